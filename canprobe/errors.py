@@ -1,0 +1,95 @@
+"""Exceptions of canprobe, and the exit status that each one means to the command line.
+
+    CanprobeError
+    ├── UsageError           2  wrong usage
+    │   ├── SceneError       2  the scene file is wrong; carries every problem found
+    │   ├── PlanError        2  the scene is right but does not fit (bus, reach, geometry)
+    │   └── EdsError         2  an EDS file cannot be used
+    ├── BusError             3  interface missing or lost, node missing, node refused
+    │   ├── InterfaceError   3  the CAN interface itself
+    │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
+    ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
+    └── ProtocolError        3  bytes on the bus that mean nothing where they stand
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+
+class CanprobeError(Exception):
+    """Base of every error that canprobe raises on purpose."""
+
+    exit_status = 3
+
+
+class UsageError(CanprobeError):
+    """The request itself is wrong; nothing was started."""
+
+    exit_status = 2
+
+
+class SceneError(UsageError):
+    """A scene that cannot be loaded.
+
+    Attributes:
+        problems: every problem found, one line each, with file, key path and a suggestion.
+    """
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(self.problems))
+
+
+class PlanError(UsageError):
+    """A valid scene that cannot be carried out.
+
+    Attributes:
+        problems: every reason with its numbers and the ways out, one line each.
+    """
+
+    def __init__(self, problems: Sequence[str]) -> None:
+        self.problems = tuple(problems)
+        super().__init__("\n".join(self.problems))
+
+
+class EdsError(UsageError):
+    """An EDS file that is missing or cannot be read."""
+
+
+class BusError(CanprobeError):
+    """The bus or something on it failed."""
+
+
+class InterfaceError(BusError):
+    """The CAN interface is missing, cannot be opened or was lost."""
+
+
+class NodeError(BusError):
+    """One node did not do what it must.
+
+    Attributes:
+        node_id: the node, 1–127.
+    """
+
+    def __init__(self, node_id: int, message: str) -> None:
+        self.node_id = node_id
+        super().__init__(f"node {node_id}: {message}")
+
+
+class ProtocolError(BusError):
+    """Bytes that do not decode to what they must be where they stand."""
+
+
+class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake
+    """The cell was stopped for safety. Raised after the drives were disabled.
+
+    Attributes:
+        reason: what was detected, with numbers.
+    """
+
+    exit_status = 1
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
+        super().__init__(reason)
