@@ -1,0 +1,59 @@
+"""A robot cell on a CAN bus: PUMA 260, tactile servo and local shape from touch, over CANopen.
+
+Public names are imported when they are first used, so that `import canprobe` costs nothing.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from canprobe.api import RunResult, open_cell, run
+    from canprobe.planning import make_plan as plan
+    from canprobe.scene_loader import load_scene
+    from canprobe.touch.bound import cramer_rao
+    from canprobe.touch.estimate import SurfaceEstimate
+    from canprobe.touch.fit import fit_surface
+    from canprobe.touch.surface import SurfaceMatrix
+
+__version__ = "0.1.0"
+
+_EXPORTS = {
+    "load_scene": ("canprobe.scene_loader", "load_scene"),
+    "plan": ("canprobe.planning", "make_plan"),
+    "run": ("canprobe.api", "run"),
+    "open_cell": ("canprobe.api", "open_cell"),
+    "RunResult": ("canprobe.api", "RunResult"),
+    "SurfaceMatrix": ("canprobe.touch.surface", "SurfaceMatrix"),
+    "SurfaceEstimate": ("canprobe.touch.estimate", "SurfaceEstimate"),
+    "fit_surface": ("canprobe.touch.fit", "fit_surface"),
+    "cramer_rao": ("canprobe.touch.bound", "cramer_rao"),
+}
+
+__all__ = [
+    "RunResult",
+    "SurfaceEstimate",
+    "SurfaceMatrix",
+    "__version__",
+    "cramer_rao",
+    "fit_surface",
+    "load_scene",
+    "open_cell",
+    "plan",
+    "run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    if name not in _EXPORTS:
+        raise AttributeError(f"module 'canprobe' has no attribute {name!r}")
+    module, attribute = _EXPORTS[name]
+    value = getattr(importlib.import_module(module), attribute)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_EXPORTS})

@@ -1,0 +1,216 @@
+"""A scene: what one experiment consists of, as frozen dataclasses that mirror the TOML file.
+
+Field names are the TOML keys and carry their unit. A section that is None is absent and left out of the plan. Each
+field is one line: type, check, default; `canprobe.scene_loader` reads everything it needs from these annotations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+from canprobe.scene_checks import Direction, Distinct, Only, Pattern, Range, ScenePath, Symmetric
+
+TaskKind = Literal["scan", "press", "listen", "free"]
+Strategy = Literal["weave", "straight", "circle"]
+TactileModeName = Literal["window", "image", "features"]
+ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
+ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "quadric"]
+ArmModel = Literal["upenn", "unimate"]
+Fidelity = Literal["ideal"]
+
+Vec3 = tuple[float, float, float]
+Vec6 = tuple[float, float, float, float, float, float]
+Row4 = tuple[float, float, float, float]
+NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
+NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
+
+TOUCHING = Only("kind", ("scan", "press"))
+SCANNING = Only("kind", ("scan",))
+FREE = Only("kind", ("free",))
+
+
+@dataclass(frozen=True, slots=True)
+class SceneInfo:
+    """`[scene]`: what the scene is called, and the seed of everything random in it."""
+
+    name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")]
+    title: str = ""
+    seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+
+
+@dataclass(frozen=True, slots=True)
+class BusSettings:
+    """`[bus]`: where the nodes are. `lockstep`, `socketcan` or any python-can interface."""
+
+    interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
+    bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class CycleSettings:
+    """`[cycle]`: the rate of SYNC and servo."""
+
+    rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+
+
+@dataclass(frozen=True, slots=True)
+class ArmSettings:
+    """`[arm]`: six joint drives."""
+
+    model: ArmModel = "upenn"
+    node_ids: Annotated[NodeIds, Distinct()] = (1, 2, 3, 4, 5, 6)
+    eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
+    emulated: bool = True
+    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)  # selects the branch; an emulated arm stands here at first
+    grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
+
+
+@dataclass(frozen=True, slots=True)
+class SensorSettings:
+    """`[sensor]`: the 16×16 tactile array."""
+
+    node_id: NodeId = 16
+    eds: Annotated[str, ScenePath()] = "tactile_array.eds"
+    emulated: bool = True
+    mode: TactileModeName = "window"
+    rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
+    full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeSettings:
+    """`[probe]`: the sphere that carries the array, with its elastic layer."""
+
+    radius_mm: Annotated[float, Range(5, 200)] = 40.0
+    centre_offset_mm: Annotated[float, Range(0, 300)] = 80.0  # of the sphere's centre beyond the flange, along tool z
+    mass_kg: Annotated[float, Range(0, 5)] = 0.3
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] = 1.27e8  # K/h of the elastic layer
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectSettings:
+    """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
+
+    The object frame's origin lies on the surface with z outward; the cylinder's axis is its x, a saddle is
+    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex), and a quadric is
+    XᵀSX = 0 with S = matrix, in metres, negative inside.
+    """
+
+    kind: ObjectKind
+    radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder"), required=True)] = None
+    radius_x_mm: Annotated[float | None, Range(-1e5, 1e5), Only("kind", ("saddle",), required=True)] = None
+    radius_y_mm: Annotated[float | None, Range(-1e5, 1e5), Only("kind", ("saddle",), required=True)] = None
+    matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
+        None
+    )
+    position_mm: Vec3 = (-120.0, -122.5, 374.0)  # of the object frame in base: a point on the surface
+    rotation_deg: Vec3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSettings:
+    """`[task]`: what is done.
+
+    `scan` approaches, touches and follows the strategy; `press` approaches and holds the force; `listen` reads the
+    sensor only; `free` swings the joints about `arm.start_deg` without a sensor.
+    """
+
+    kind: TaskKind
+    duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0  # of the scan, press, listen or free phase
+    force_n: Annotated[float, Range(0, 20, open_low=True), TOUCHING] = 2.0
+    approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCHING] = 4.0
+    start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)  # expected contact point, approached along −normal
+    approach_normal: Annotated[Vec3, Direction(), TOUCHING] = (0.0, 0.0, 1.0)  # normalised by its users
+    strategy: Annotated[Strategy, SCANNING] = "weave"
+    speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
+    heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane
+    length_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING] = 36.0  # full size; a circle's diameter
+    width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
+    wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave
+    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.1  # 0: pad follows the normal, 1: fixed orientation
+    swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)  # amplitude of each joint
+    swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeSettings:
+    """`[shape]`: the surface estimator."""
+
+    method: ShapeMethod = "recursive"
+    memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0  # of path, whatever the time
+    also: Annotated[tuple[ShapeMethod, ...], Distinct()] = ("ml", "chen1996")  # on the same data, for the report
+    every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class LimitSettings:
+    """`[limits]`: where the cell is stopped for safety."""
+
+    force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
+    joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
+    joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+
+
+@dataclass(frozen=True, slots=True)
+class ServoSettings:
+    """`[servo]`: the tactile servo's gains."""
+
+    force_bandwidth_hz: Annotated[float, Range(0, 50, open_low=True)] = 4.0
+    drive_lag_ms: Annotated[float, Range(0, 100)] = 10.6  # of the drives behind a ramp: 2/(2π·30 Hz)
+
+
+@dataclass(frozen=True, slots=True)
+class PlantSettings:
+    """`[plant]`: how the emulated arm, contact and array behave."""
+
+    fidelity: Fidelity = "ideal"
+    drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
+    contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
+    noise: bool = True
+    gain_error: bool = True
+    blur: bool = True
+    hysteresis: bool = True
+    creep: bool = True
+    crosstalk: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """One experiment. Sections that are None are absent."""
+
+    scene: SceneInfo
+    task: TaskSettings
+    bus: BusSettings = BusSettings()
+    cycle: CycleSettings = CycleSettings()
+    limits: LimitSettings = LimitSettings()
+    arm: ArmSettings | None = None
+    sensor: SensorSettings | None = None
+    probe: ProbeSettings | None = None
+    object: ObjectSettings | None = None
+    shape: ShapeSettings | None = None
+    servo: ServoSettings | None = None
+    plant: PlantSettings | None = None
+
+    @property
+    def name(self) -> str:
+        """The scene's name."""
+        return self.scene.name
+
+    @property
+    def title(self) -> str:
+        """One line about the scene."""
+        return self.scene.title
+
+    @property
+    def seed(self) -> int:
+        """The seed of everything random."""
+        return self.scene.seed
+
+    @property
+    def emulated_node_ids(self) -> tuple[int, ...]:
+        """The nodes that the scene wants emulated, ascending."""
+        arm = self.arm.node_ids if self.arm is not None and self.arm.emulated else ()
+        sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
+        return tuple(sorted((*arm, *sensor)))

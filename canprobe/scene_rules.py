@@ -1,0 +1,130 @@
+"""Which parts of a scene go together: one table of needs per kind of task, and one table of rules across keys."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    # section: (need, why). need: "must" be given, "default" when left out, "may" be given, "never"
+    "scan": {
+        "arm": ("must", "a scan moves the probe"),
+        "sensor": ("must", "a scan follows what it feels"),
+        "probe": ("default", ""),
+        "object": ("may", ""),
+        "shape": ("default", ""),
+        "servo": ("default", ""),
+        "plant": ("default", ""),
+    },
+    "press": {
+        "arm": ("must", "a press moves the probe"),
+        "sensor": ("must", "a press holds the force it feels"),
+        "probe": ("default", ""),
+        "object": ("may", ""),
+        "shape": ("never", "one touch without motion shows no shape"),
+        "servo": ("default", ""),
+        "plant": ("default", ""),
+    },
+    "listen": {
+        "arm": ("never", "listening moves nothing"),
+        "sensor": ("must", "there is nothing else to listen to"),
+        "probe": ("default", ""),
+        "object": ("may", ""),
+        "shape": ("never", "without motion there is no shape to estimate"),
+        "servo": ("never", "listening moves nothing"),
+        "plant": ("default", ""),
+    },
+    "free": {
+        "arm": ("must", "free motion moves the arm"),
+        "sensor": ("never", "free motion feels nothing"),
+        "probe": ("may", ""),
+        "object": ("never", "free motion touches nothing"),
+        "shape": ("never", "without touch there is no shape to estimate"),
+        "servo": ("never", "there is no touch to control"),
+        "plant": ("default", ""),
+    },
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A condition across keys.
+
+    Attributes:
+        where: the key path that the message names.
+        keys: key paths (`section` or `section.key`) whose values `wrong` takes, None where absent.
+        wrong: returns the complaint, or None.
+    """
+
+    where: str
+    keys: tuple[str, ...]
+    wrong: Callable[..., str | None]
+
+
+def _duplicate_node(arm_ids: tuple[int, ...] | None, sensor_id: int | None) -> str | None:
+    if arm_ids is None or sensor_id not in arm_ids:
+        return None
+    return f"expected a node id of its own, got {sensor_id}, which arm.node_ids has too"
+
+
+def _object_missing(kind: str, sensor: bool | None, obj: object) -> str | None:
+    if kind not in ("scan", "press") or not sensor or obj is not None:
+        return None
+    return "missing: an emulated sensor touches nothing without an [object]; describe the true object"
+
+
+def _half_emulated(kind: str, arm: bool | None, sensor: bool | None) -> str | None:
+    if kind not in ("scan", "press") or arm is None or sensor is None or arm is False or sensor is True:
+        return None
+    return "expected true: a real sensor cannot feel what an emulated arm touches; emulate both, or only the sensor"
+
+
+def _main_method_repeated(method: str | None, also: tuple[str, ...] | None) -> str | None:
+    if also is None or method not in also:
+        return None
+    return f'expected methods besides the main one, got "{method}", which shape.method has already'
+
+
+def _saddle_radii(kind: str | None, x: float | None, y: float | None) -> str | None:
+    if kind != "saddle" or x is None or y is None or x * y < 0:
+        return None
+    return f"expected the radii of a saddle to have opposite signs, got {x:g} and {y:g}"
+
+
+def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
+    if kind not in ("scan", "press") or force is None or limit is None or force < limit:
+        return None
+    return f"expected less than limits.force_max_n = {limit:g}, got {force:g}"
+
+
+def _sensor_rate(cycle: float | None, sensor: float | None) -> str | None:
+    if cycle is None or sensor is None or sensor <= cycle:
+        return None
+    return f"expected at most cycle.rate_hz = {cycle:g}, got {sensor:g}: frames are triggered by SYNC"
+
+
+RULES: tuple[Rule, ...] = (
+    Rule("sensor.node_id", ("arm.node_ids", "sensor.node_id"), _duplicate_node),
+    Rule("object", ("task.kind", "sensor.emulated", "object"), _object_missing),
+    Rule("sensor.emulated", ("task.kind", "arm.emulated", "sensor.emulated"), _half_emulated),
+    Rule("shape.also", ("shape.method", "shape.also"), _main_method_repeated),
+    Rule("object.radius_y_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _saddle_radii),
+    Rule("task.force_n", ("task.kind", "task.force_n", "limits.force_max_n"), _force_target),
+    Rule("sensor.rate_hz", ("cycle.rate_hz", "sensor.rate_hz"), _sensor_rate),
+)
+
+
+def broken_rules(lookup: Callable[[str], Any]) -> Iterator[tuple[str, str]]:
+    """Every rule that a scene breaks, as (key path, complaint).
+
+    Args:
+        lookup: value at a key path, None where absent; raises LookupError where the key has a problem already.
+    """
+    for rule in RULES:
+        try:
+            complaint = rule.wrong(*(lookup(key) for key in rule.keys))
+        except LookupError:
+            continue
+        if complaint is not None:
+            yield rule.where, complaint
