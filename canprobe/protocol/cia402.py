@@ -1,0 +1,214 @@
+"""The CiA 402 drive state machine as tables, read by the drive and by its master.
+
+    power on ─0→ NOT_READY ─1→ SWITCH_ON_DISABLED ⇄2,7 READY ⇄3,6 SWITCHED_ON ⇄4,5 OPERATION_ENABLED
+    OPERATION_ENABLED ─8→ READY   ─9→ SWITCH_ON_DISABLED   ─11→ QUICK_STOP_ACTIVE ─12→ SWITCH_ON_DISABLED (16: back)
+    SWITCHED_ON ─10→ SWITCH_ON_DISABLED      any ─13→ FAULT_REACTION_ACTIVE ─14→ FAULT ─15→ SWITCH_ON_DISABLED
+
+Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, controlword 6040h, statusword 6041h.
+"""
+
+from __future__ import annotations
+
+from enum import Enum, IntEnum, auto
+
+from canprobe.errors import ProtocolError
+
+# Statusword bit numbers (6041h) outside the state bits 0..3, 5, 6.
+VOLTAGE_ENABLED = 4
+WARNING = 7
+REMOTE = 9
+TARGET_REACHED = 10
+INTERNAL_LIMIT = 11
+DRIVE_FOLLOWS = 12  # CSP, CSV, CST: the drive follows the command value
+SETPOINT_ACKNOWLEDGE = 12  # PP
+HOMING_ATTAINED = 12  # homing
+FOLLOWING_ERROR = 13  # PP, CSP
+HOMING_ERROR = 13  # homing
+
+# Controlword bit numbers (6040h) outside the command bits 0..3.
+NEW_SETPOINT = 4  # PP
+HOMING_START = 4  # homing
+CHANGE_IMMEDIATELY = 5  # PP
+RELATIVE = 6  # PP
+FAULT_RESET_BIT = 7
+HALT = 8
+
+
+class OperationMode(IntEnum):
+    """Modes of operation, 6060h and 6061h, that the drives know."""
+
+    NONE = 0
+    PROFILE_POSITION = 1
+    HOMING = 6
+    CYCLIC_SYNC_POSITION = 8
+    CYCLIC_SYNC_VELOCITY = 9
+    CYCLIC_SYNC_TORQUE = 10
+
+
+class DriveState(Enum):
+    """States of the drive; the value is its pattern in the statusword's bits 0..3, 5 and 6."""
+
+    NOT_READY_TO_SWITCH_ON = 0x00
+    SWITCH_ON_DISABLED = 0x40
+    READY_TO_SWITCH_ON = 0x21
+    SWITCHED_ON = 0x23
+    OPERATION_ENABLED = 0x27
+    QUICK_STOP_ACTIVE = 0x07
+    FAULT_REACTION_ACTIVE = 0x0F
+    FAULT = 0x08
+
+
+class Command(Enum):
+    """What a controlword commands; switching on and disabling operation are the same pattern."""
+
+    SHUTDOWN = auto()
+    SWITCH_ON = auto()
+    DISABLE_OPERATION = SWITCH_ON
+    ENABLE_OPERATION = auto()
+    DISABLE_VOLTAGE = auto()
+    QUICK_STOP = auto()
+    FAULT_RESET = auto()
+
+
+class Event(Enum):
+    """What changes the state without a controlword."""
+
+    INITIALISED = auto()
+    QUICK_STOP_DONE = auto()
+    FAULT_DETECTED = auto()
+    FAULT_REACTION_DONE = auto()
+
+
+_S = DriveState
+_C = Command
+INITIAL_STATE = _S.NOT_READY_TO_SWITCH_ON  # transition 0, at power on
+
+# (mask, pattern, state). Bit 5 is free in the states that mask 4Fh tests.
+STATUSWORD_PATTERNS: tuple[tuple[int, int, DriveState], ...] = (
+    (0x4F, 0x00, _S.NOT_READY_TO_SWITCH_ON),
+    (0x4F, 0x40, _S.SWITCH_ON_DISABLED),
+    (0x6F, 0x21, _S.READY_TO_SWITCH_ON),
+    (0x6F, 0x23, _S.SWITCHED_ON),
+    (0x6F, 0x27, _S.OPERATION_ENABLED),
+    (0x6F, 0x07, _S.QUICK_STOP_ACTIVE),
+    (0x4F, 0x0F, _S.FAULT_REACTION_ACTIVE),
+    (0x4F, 0x08, _S.FAULT),
+)
+
+# (mask, pattern, command). With bit 7 clear every controlword matches exactly one line.
+CONTROLWORD_PATTERNS: tuple[tuple[int, int, Command], ...] = (
+    (0x82, 0x00, _C.DISABLE_VOLTAGE),
+    (0x86, 0x02, _C.QUICK_STOP),
+    (0x87, 0x06, _C.SHUTDOWN),
+    (0x8F, 0x07, _C.SWITCH_ON),
+    (0x8F, 0x0F, _C.ENABLE_OPERATION),
+)
+
+# (number in the standard, from, cause, to). 3 is there twice: enabling from READY passes through SWITCHED_ON.
+NUMBERED_TRANSITIONS: tuple[tuple[int, DriveState, Command, DriveState], ...] = (
+    (2, _S.SWITCH_ON_DISABLED, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (3, _S.READY_TO_SWITCH_ON, _C.SWITCH_ON, _S.SWITCHED_ON),
+    (3, _S.READY_TO_SWITCH_ON, _C.ENABLE_OPERATION, _S.SWITCHED_ON),
+    (4, _S.SWITCHED_ON, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+    (5, _S.OPERATION_ENABLED, _C.DISABLE_OPERATION, _S.SWITCHED_ON),
+    (6, _S.SWITCHED_ON, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (7, _S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (7, _S.READY_TO_SWITCH_ON, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (8, _S.OPERATION_ENABLED, _C.SHUTDOWN, _S.READY_TO_SWITCH_ON),
+    (9, _S.OPERATION_ENABLED, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (10, _S.SWITCHED_ON, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (10, _S.SWITCHED_ON, _C.QUICK_STOP, _S.SWITCH_ON_DISABLED),
+    (11, _S.OPERATION_ENABLED, _C.QUICK_STOP, _S.QUICK_STOP_ACTIVE),
+    (12, _S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE, _S.SWITCH_ON_DISABLED),
+    (15, _S.FAULT, _C.FAULT_RESET, _S.SWITCH_ON_DISABLED),
+    (16, _S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION, _S.OPERATION_ENABLED),
+)
+
+TRANSITIONS: dict[tuple[DriveState, Command], DriveState] = {
+    (source, command): target for _, source, command, target in NUMBERED_TRANSITIONS
+}
+"""Where a command leads. What is not in the table changes nothing. Transition 16 is only for 605Ah = 5..8, and
+transition 15 only when no cause of the fault remains: both are the drive's to check."""
+
+AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
+    (_S.NOT_READY_TO_SWITCH_ON, Event.INITIALISED): _S.SWITCH_ON_DISABLED,  # 1
+    (_S.QUICK_STOP_ACTIVE, Event.QUICK_STOP_DONE): _S.SWITCH_ON_DISABLED,  # 12, with 605Ah = 0..3
+    (_S.FAULT_REACTION_ACTIVE, Event.FAULT_REACTION_DONE): _S.FAULT,  # 14
+} | {
+    (state, Event.FAULT_DETECTED): _S.FAULT_REACTION_ACTIVE  # 13
+    for state in DriveState
+    if state not in (_S.FAULT_REACTION_ACTIVE, _S.FAULT)
+}
+
+POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
+"""States in which the drive function is on: torque may act on the motor."""
+
+_STATES = {
+    word: state for mask, pattern, state in STATUSWORD_PATTERNS for word in range(0x80) if word & mask == pattern
+}
+_COMMANDS = {
+    word: command for mask, pattern, command in CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
+}
+
+
+def state_of(statusword: int) -> DriveState:
+    """The drive state that a statusword tells.
+
+    Raises:
+        ProtocolError: a bit pattern that is no state.
+    """
+    try:
+        return _STATES[statusword & 0x6F]
+    except KeyError:
+        raise ProtocolError(f"statusword {statusword:#06x} is no CiA 402 state") from None
+
+
+def statusword_of(state: DriveState) -> int:
+    """The state bits of the statusword; the drive adds bits 4, 7 and 9..13."""
+    return state.value
+
+
+def command_of(controlword: int, previous: int = 0) -> Command | None:
+    """The command in a controlword, given the one before it.
+
+    Fault reset is the rising edge of bit 7. While bit 7 stays set nothing else is commanded: None.
+    """
+    if controlword & ~previous & 1 << FAULT_RESET_BIT:
+        return Command.FAULT_RESET
+    return _COMMANDS.get(controlword & 0xFF)
+
+
+_DISABLE = dict.fromkeys(DriveState, 0x0000)
+_TOWARD: dict[DriveState, dict[DriveState, int]] = {
+    _S.SWITCH_ON_DISABLED: _DISABLE,
+    _S.QUICK_STOP_ACTIVE: _DISABLE | {_S.OPERATION_ENABLED: 0x0002, _S.QUICK_STOP_ACTIVE: 0x0002},
+    _S.OPERATION_ENABLED: _DISABLE
+    | {
+        _S.SWITCH_ON_DISABLED: 0x0006,
+        _S.READY_TO_SWITCH_ON: 0x0007,
+        _S.SWITCHED_ON: 0x000F,
+        _S.OPERATION_ENABLED: 0x000F,
+        _S.FAULT: 0x0080,
+    },
+}
+
+
+def controlword_toward(state: DriveState, goal: DriveState, previous: int = 0) -> int:
+    """The controlword that a master sends now, in `state`, to come nearer to `goal`. Call it every cycle.
+
+    On the way to OPERATION_ENABLED a fault is reset (with an edge every second call while `previous` is passed) and
+    a quick stop is left through SWITCH_ON_DISABLED. Stopping never resets a fault: a drive in FAULT is already off.
+
+    Args:
+        state: the drive's present state.
+        goal: OPERATION_ENABLED, SWITCH_ON_DISABLED or QUICK_STOP_ACTIVE (from states below operation: disable).
+        previous: the controlword sent before, so that a reset that did not take is tried with a new edge.
+
+    Raises:
+        ProtocolError: another goal.
+    """
+    try:
+        word = _TOWARD[goal][state]
+    except KeyError:
+        raise ProtocolError(f"no way to {goal.name}: goals are {', '.join(s.name for s in _TOWARD)}") from None
+    return word & ~(previous & 1 << FAULT_RESET_BIT)

@@ -1,0 +1,110 @@
+"""CAN frames, the identifiers of CiA 301 and the two network services that are a byte or two long."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+from canprobe.errors import ProtocolError
+
+Frame = tuple[int, bytes]
+"""An 11-bit identifier and up to 8 data bytes."""
+
+NMT_ID = 0x000
+SYNC_ID = 0x080
+EMCY_BASE = 0x080
+SDO_TX_BASE = 0x580  # server (node) to client (master)
+SDO_RX_BASE = 0x600  # client (master) to server (node)
+HEARTBEAT_BASE = 0x700
+BROADCAST = 0  # NMT: every node
+
+# Source: CiA 301, table "restricted COB-IDs"; last row of CANopen's predefined set included.
+_RESTRICTED = (
+    (0x000, 0x000),  # NMT
+    (0x001, 0x07F),
+    (0x101, 0x180),
+    (0x581, 0x5FF),  # default SDO, server to client
+    (0x601, 0x67F),  # default SDO, client to server
+    (0x6E0, 0x6FF),
+    (0x701, 0x77F),  # NMT error control
+    (0x780, 0x7FF),
+)
+
+
+class NmtCommand(IntEnum):
+    """NMT node control, first byte of the NMT frame. Source: CiA 301 (NMT protocols)."""
+
+    START = 0x01
+    STOP = 0x02
+    PRE_OPERATIONAL = 0x80
+    RESET_NODE = 0x81
+    RESET_COMMUNICATION = 0x82
+
+
+class NmtState(IntEnum):
+    """NMT state as the heartbeat tells it; INITIALISING is the boot-up message. Source: CiA 301."""
+
+    INITIALISING = 0x00
+    STOPPED = 0x04
+    OPERATIONAL = 0x05
+    PRE_OPERATIONAL = 0x7F
+
+
+def _check_node(node_id: int, lowest: int = 1) -> int:
+    if not lowest <= node_id <= 127:
+        raise ProtocolError(f"node id {node_id}: must be {lowest}..127")
+    return node_id
+
+
+def pack_nmt(command: NmtCommand, node_id: int = BROADCAST) -> Frame:
+    """Pack an NMT command for one node, or for all with node id 0.
+
+    Raises:
+        ProtocolError: the node id is not 0..127.
+    """
+    return NMT_ID, bytes((command, _check_node(node_id, lowest=0)))
+
+
+def unpack_nmt(data: bytes) -> tuple[NmtCommand, int]:
+    """Unpack an NMT frame into command and node id (0: all nodes).
+
+    Raises:
+        ProtocolError: not two bytes, an unknown command, or no node id. A node ignores such frames.
+    """
+    if len(data) != 2:
+        raise ProtocolError(f"NMT: expected 2 bytes, got {len(data)}")
+    try:
+        command = NmtCommand(data[0])
+    except ValueError:
+        raise ProtocolError(f"NMT: unknown command {data[0]:#04x}") from None
+    return command, _check_node(data[1], lowest=0)
+
+
+def pack_heartbeat(node_id: int, state: NmtState) -> Frame:
+    """Pack the heartbeat of a node; with INITIALISING it is the boot-up message.
+
+    Raises:
+        ProtocolError: the node id is not 1..127.
+    """
+    return HEARTBEAT_BASE + _check_node(node_id), bytes((state,))
+
+
+def unpack_heartbeat(data: bytes) -> NmtState:
+    """Unpack the state from a heartbeat, boot-up or node-guarding answer (whose toggle bit 7 is dropped).
+
+    Raises:
+        ProtocolError: not one byte, or no NMT state.
+    """
+    if len(data) != 1:
+        raise ProtocolError(f"heartbeat: expected 1 byte, got {len(data)}")
+    try:
+        return NmtState(data[0] & 0x7F)
+    except ValueError:
+        raise ProtocolError(f"heartbeat: unknown state {data[0]:#04x}") from None
+
+
+def is_restricted(cob_id: int) -> bool:
+    """Whether CiA 301 forbids an 11-bit identifier to PDOs, SYNC, EMCY and additional SDOs.
+
+    080h itself (SYNC) and the bases 580h and 600h are not in the standard's table.
+    """
+    return any(first <= cob_id <= last for first, last in _RESTRICTED)

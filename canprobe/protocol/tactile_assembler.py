@@ -1,0 +1,158 @@
+"""Puts the PDOs of a tactile frame together again, or drops them: never half of one frame and half of another."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ProtocolError
+from canprobe.protocol.tactile_wire import PDO_COUNT, SIDE, WINDOW, Features, TactileHeader, TactileMode, crc16_ccitt
+
+
+@dataclass(frozen=True, slots=True)
+class TactileFrame:
+    """One complete, checked tactile frame.
+
+    Attributes:
+        header: as received.
+        taxels: uint8 (16, 16), full pad, counts; zero outside the window, all zero in features mode; read-only.
+        window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
+        features: contact features, in features mode only.
+        t_ns: arrival of the header.
+    """
+
+    header: TactileHeader
+    taxels: NDArray[np.uint8]
+    window: tuple[int, int, int, int]
+    features: Features | None
+    t_ns: int
+
+
+class FrameAssembler:
+    """Collects one sensor's PDOs; `push` returns a frame when its last PDO arrives and the CRC matches.
+
+    A frame opens at a header and takes each expected COB-ID exactly once, in any order. A new header, a duplicate or
+    the deadline before it is complete: torn, dropped.
+
+    Attributes:
+        frames: published.
+        torn: opened and dropped incomplete.
+        crc_errors: complete with a wrong CRC (corrupted, or mixed from two triggers where a header was lost).
+        duplicates: taxel PDOs that came twice, and complete frames with the counter of the frame before.
+        lost: frames of the sensor that were not published, from gaps of the frame counter (mod 256).
+        orphans: taxel PDOs without an open frame.
+        malformed: PDOs that are not 8 bytes, headers that mean nothing, frames of another mode.
+    """
+
+    __slots__ = (
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_slots",
+        "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
+    )  # fmt: skip
+
+    def __init__(self, cob_ids: Sequence[int], mode: TactileMode, deadline_ns: int) -> None:
+        """Expect the given identifiers.
+
+        Args:
+            cob_ids: header first, then the payloads in PDO order.
+            mode: what the sensor is set to.
+            deadline_ns: longest time from header to last PDO; two cycles as a rule.
+
+        Raises:
+            ProtocolError: the number of identifiers does not belong to the mode, or one is there twice.
+        """
+        self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
+        if len(cob_ids) != PDO_COUNT[mode] or len(self._slots) != len(cob_ids):
+            raise ProtocolError(f"{mode.name.lower()} frames need {PDO_COUNT[mode]} different COB-IDs, got {cob_ids}")
+        self._mode = mode
+        self._deadline_ns = deadline_ns
+        self._parts: list[bytes | None] = []
+        self._missing = 0  # 0: no frame is open
+        self._opened_ns = 0
+        self._last: int | None = None
+        self.frames = self.torn = self.crc_errors = self.duplicates = self.lost = self.orphans = self.malformed = 0
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+        """Take one received frame; identifiers of others are ignored. Never raises on bytes."""
+        slot = self._slots.get(can_id)
+        if slot is None:
+            return None
+        self.expire(t_ns)
+        if len(data) != 8:
+            self.malformed += 1
+            self._tear()
+        elif slot == 0:
+            self._open(data, t_ns)
+        elif not self._missing:
+            self.orphans += 1
+        elif self._parts[slot] is not None:
+            self.duplicates += 1
+            self._tear()
+        else:
+            self._parts[slot] = data
+            self._missing -= 1
+            if not self._missing:
+                return self._close()
+        return None
+
+    def expire(self, t_ns: int) -> None:
+        """Drop the open frame if its deadline has passed."""
+        if self._missing and t_ns - self._opened_ns > self._deadline_ns:
+            self._tear()
+
+    def reset(self) -> None:
+        """Forget the open frame and the last counter (the sensor was restarted); counters stay."""
+        self._missing = 0
+        self._last = None
+
+    def _tear(self) -> None:
+        if self._missing:
+            self.torn += 1
+            self._missing = 0
+
+    def _open(self, data: bytes, t_ns: int) -> None:
+        self._tear()
+        self._parts = [None] * len(self._slots)
+        self._parts[0] = data
+        self._missing = len(self._slots) - 1
+        self._opened_ns = t_ns
+
+    def _close(self) -> TactileFrame | None:
+        start, *rest = self._parts
+        assert start is not None
+        body = b"".join(rest)  # type: ignore[arg-type]  # complete: no None is left
+        try:
+            header = TactileHeader.unpack(start)
+        except ProtocolError:
+            self.malformed += 1
+            return None
+        if crc16_ccitt(body, crc16_ccitt(start[:6])) != header.crc:
+            self.crc_errors += 1
+            return None
+        if header.mode is not self._mode:
+            self.malformed += 1
+            return None
+        if header.frame_counter == self._last:
+            self.duplicates += 1
+            return None
+        if self._last is not None:
+            self.lost += (header.frame_counter - self._last - 1) % 256
+        self._last = header.frame_counter
+        self.frames += 1
+        return _build(header, body, self._opened_ns)
+
+
+def _build(header: TactileHeader, body: bytes, t_ns: int) -> TactileFrame:
+    taxels = np.zeros((SIDE, SIDE), np.uint8)
+    window, features = (0, 0, 0, 0), None
+    if header.mode is TactileMode.FEATURES:
+        features = Features.unpack(body, header.peak)
+    else:
+        side = WINDOW if header.mode is TactileMode.WINDOW else SIDE
+        row, col = header.origin_row, header.origin_col
+        taxels[row : row + side, col : col + side] = np.frombuffer(body, np.uint8).reshape(side, side)
+        window = (row, col, side, side)
+    taxels.flags.writeable = False
+    return TactileFrame(header, taxels, window, features, t_ns)

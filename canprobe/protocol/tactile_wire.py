@@ -1,0 +1,227 @@
+"""Tactile frames on the wire: header, contact features, checksum, payloads in PDO order.
+
+Every frame begins with the same 8 bytes, little-endian:
+
+    byte 0  frame counter, +1 a frame, mod 256        byte 3     flags: bits 0..1 mode, bit 2 overload, others 0
+    byte 1  SYNC counter of the trigger (0: none)     bytes 4..5 sample age in µs: trigger SYNC minus sample time
+    byte 2  window origin, row << 4 | column          bytes 6..7 CRC-16 over bytes 0..5 and all payload after
+
+In features mode byte 2 is the peak taxel instead: features have no window. Then follow, by mode,
+window: 8 payloads, a row of 8 taxels each; image: 32 payloads, the left then the right half of each of 16 rows; lowest
+byte = lowest column. Features: one payload, a 64-bit little-endian word from its least significant bit upward:
+
+    field   bits  scale         range, saturating          field   bits  scale          range, saturating
+    force   12    1/400 N       0..10.2375 N               var_rr  10    1/64 taxel²    0..15.98 taxel²
+    row     11    1/128 taxel   0..15.992                  var_rc  10    1/64 taxel²    −8..7.98 taxel² (signed)
+    col     11    1/128 taxel   0..15.992                  var_cc  10    1/64 taxel²    0..15.98 taxel²
+
+One step of the centroid is 12 µm on the pad and half a step the largest error inside the ranges.
+"""
+
+from __future__ import annotations
+
+import binascii
+import math
+import struct
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ProtocolError
+
+SIDE = 16  # taxels along the pad
+WINDOW = 8  # taxels along the window
+_FORM = struct.Struct("<BBBBHH")
+_OVERLOAD = 0x04
+_FORCE_SCALE, _CENTROID_SCALE, _MOMENT_SCALE = 400.0, 128.0, 64.0
+
+# bits, signed, scale, in the order of the wire
+_FEATURE_FIELDS = (
+    (12, False, _FORCE_SCALE),
+    (11, False, _CENTROID_SCALE),
+    (11, False, _CENTROID_SCALE),
+    (10, False, _MOMENT_SCALE),
+    (10, True, _MOMENT_SCALE),
+    (10, False, _MOMENT_SCALE),
+)
+
+
+class TactileMode(IntEnum):
+    """What the sensor sends, object 2000h."""
+
+    FEATURES = 0
+    WINDOW = 1
+    IMAGE = 2
+
+
+PDO_COUNT = {TactileMode.FEATURES: 2, TactileMode.WINDOW: 9, TactileMode.IMAGE: 33}
+"""PDOs of a frame, header included."""
+
+
+def crc16_ccitt(data: bytes, crc: int = 0) -> int:
+    """CRC-16 with the CCITT polynomial 1021h, initial value 0, not reflected: that of SDO block transfers.
+
+    Up to three flipped bits, and any burst of 16, are always found. Check value of b"123456789": 31C3h.
+    Source: CiA 301 (SDO block transfer); catalogued as CRC-16/XMODEM.
+    """
+    return binascii.crc_hqx(data, crc)
+
+
+@dataclass(frozen=True, slots=True)
+class TactileHeader:
+    """First payload of every tactile frame.
+
+    Attributes:
+        frame_counter: 0..255.
+        sync_counter: SYNC counter of the trigger, 1..240; 0 without a counter.
+        origin_row, origin_col: window's first taxel in the full pad, 0..8; in features mode together the peak.
+        mode: what follows.
+        overload: a taxel reached full scale.
+        sample_age_us: trigger SYNC minus sample time, µs.
+        crc: over the six bytes before it and the payloads after; `pack_frame` computes it.
+    """
+
+    frame_counter: int
+    sync_counter: int
+    origin_row: int
+    origin_col: int
+    mode: TactileMode
+    overload: bool
+    sample_age_us: int
+    crc: int = 0
+
+    @property
+    def peak(self) -> int:
+        """Byte 2 as features mode reads it: the highest taxel, counts."""
+        return self.origin_row << 4 | self.origin_col
+
+    def pack(self) -> bytes:
+        """Pack into 8 bytes.
+
+        Raises:
+            ProtocolError: a field that does not fit.
+        """
+        if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
+            raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
+        flags = self.mode | (_OVERLOAD if self.overload else 0)
+        fields = (self.frame_counter, self.sync_counter, self.peak, flags, self.sample_age_us, self.crc)
+        try:
+            return _FORM.pack(*fields)
+        except struct.error as error:
+            raise ProtocolError(f"tactile header: {error} in {self}") from None
+
+    @classmethod
+    def unpack(cls, data: bytes) -> TactileHeader:
+        """Unpack exactly 8 bytes.
+
+        Raises:
+            ProtocolError: another length, reserved flags or mode, a window that leaves the pad.
+        """
+        if len(data) != _FORM.size:
+            raise ProtocolError(f"tactile header: expected 8 bytes, got {len(data)}")
+        counter, sync, origin, flags, age, crc = _FORM.unpack(data)
+        if flags & 0x03 not in PDO_COUNT or flags & ~0x07:
+            raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
+        header = cls(counter, sync, origin >> 4, origin & 0x0F, TactileMode(flags & 3), bool(flags & 4), age, crc)
+        _check_origin(header)
+        return header
+
+
+def _check_origin(header: TactileHeader) -> None:
+    limit = {TactileMode.FEATURES: SIDE - 1, TactileMode.WINDOW: SIDE - WINDOW, TactileMode.IMAGE: 0}[header.mode]
+    if max(header.origin_row, header.origin_col) > limit:
+        origin = (header.origin_row, header.origin_col)
+        raise ProtocolError(f"tactile header: {header.mode.name.lower()} cannot begin at taxel {origin}")
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Contact features computed by the sensor.
+
+    Attributes:
+        force_n: force over the pad, N.
+        row, col: centroid in taxels of the full pad, 0..15 (7.5 is the middle).
+        var_rr, var_rc, var_cc: central second moments, taxel².
+        peak: highest taxel, counts 0..255.
+    """
+
+    force_n: float
+    row: float
+    col: float
+    var_rr: float
+    var_rc: float
+    var_cc: float
+    peak: int = 0
+
+    def pack(self) -> bytes:
+        """The 8 bytes after the header; values beyond a range saturate at its end (module text).
+
+        Raises:
+            ProtocolError: a value that is not a number.
+        """
+        word = shift = 0
+        values = (self.force_n, self.row, self.col, self.var_rr, self.var_rc, self.var_cc)
+        for value, (bits, signed, scale) in zip(values, _FEATURE_FIELDS, strict=True):
+            if math.isnan(value):
+                raise ProtocolError(f"features: not a number in {self}")
+            lowest = -(1 << bits - 1) if signed else 0
+            code = round(min(max(value * scale, lowest), lowest + (1 << bits) - 1))
+            word |= (code & (1 << bits) - 1) << shift
+            shift += bits
+        return word.to_bytes(8, "little")
+
+    @classmethod
+    def unpack(cls, data: bytes, peak: int = 0) -> Features:
+        """Unpack exactly 8 bytes; the peak comes from the header.
+
+        Raises:
+            ProtocolError: another length.
+        """
+        if len(data) != 8:
+            raise ProtocolError(f"features: expected 8 bytes, got {len(data)}")
+        word, values = int.from_bytes(data, "little"), []
+        for bits, signed, scale in _FEATURE_FIELDS:
+            code = word & (1 << bits) - 1
+            word >>= bits
+            values.append((code - (1 << bits) if signed and code >> bits - 1 else code) / scale)
+        force_n, row, col, var_rr, var_rc, var_cc = values
+        return cls(force_n, row, col, var_rr, var_rc, var_cc, peak)
+
+
+def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
+    if isinstance(content, Features):
+        if header.mode is not TactileMode.FEATURES:
+            raise ProtocolError(f"features given to a frame of mode {header.mode.name}")
+        return content.pack()
+    if content.dtype != np.uint8 or content.shape not in ((SIDE, SIDE), (WINDOW, WINDOW)):
+        raise ProtocolError(f"taxels: expected uint8 (16, 16) or (8, 8), got {content.dtype} {content.shape}")
+    if header.mode is TactileMode.WINDOW and content.shape == (SIDE, SIDE):
+        row, col = header.origin_row, header.origin_col
+        content = content[row : row + WINDOW, col : col + WINDOW]
+    if content.shape != {TactileMode.WINDOW: (WINDOW, WINDOW), TactileMode.IMAGE: (SIDE, SIDE)}.get(header.mode):
+        raise ProtocolError(f"taxels of shape {content.shape} given to a frame of mode {header.mode.name}")
+    return content.tobytes()
+
+
+def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
+    """Pack a whole tactile frame into payloads of 8 bytes, in PDO order, with the CRC set.
+
+    Args:
+        header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
+        content: taxels uint8, the full pad (16, 16), of which window mode sends its window, or that window (8, 8);
+            or features.
+
+    Raises:
+        ProtocolError: content and mode do not match, or a field does not fit.
+    """
+    if isinstance(content, Features):
+        if not 0 <= content.peak <= 255:
+            raise ProtocolError(f"features: peak {content.peak} is not 0..255")
+        header = replace(header, origin_row=content.peak >> 4, origin_col=content.peak & 0x0F)
+    _check_origin(header)
+    body = _payload_bytes(header, content)
+    start = replace(header, crc=0).pack()[:6]
+    crc = crc16_ccitt(body, crc16_ccitt(start))
+    return [start + crc.to_bytes(2, "little"), *(body[i : i + 8] for i in range(0, len(body), 8))]
