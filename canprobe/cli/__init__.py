@@ -1,0 +1,76 @@
+"""The command line: parse, call, print. One module a command, imported only when it is used.
+
+A command module has `add_parser(commands)`, which adds its parser and sets `run=run`, and `run(args) -> int`. What it
+needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+import canprobe
+from canprobe.cli.interrupts import Terminated
+from canprobe.cli.parser import Parser, did_you_mean
+from canprobe.errors import CanprobeError
+
+COMMANDS = ("scenes", "plan", "run", "up", "emulate", "scan", "vcan", "eds")
+
+_EXAMPLE = """\
+exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure
+
+example:
+  canprobe run cylinder
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command line.
+
+    Args:
+        argv: arguments without the program's name; those of the process by default.
+
+    Returns:
+        The exit status, as DESIGN lists it: 0, 1, 2, 3, 130 or 143; 141 when the reader of our output went away.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args = _parser(arguments).parse_args(arguments)
+        status = int(args.run(args))
+        sys.stdout.flush()
+        return status
+    except SystemExit as leaving:
+        return leaving.code if isinstance(leaving.code, int) else 0
+    except CanprobeError as error:
+        return _complain(str(error), error.exit_status)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter's last flush goes nowhere
+        return 141
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename is not None else ""
+        return _complain(f"{where}{error.strerror or error}", 3)
+    except KeyboardInterrupt as interrupt:
+        return 143 if isinstance(interrupt, Terminated) else 130
+
+
+def _parser(arguments: Sequence[str]) -> Parser:
+    """The parser with the named command only, or with all of them when none is named."""
+    parser = Parser(
+        prog="canprobe", description="A robot cell on a CAN bus: run it, emulate it, look at it.", epilog=_EXAMPLE
+    )
+    parser.add_argument("--version", action="version", version=f"canprobe {canprobe.__version__}")
+    named = next((word for word in arguments if not word.startswith("-")), None)
+    if named is not None and named not in COMMANDS:
+        parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
+    for name in (named,) if named else COMMANDS:
+        importlib.import_module(f"canprobe.cli.{name}").add_parser(commands)
+    return parser
+
+
+def _complain(text: str, status: int) -> int:
+    for line in text.splitlines():
+        print(f"canprobe: {line}", file=sys.stderr)
+    return status

@@ -1,0 +1,53 @@
+"""What commands print: JSON documents, tables, a progress bar."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from typing import TextIO
+
+Progress = Callable[[float, float], None]
+
+
+def print_json(document: object) -> None:
+    """One JSON document on stdout; NaN is refused rather than written."""
+    print(json.dumps(document, indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def print_table(rows: Sequence[Sequence[str]]) -> None:
+    """Rows in columns as wide as they need to be."""
+    if not rows:
+        return
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+
+
+def progress_bar(stream: TextIO | None = None, width: int = 40) -> Progress | None:
+    """A progress bar on a terminal, None elsewhere.
+
+    Args:
+        stream: stderr by default.
+        width: of the bar, in characters.
+
+    Returns:
+        A function of (done, total), both in the same unit, that redraws only when the picture changes.
+    """
+    out = sys.stderr if stream is None else stream
+    if not out.isatty():
+        return None
+    shown = -1
+
+    def show(done: float, total: float) -> None:
+        nonlocal shown
+        share = min(max(done / total, 0.0), 1.0) if total > 0 else 1.0
+        if (percent := int(100 * share)) == shown:
+            return
+        shown = percent
+        bar = "█" * round(width * share)
+        out.write(f"\r{bar.ljust(width, '░')} {percent:3d} %  {done:6.1f} of {total:.1f} s")
+        out.write("\n" if percent == 100 else "")
+        out.flush()
+
+    return show

@@ -1,0 +1,65 @@
+"""`canprobe run`: carry out a scene and write what was measured."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import print_json, progress_bar
+from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, whole
+from canprobe.cli.target import target_of
+
+_EXAMPLE = """\
+Emulated nodes run in this process on the lockstep bus, and in a process of their own on any other.
+
+examples:
+  canprobe run cylinder
+  canprobe run cylinder --seed 3 --out runs/third --json
+  canprobe run cylinder --bus socketcan --channel vcan0
+"""
+
+
+def add_parser(commands: Commands[Parser]) -> None:
+    """Add the command."""
+    parser = commands.add_parser("run", help="carry out a scene", description=__doc__, epilog=_EXAMPLE)
+    add_scene(parser)
+    add_bus(parser)
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the results [runs/<scene>-<time>]")
+    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
+    parser.add_argument(
+        "--duration", metavar="S", type=seconds, help="length of the scene's phase, seconds [the scene's]"
+    )
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the scene; the summary goes to stdout, the progress to stderr."""
+    from canprobe.scene_loader import load_scene
+
+    scene = load_scene(args.scene)
+    target = target_of(args, scene)
+
+    from canprobe import api
+
+    with termination_interrupts():
+        result = api.run(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            bitrate=target.bitrate,
+            out=args.out,
+            seed=args.seed,
+            duration_s=args.duration,
+            progress=progress_bar(),
+        )
+    if args.json:
+        print_json(result.summary)
+    else:
+        print(result.text())
+    if result.summary["completed"]:
+        return 0
+    print(f"canprobe: stopped: {result.summary['stop_reason']}", file=sys.stderr)
+    return 1
