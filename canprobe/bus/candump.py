@@ -1,0 +1,144 @@
+"""candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
+
+Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import TracebackType
+
+from canprobe.bus.clock import Clock
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, TimedFrame
+from canprobe.errors import UsageError
+
+_LINE = re.compile(
+    r"\((?P<s>\d+)\.(?P<us>\d{6})\) (?P<channel>\S+) (?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"(?:R(?P<length>[0-8]?)|(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
+)
+
+
+class CandumpWriter:
+    """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        channel: the name in each line.
+        t0_ns: the time on the frames' clock that is written as 0.
+    """
+
+    def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
+        self._channel = channel
+        self._t0_ns = t0_ns
+        self._file = open(path, "w", encoding="ascii", newline="\n", buffering=1 << 16)  # noqa: SIM115 - closed by close
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Add one frame that was on the bus at `t_ns`."""
+        self._file.write(format_line(self._channel, can_id, data, t_ns - self._t0_ns))
+
+    def close(self) -> None:
+        """Flush and close the file; twice is allowed."""
+        self._file.close()
+
+    def __enter__(self) -> CandumpWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:
+    """Return the line of one frame, newline included; ns below the microsecond are cut off."""
+    seconds, us = divmod(t_ns // 1000, 1_000_000)
+    name = f"{can_id:03X}" if can_id <= 0x7FF else _format_flagged(can_id)
+    payload = "R" if can_id & RTR_FLAG else data.hex().upper()
+    return f"({seconds:010d}.{us:06d}) {channel} {name}#{payload}\n"
+
+
+def _format_flagged(can_id: int) -> str:
+    plain = can_id & ~RTR_FLAG
+    return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
+
+
+def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+    """Read a candump log.
+
+    Yields:
+        (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
+
+    Raises:
+        UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+    """
+    try:
+        with Path(path).open(encoding="ascii", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                if text := line.rstrip("\r\n"):
+                    yield _parse_line(text, path, number)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
+    match = _LINE.fullmatch(text)
+    if match is None:
+        what = "a CAN FD frame; only classic CAN is read" if "##" in text else "no candump line"
+        raise UsageError(f"{path}:{number}: {what}: {text[:60]!r}; expected '(seconds.microseconds) channel ID#DATA'")
+    t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["data"] or "")
+
+
+def _parse_id(match: re.Match[str]) -> int:
+    can_id = int(match["id"], 16)
+    if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
+        can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
+    return can_id | RTR_FLAG if match["data"] is None else can_id
+
+
+class RecordingPort:
+    """A `Port` that writes down what passes through it, sent frames with the time of sending.
+
+    In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
+    than the line above it.
+
+    Args:
+        port: the port to use.
+        writer: where to write; it is not closed with the port.
+    """
+
+    def __init__(self, port: Port, writer: CandumpWriter) -> None:
+        self._port = port
+        self._write = writer.write
+
+    @property
+    def clock(self) -> Clock:
+        """The port's clock."""
+        return self._port.clock
+
+    @property
+    def channel(self) -> str:
+        """The port's channel."""
+        return self._port.channel
+
+    def send_batch(self, frames: Sequence[Frame]) -> None:
+        """Send `frames` and write them down."""
+        t_ns = self._port.clock.now_ns()
+        self._port.send_batch(frames)
+        for can_id, data in frames:
+            self._write(can_id, data, t_ns)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return what arrived, written down."""
+        frames = self._port.drain()
+        for can_id, data, t_ns in frames:
+            self._write(can_id, data, t_ns)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Wait as the port does."""
+        self._port.wait(until_ns)
+
+    def close(self) -> None:
+        """Close the port; the writer stays open."""
+        self._port.close()

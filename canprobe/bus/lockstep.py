@@ -1,0 +1,284 @@
+"""A CAN bus inside one process and one thread, in virtual time: deterministic, and as fast as the processor.
+
+Each participant and each port has one outgoing queue. At one instant the bus first lets everybody speak whose deadline
+has come, then carries the frames one by one: of the heads of all queues the one that wins the arbitration, so lowest
+identifier first, first in first out for each sender, ties by order of attachment. Nobody receives what it sent. Answers
+join at the same instant, until nobody has anything to say. A frame takes no time on the wire.
+
+A deadline that a reception moves to the present is served when the frames already waiting have gone.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Protocol
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, PortCounters, TimedFrame
+from canprobe.errors import BusError, InterfaceError
+
+Recorder = Callable[[int, bytes, int], None]
+"""Called with (can_id, data, t_ns)."""
+
+_MAX_LENGTH = 8
+
+
+class Participant(Protocol):
+    """A node that is a pure function of frames and time; what it returns is sent in that order."""
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """When `advance` has to be called next, `None` if only a frame can wake it."""
+        ...
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        """Begin to live at `t_ns`."""
+        ...
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """Take a frame from the bus."""
+        ...
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """Do what is due at `t_ns`; afterwards the next deadline lies later."""
+        ...
+
+
+class _Node:
+    """The bus's view of one sender: its queue, and where its frames go."""
+
+    __slots__ = ("inboxes", "order", "outbox", "owner", "receivers")
+
+    def __init__(self, owner: Participant | LockstepPort, order: int) -> None:
+        self.owner = owner
+        self.order = order
+        self.outbox: deque[Frame] = deque()
+        self.receivers: tuple[tuple[Callable[[int, bytes, int], Sequence[Frame]], _Node], ...] = ()
+        self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
+
+
+class LockstepBus:
+    """The bus itself. It drives its clock: every wait on the clock runs the participants up to then.
+
+    Args:
+        clock: virtual time, possibly shared with other buses.
+        channel: the bus's name in messages and logs.
+        max_frames: frames at one instant above which the participants are taken to answer each other for ever.
+    """
+
+    def __init__(self, clock: VirtualClock, channel: str = "can0", *, max_frames: int = 20_000) -> None:
+        self.clock = clock
+        self.channel = channel
+        self.recorder: Recorder | None = None
+        self._max_frames = max_frames
+        self._count = 0
+        self._nodes: list[_Node] = []
+        self._participants: tuple[tuple[_Node, Participant], ...] = ()
+        self._heads: list[tuple[int, int, _Node]] = []
+        self._settling = False
+        clock.attach(self)
+
+    def attach(self, participant: Participant) -> None:
+        """Put `participant` on the bus and start it; what it says is carried when time moves or a port is used."""
+        node = self._add(participant)
+        self._queue(node, participant.start(self.clock.now_ns()))
+
+    def detach(self, participant: Participant) -> None:
+        """Cut `participant` off; frames that it had queued are lost."""
+        self._remove(participant)
+
+    def port(self) -> LockstepPort:
+        """Return a new port of a master; several see each other's frames."""
+        port = LockstepPort(self)
+        port.node = self._add(port)
+        return port
+
+    def next_deadline_ns(self) -> int | None:
+        """Return the earliest deadline of all participants; the present if frames are waiting."""
+        if self._heads:
+            return self.clock.now_ns()
+        deadlines = [due for _, owner in self._participants if (due := owner.next_deadline_ns) is not None]
+        return min(deadlines, default=None)
+
+    def settle(self) -> None:
+        """Carry everything due at the present instant.
+
+        Raises:
+            BusError: the participants keep answering without an end.
+        """
+        if self._settling:
+            return
+        self._settling = True
+        t_ns = self.clock.now_ns()
+        limit = rounds_left = self._max_frames
+        try:
+            while self._advance_due(t_ns) or self._heads:
+                limit = self._deliver(t_ns, limit)
+                rounds_left -= 1
+                if rounds_left < 0:
+                    raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
+        finally:
+            self._settling = False
+
+    def send(self, node: _Node, frames: Sequence[Frame]) -> None:
+        """Queue the frames of a port and carry everything due."""
+        self._queue(node, frames)
+        self.settle()
+
+    def remove_port(self, port: LockstepPort) -> None:
+        """Take a closed port off the bus."""
+        self._remove(port)
+
+    def _advance_due(self, t_ns: int) -> bool:
+        advanced = False
+        for node, owner in self._participants:
+            due = owner.next_deadline_ns
+            if due is not None and due <= t_ns:
+                advanced = True
+                self._queue(node, owner.advance(t_ns))
+        return advanced
+
+    def _deliver(self, t_ns: int, limit: int) -> int:
+        """Carry frames until all queues are empty; return how many more may follow at this instant."""
+        heads = self._heads
+        recorder = self.recorder
+        while heads:
+            _, _, sender = heappop(heads)
+            outbox = sender.outbox
+            can_id, data = outbox.popleft()
+            if outbox:
+                heappush(heads, (_arbitration(outbox[0][0]), sender.order, sender))
+            limit -= 1
+            if limit < 0:
+                what = f"{can_id:03X} from {_name(sender.owner)} is frame {self._max_frames + 1} of this instant"
+                raise self._endless(t_ns, what)
+            if recorder is not None:
+                recorder(can_id, data, t_ns)
+            for receive, receiver in sender.receivers:
+                answers = receive(can_id, data, t_ns)
+                if answers:
+                    self._queue(receiver, answers)
+            frame = (can_id, data, t_ns)
+            for put in sender.inboxes:
+                put(frame)
+        return limit
+
+    def _queue(self, node: _Node, frames: Sequence[Frame]) -> None:
+        if not frames:
+            return
+        for can_id, data in frames:
+            if len(data) > _MAX_LENGTH:
+                raise BusError(
+                    f"{self.channel}: {_name(node.owner)} sends {len(data)} bytes with {can_id:03X}; CAN has 8"
+                )
+        if not node.outbox:
+            heappush(self._heads, (_arbitration(frames[0][0]), node.order, node))
+        node.outbox.extend(frames)
+
+    def _add(self, owner: Participant | LockstepPort) -> _Node:
+        if any(node.owner is owner for node in self._nodes):
+            raise BusError(f"{self.channel}: {_name(owner)} is on the bus already")
+        node = _Node(owner, self._count)
+        self._count += 1
+        self._nodes.append(node)
+        self._connect()
+        return node
+
+    def _remove(self, owner: Participant | LockstepPort) -> None:
+        self._nodes = [node for node in self._nodes if node.owner is not owner]
+        self._heads = [head for head in self._heads if head[2].owner is not owner]
+        heapify(self._heads)
+        self._connect()
+
+    def _connect(self) -> None:
+        """Work out once who hears whom."""
+        self._participants = tuple((n, n.owner) for n in self._nodes if not isinstance(n.owner, LockstepPort))
+        for node in self._nodes:
+            node.receivers = tuple((owner.receive, other) for other, owner in self._participants if other is not node)
+            ports = (other.owner for other in self._nodes if other is not node)
+            node.inboxes = tuple(port.inbox.append for port in ports if isinstance(port, LockstepPort))
+
+    def _names_due(self, t_ns: int) -> str:
+        due = (p for _, p in self._participants if p.next_deadline_ns is not None and p.next_deadline_ns <= t_ns)
+        return ", ".join(map(_name, due))
+
+    def _endless(self, t_ns: int, what: str) -> BusError:
+        self._heads.clear()
+        for node in self._nodes:
+            node.outbox.clear()
+        return BusError(f"{self.channel}: no end at {t_ns * 1e-9:.6f} s: {what}")
+
+
+class LockstepPort:
+    """A master's `Port` on a `LockstepBus`; see there for the order of frames."""
+
+    __slots__ = ("_bus", "_open", "counters", "inbox", "node")
+
+    node: _Node
+
+    def __init__(self, bus: LockstepBus) -> None:
+        self._bus = bus
+        self._open = True
+        self.inbox: list[TimedFrame] = []
+        self.counters = PortCounters()
+
+    @property
+    def clock(self) -> VirtualClock:
+        """The bus's virtual clock."""
+        return self._bus.clock
+
+    @property
+    def channel(self) -> str:
+        """The bus's name."""
+        return self._bus.channel
+
+    def send_batch(self, frames: Sequence[Frame]) -> None:
+        """Send `frames` now and let everybody answer; the answers are there when this returns."""
+        self._check_open()
+        self.counters.sent += len(frames)
+        self._bus.send(self.node, frames)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return the frames received so far and forget them."""
+        self._check_open()
+        self._bus.settle()
+        frames = self.inbox.copy()
+        self.inbox.clear()
+        self.counters.received += len(frames)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Move virtual time on until a frame is here, or to `until_ns` with everything due by then done."""
+        self._check_open()
+        clock, inbox = self._bus.clock, self.inbox
+        until_ns = max(until_ns, clock.now_ns())
+        while not inbox and clock.step(until_ns):
+            pass
+
+    def close(self) -> None:
+        """Leave the bus."""
+        if self._open:
+            self._open = False
+            self._bus.remove_port(self)
+
+    def _check_open(self) -> None:
+        if not self._open:
+            raise InterfaceError(f"{self.channel}: this port is closed")
+
+
+def _arbitration(can_id: int) -> int:
+    """Return the bits in the order in which the wire arbitrates them: the lowest value wins (ISO 11898-1)."""
+    if can_id <= 0x7FF:
+        return can_id << 21
+    remote = 1 if can_id & RTR_FLAG else 0
+    if can_id & EFF_FLAG:
+        can_id &= 0x1FFFFFFF
+        return (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1 | remote
+    return (can_id & 0x7FF) << 21 | remote << 20
+
+
+def _name(owner: object) -> str:
+    """Name a participant in a message: its own `name` if it has one."""
+    return str(getattr(owner, "name", type(owner).__name__))
