@@ -1,0 +1,95 @@
+"""The EDS files of the cell's nodes: the contract from which master and emulator are both configured.
+
+    puma260_joint   nodes 1..6, a CiA 402 drive a joint       vendor CA5Eh, product 0260h, revision 0001_0000h
+    tactile_array   node 16, 16 × 16 taxels                   vendor CA5Eh, product 1616h, revision 0001_0000h
+
+The vendor number is this project's own choice; CiA has not assigned it. Source of the format: CiA 306-1.
+"""
+
+from __future__ import annotations
+
+import configparser
+import difflib
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.errors import EdsError
+
+if TYPE_CHECKING:
+    import canopen
+
+_FOLDER = Path(__file__).resolve().parent
+
+
+def eds_names() -> tuple[str, ...]:
+    """Names of the packaged EDS files, sorted, without the suffix."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.eds")))
+
+
+def eds_path(name: str) -> Path:
+    """Path of a packaged EDS file.
+
+    Args:
+        name: with or without the suffix .eds.
+
+    Raises:
+        EdsError: no packaged file has this name.
+    """
+    names = eds_names()
+    stem = name.removesuffix(".eds")
+    if stem in names:
+        return _FOLDER / f"{stem}.eds"
+    near = difflib.get_close_matches(stem, names, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
+    raise EdsError(f"EDS {name!r}: no such packaged file: {hint}")
+
+
+def _resolve(source: str | os.PathLike[str]) -> Path:
+    """A path stays a path; a bare word names a packaged file, unless a file of that name lies here."""
+    path = Path(source)
+    if path.is_file():
+        return path
+    if isinstance(source, str) and path.name == source:
+        return eds_path(source)
+    raise EdsError(f"EDS {str(source)!r}: no such file")
+
+
+def _check_values(path: Path, od: canopen.ObjectDictionary) -> None:
+    """Canopen skips a default that it cannot convert; a contract must not lose one silently."""
+    for entry in od.values():
+        for var in entry.values() if hasattr(entry, "values") else (entry,):
+            if getattr(var, "default_raw", "") != "" and var.default is None:
+                raise EdsError(
+                    f"{path}: [{var.index:04X}] sub {var.subindex:X} {var.name}: DefaultValue={var.default_raw} "
+                    f"does not convert to data type {var.data_type:04X}h"
+                )
+
+
+def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
+    """Load an EDS file into canopen's object dictionary for one node.
+
+    Args:
+        name_or_path: a packaged name (see `eds_names`) or the path of any EDS file.
+        node_id: 1..127, put in for $NODEID.
+
+    Raises:
+        EdsError: missing, unreadable or not an EDS file; names the file and what is wrong in it.
+    """
+    from canopen.objectdictionary import eds  # late: the command line's --help must not pay for it
+
+    if not 1 <= node_id <= 127:
+        raise EdsError(f"EDS {str(name_or_path)!r}: node id {node_id} is not 1..127")
+    path = _resolve(name_or_path)
+    try:
+        with path.open(encoding="utf-8") as file:
+            od: canopen.ObjectDictionary = eds.import_eds(file, node_id)  # type: ignore[no-untyped-call]
+    except UnicodeDecodeError as error:
+        raise EdsError(f"{path}: not a text file: {error}") from error
+    except (configparser.Error, KeyError, ValueError, OSError) as error:
+        raise EdsError(f"{path}: not a usable EDS file: {' '.join(str(error).split())}") from error
+    if len(od) == 0:
+        raise EdsError(f"{path}: not a usable EDS file: no object in it")
+    _check_values(path, od)
+    od.node_id = node_id
+    return od
