@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import configparser
 import difflib
+import io
 import os
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,8 +83,10 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
         raise EdsError(f"EDS {str(name_or_path)!r}: node id {node_id} is not 1..127")
     path = _resolve(name_or_path)
     try:
-        with path.open(encoding="utf-8") as file:
-            od: canopen.ObjectDictionary = eds.import_eds(file, node_id)  # type: ignore[no-untyped-call]
+        text = path.read_text(encoding="utf-8")
+        if "[DeviceInfo]" not in text:  # mandatory; canopen would warn through a method that Python 3.13 dropped
+            raise EdsError(f"{path}: not a usable EDS file: no section [DeviceInfo]")
+        od: canopen.ObjectDictionary = eds.import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
     except UnicodeDecodeError as error:
         raise EdsError(f"{path}: not a text file: {error}") from error
     except (configparser.Error, KeyError, ValueError, OSError) as error:
