@@ -15,7 +15,7 @@ TaskKind = Literal["scan", "press", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
 TactileModeName = Literal["window", "image", "features"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
-ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "quadric"]
+ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
 
@@ -93,15 +93,17 @@ class ProbeSettings:
 class ObjectSettings:
     """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
 
-    The object frame's origin lies on the surface with z outward; the cylinder's axis is its x, a saddle is
-    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex), and a quadric is
-    XᵀSX = 0 with S = matrix, in metres, negative inside.
+    The object frame's origin lies on the surface with z outward. The cylinder's axis runs along x; a saddle is
+    z = −x²/(2 radius_x) + y²/(2 radius_y), convex along x and hollow along y; a bowl is the inside of a sphere, seen
+    from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
-    radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder"), required=True)] = None
-    radius_x_mm: Annotated[float | None, Range(-1e5, 1e5), Only("kind", ("saddle",), required=True)] = None
-    radius_y_mm: Annotated[float | None, Range(-1e5, 1e5), Only("kind", ("saddle",), required=True)] = None
+    radius_mm: Annotated[
+        float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder", "bowl"), required=True)
+    ] = None
+    radius_x_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_y_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("saddle",), required=True)] = None
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )
@@ -123,6 +125,8 @@ class TaskSettings:
     approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCHING] = 4.0
     start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)  # expected contact point, approached along −normal
     approach_normal: Annotated[Vec3, Direction(), TOUCHING] = (0.0, 0.0, 1.0)  # normalised by its users
+    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0  # above start_mm before the approach
+    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 8.0  # below start_mm where it gives up
     strategy: Annotated[Strategy, SCANNING] = "weave"
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
     heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -86,10 +87,15 @@ def _main_method_repeated(method: str | None, also: tuple[str, ...] | None) -> s
     return f'expected methods besides the main one, got "{method}", which shape.method has already'
 
 
-def _saddle_radii(kind: str | None, x: float | None, y: float | None) -> str | None:
-    if kind != "saddle" or x is None or y is None or x * y < 0:
+def _heading_along_normal(kind: str, normal: tuple[float, ...] | None, heading: float | None) -> str | None:
+    if kind != "scan" or normal is None or heading is None:
         return None
-    return f"expected the radii of a saddle to have opposite signs, got {x:g} and {y:g}"
+    along = (normal[0] * math.cos(math.radians(heading)) + normal[1] * math.sin(math.radians(heading))) / math.hypot(
+        *normal
+    )
+    if abs(along) < 0.99:
+        return None
+    return f"expected a heading across task.approach_normal, got {heading:g}, which runs along it"
 
 
 def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
@@ -109,7 +115,7 @@ RULES: tuple[Rule, ...] = (
     Rule("object", ("task.kind", "sensor.emulated", "object"), _object_missing),
     Rule("sensor.emulated", ("task.kind", "arm.emulated", "sensor.emulated"), _half_emulated),
     Rule("shape.also", ("shape.method", "shape.also"), _main_method_repeated),
-    Rule("object.radius_y_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _saddle_radii),
+    Rule("task.heading_deg", ("task.kind", "task.approach_normal", "task.heading_deg"), _heading_along_normal),
     Rule("task.force_n", ("task.kind", "task.force_n", "limits.force_max_n"), _force_target),
     Rule("sensor.rate_hz", ("cycle.rate_hz", "sensor.rate_hz"), _sensor_rate),
 )

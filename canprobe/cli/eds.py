@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from importlib import resources
-from pathlib import Path
 
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean
-from canprobe.errors import EdsError
+from canprobe.cli.parser import Commands, Parser, add_json
 
 _EXAMPLE = """\
 examples:
   canprobe eds list
-  canprobe eds path puma260_joint.eds
+  canprobe eds path puma260_joint
 """
 
 
@@ -27,7 +24,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_json(listing)
     listing.set_defaults(run=run, action="list")
     path = actions.add_parser(
-        "path", help="print where one of them is", epilog="example:\n  canprobe eds path puma260_joint.eds\n"
+        "path", help="print where one of them is", epilog="example:\n  canprobe eds path puma260_joint\n"
     )
     path.add_argument("name", metavar="NAME", help="name of a packaged file, with or without .eds")
     path.set_defaults(run=run, action="path")
@@ -35,20 +32,12 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of the files, or the path of one."""
-    files = {path.name: path for path in sorted(Path(str(resources.files("canprobe.eds"))).glob("*.eds"))}
+    from canprobe.eds import eds_names, eds_path
+
     if args.action == "path":
-        print(_find(args.name, files))
+        print(eds_path(args.name))
     elif args.json:
-        print_json(sorted(files))
+        print_json(list(eds_names()))
     else:
-        print("\n".join(sorted(files)))
+        print("\n".join(eds_names()))
     return 0
-
-
-def _find(name: str, files: dict[str, Path]) -> Path:
-    wanted = name if name.endswith(".eds") else f"{name}.eds"
-    if wanted not in files:
-        raise EdsError(
-            f"{name}: no such packaged EDS{did_you_mean(wanted, files)}; there are: {', '.join(sorted(files))}"
-        )
-    return files[wanted]
