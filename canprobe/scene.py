@@ -161,7 +161,8 @@ class LimitSettings:
 class ServoSettings:
     """`[servo]`: the tactile servo's gains."""
 
-    force_bandwidth_hz: Annotated[float, Range(0, 50, open_low=True)] = 4.0
+    surface_height_hz: Annotated[float, Range(0, 50, open_low=True)] = 8.0  # how fast its surface follows the samples
+    surface_tilt_hz: Annotated[float, Range(0, 50, open_low=True)] = 6.0  # and that surface's normal
     drive_lag_ms: Annotated[float, Range(0, 100)] = 10.6  # of the drives behind a ramp: 2/(2π·30 Hz)
 
 

@@ -1,0 +1,1 @@
+"""The master side: bring-up, drives, sensor, the cycle, supervision, safe stop and the run log."""

@@ -1,0 +1,95 @@
+"""Plan and port → cell; plan → the controller of its task. Only what the scene needs is made."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+
+from canprobe.bus.port import Port
+from canprobe.cell.bringup import BringUpTimes
+from canprobe.cell.cell import Cell
+from canprobe.cell.configuration import make_setups
+from canprobe.cell.cycle import CycleSettings
+from canprobe.cell.drives import DriveAxis, DriveGroup
+from canprobe.cell.measurement import Controller
+from canprobe.cell.tactile import TactileReceiver
+from canprobe.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Plan,
+)
+from canprobe.protocol.tactile import FrameAssembler, TactileMode
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene import Scene
+
+TACTILE_DEADLINE_CYCLES = 2
+TACTILE_TIMEOUT_PERIODS = 6
+
+
+def make_cell(
+    plan: Plan, port: Port, say: Callable[[str], None] = lambda _: None, times: BringUpTimes | None = None
+) -> Cell:
+    """The cell of a plan on a port; nothing is sent before it is entered."""
+    settings = CycleSettings(
+        period_ns=plan.sync.period_ns,
+        sync_overflow=plan.sync.overflow,
+        heartbeat_cycles=max(1, HEARTBEAT_PRODUCED_MS * 1_000_000 // plan.sync.period_ns),
+        master_id=MASTER_NODE_ID,
+    )
+    return Cell(
+        port,
+        make_setups(plan),
+        settings,
+        _drives(plan),
+        _tactile(plan),
+        HEARTBEAT_CONSUMED_MS * 1_000_000,
+        say,
+        times,
+    )
+
+
+def _drives(plan: Plan) -> DriveGroup | None:
+    arm = plan.scene.arm
+    if arm is None:
+        return None
+    axes = tuple(
+        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, plan.pdos_of(n, "rpdo")[0].layout) for n in arm.node_ids
+    )
+    return DriveGroup(axes, MODELS[arm.model])
+
+
+def _tactile(plan: Plan) -> TactileReceiver | None:
+    sensor = plan.scene.sensor
+    if sensor is None:
+        return None
+    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(sensor.node_id, "tpdo")]
+    deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
+    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline)
+    return TactileReceiver(assembler, cob_ids, plan.sync.overflow)
+
+
+def tactile_timeout(scene: Scene) -> int:
+    """Cycles without a tactile sample after which a task gives up."""
+    assert scene.sensor is not None
+    return math.ceil(TACTILE_TIMEOUT_PERIODS * scene.cycle.rate_hz / scene.sensor.rate_hz)
+
+
+def make_task(plan: Plan) -> Controller:
+    """The controller of the plan's task; what the task does not need is not even imported."""
+    task = plan.scene.task
+    period_s = plan.sync.period_ns * 1e-9
+    if task.kind == "free":
+        from canprobe.cell.tasks.untouched import FreeTask
+
+        return FreeTask(np.radians(task.swing_deg), task.swing_period_s, task.duration_s, period_s)
+    if task.kind == "listen":
+        from canprobe.cell.tasks.untouched import ListenTask
+        from canprobe.touch.patch import PatchCalibration
+
+        return ListenTask(PatchCalibration(), task.duration_s, period_s, tactile_timeout(plan.scene))
+    from canprobe.cell.tasks.build import make_touch_task
+
+    return make_touch_task(plan, period_s, tactile_timeout(plan.scene))

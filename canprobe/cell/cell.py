@@ -1,0 +1,219 @@
+"""The cell: brought up, run cycle by cycle under supervision, and always left with the drives disabled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+
+from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.port import Port
+from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
+from canprobe.cell.cycle import Cycle, CycleSettings
+from canprobe.cell.drives import DriveGroup
+from canprobe.cell.log import RunLog
+from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.tactile import TactileReceiver
+from canprobe.cell.watch import NodeWatch
+from canprobe.errors import CanprobeError, NodeError, SafetyStop
+from canprobe.protocol.cia402 import POWERED_STATES, DriveState
+from canprobe.protocol.frames import NmtState
+
+ENABLE_TIMEOUT_S = 2.0
+STOP_TIMEOUT_S = 0.5
+MISSED_LIMIT = 5
+"""Cycles without a TPDO after which a drive is lost, as many SYNCs as a drive waits for its master."""
+
+
+class Cell:
+    """One cell on one bus. A context manager: entering brings the nodes up, leaving stops them safely.
+
+    Args:
+        port: the bus; it is closed on leaving.
+        setups: the nodes to bring up.
+        settings: times of the cycle.
+        drives: the arm, or None.
+        tactile: the sensor, or None.
+        heartbeat_timeout_ns: silence after which a node is lost.
+        say: called with each step of bring-up and stop.
+        times: time-outs of bring-up.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        setups: tuple[NodeSetup, ...],
+        settings: CycleSettings,
+        drives: DriveGroup | None,
+        tactile: TactileReceiver | None,
+        heartbeat_timeout_ns: int,
+        say: Callable[[str], None] = lambda _: None,
+        times: BringUpTimes | None = None,
+    ) -> None:
+        self.log = RunLog()
+        self.drives = drives
+        self.tactile = tactile
+        self.faults: list[str] = []
+        self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, heartbeat_timeout_ns)
+        self.cycle: Cycle | None = None
+        self._port = port
+        self._settings = settings
+        self._say = say
+        self._network = PumpedNetwork(port, other=self._other)
+        self._bring_up = BringUp(self._network, self.watch, setups, times, say)
+        self._alarms = 0
+
+    def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """A frame that arrived during an SDO transfer and is not canopen's."""
+        if self.tactile is not None and can_id in self.tactile.cob_ids:
+            self.tactile.push(can_id, data, t_ns)
+        else:
+            self.watch.push(can_id, data, t_ns)
+
+    def __enter__(self) -> Cell:
+        try:
+            self._bring_up.run()
+            self.cycle = Cycle(
+                self._port, self._settings, self.drives, self.tactile, self.watch, self._network.feed
+            )
+            self.watch.start(self._port.clock.now_ns())
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> None:
+        """Enable the drives, then run ``controller`` until it says done.
+
+        Args:
+            controller: has ``step(measurement) → command``, or is such a function.
+            progress: called after each cycle.
+
+        Raises:
+            SafetyStop: the controller or the supervision stopped the cell.
+            NodeError: a node was lost or failed.
+        """
+        step = controller.step if hasattr(controller, "step") else controller
+        self._enable()
+        assert self.cycle is not None
+        while True:
+            measurement = self.cycle.begin()
+            self._supervise(measurement)
+            command = step(measurement)
+            self.cycle.end(command)
+            self._record(measurement, command)
+            progress(measurement)
+            if command.stop_reason is not None:
+                raise SafetyStop(command.stop_reason)
+            if command.done:
+                return
+
+    # enabling and supervision
+
+    def _enable(self) -> None:
+        if self.drives is None:
+            return
+        self._say("enable the drives")
+        self.drives.goal = DriveState.OPERATION_ENABLED
+        if not self._cycle_until(DriveState.OPERATION_ENABLED, ENABLE_TIMEOUT_S):
+            i, state = next(
+                (i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED
+            )
+            raise NodeError(
+                self.drives.axes[i].node_id,
+                f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
+                + "".join(f"; {event}" for event in self.watch.alarms()[-1:]),
+            )
+
+    def _cycle_until(self, *states_and_timeout: DriveState | float) -> bool:
+        """Cycle with held targets until every drive is in one of the states; False after the time-out (s)."""
+        *states, timeout = states_and_timeout
+        assert self.cycle is not None and self.drives is not None and isinstance(timeout, float)
+        for _ in range(int(timeout * 1e9 / self._settings.period_ns)):
+            measurement = self.cycle.begin()
+            reached = measurement.q is not None and self.drives.all_in(*states)  # type: ignore[arg-type]
+            self.cycle.end(None)
+            self._record(measurement, None)
+            if reached:
+                return True
+        return False
+
+    def _supervise(self, measurement: Measurement) -> None:
+        self._check_alarms()
+        now = self._port.clock.now_ns()
+        if (node_id := self.watch.silent(now)) is not None:
+            raise NodeError(node_id, "lost: no heartbeat within its time-out")
+        if (node_id := self.watch.not_in(NmtState.OPERATIONAL)) is not None:
+            raise NodeError(node_id, f"left operation: NMT state {self.watch.states[node_id].name}")
+        if self.watch.foreign:
+            raise SafetyStop(f"another master is on the bus: {self.watch.foreign[0]}")
+        if self.drives is None:
+            return
+        for axis, age in zip(self.drives.axes, measurement.q_age, strict=True):
+            if age > MISSED_LIMIT:
+                raise NodeError(axis.node_id, f"lost: no TPDO for {age} cycles")
+        if not measurement.enabled:
+            self._raise_not_enabled()
+
+    def _check_alarms(self) -> None:
+        alarms = self.watch.alarms()
+        for event in alarms[self._alarms :]:
+            self.faults.append(str(event))
+        self._alarms = len(alarms)
+
+    def _raise_not_enabled(self) -> None:
+        assert self.drives is not None
+        i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
+        node_id = self.drives.axes[i].node_id
+        why = "".join(f"; {e}" for e in self.watch.alarms() if e.node_id == node_id)
+        raise NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
+
+    def _record(self, measurement: Measurement, command: Command | None) -> None:
+        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
+        if self.drives is not None:
+            row["q_rad"] = measurement.q
+            row["statusword"] = measurement.statuswords
+            row["torque_permille"] = measurement.torque_permille
+        if command is not None:
+            if command.q_target is not None:
+                row["q_target_rad"] = command.q_target
+            row.update(command.columns)
+        self.log.add(row)
+
+    # the way out
+
+    def close(self) -> None:
+        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures go to ``faults``."""
+        for action in (self._stop_drives, self._bring_up.release):
+            self._try(action)
+        self._try(self._port.close)
+
+    def _try(self, action: Callable[[], None]) -> None:
+        """Run one step of the way out to its end: an interrupt starts it again once, a failure is noted."""
+        for _ in range(2):
+            try:
+                action()
+            except KeyboardInterrupt:
+                continue
+            except CanprobeError as error:
+                self.faults.append(f"while stopping: {error}")
+            return
+
+    def _stop_drives(self) -> None:
+        if self.drives is None or self.cycle is None or not self.drives.heard_all:
+            return
+        self._say("stop and disable the drives")
+        off = tuple(state for state in DriveState if state not in POWERED_STATES)
+        self.drives.goal = DriveState.QUICK_STOP_ACTIVE
+        self._cycle_until(*off, DriveState.QUICK_STOP_ACTIVE, STOP_TIMEOUT_S)
+        self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
+        if not self._cycle_until(*disabled, STOP_TIMEOUT_S):
+            stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
+            self.faults.append(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")

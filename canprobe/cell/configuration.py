@@ -1,0 +1,119 @@
+"""Plan → what is written into each node in bring-up."""
+
+from __future__ import annotations
+
+import numpy as np
+from canopen import ObjectDictionary
+
+from canprobe.cell.bringup import NodeSetup, Write
+from canprobe.eds import load_eds
+from canprobe.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Direction,
+    Plan,
+    PlannedNode,
+    PlannedPdo,
+)
+from canprobe.protocol.cia402 import OperationMode
+from canprobe.protocol.tactile import TactileMode
+from canprobe.robot.puma260 import MODELS, PumaModel
+
+INVALID = 1 << 31
+COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
+MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
+SYNC_START_VALUE = 1
+TARE = 0x65726174  # "tare", as 1010h has "save"
+FOLLOWING_WINDOW_DEG = 5.0
+FOLLOWING_TIMEOUT_MS = 50
+QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
+ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
+
+
+def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
+    """What every planned node must be and become, drives first."""
+    return tuple(_setup(plan, node) for node in plan.nodes)
+
+
+def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
+    dictionary = load_eds(node.eds, node.node_id)
+    numbers = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
+    specific = _drive_writes(plan, node) if node.kind == "drive" else _sensor_writes(plan)
+    return NodeSetup(
+        node_id=node.node_id,
+        name=node.role,
+        eds=node.eds,
+        dictionary=dictionary,
+        identity={sub: value for sub, value in enumerate(numbers, start=1) if value is not None},
+        writes=(*_pdo_writes(plan, node, dictionary), *_common_writes(plan), *specific),
+    )
+
+
+def _common_writes(plan: Plan) -> list[Write]:
+    return [
+        Write(0x1006, 0, 0),  # 1019h may only change while 1006h is 0
+        Write(0x1019, 0, plan.sync.overflow),
+        Write(0x1006, 0, plan.sync.period_us),
+        Write(0x1017, 0, HEARTBEAT_PRODUCED_MS),
+        Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS),
+    ]
+
+
+def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: ObjectDictionary) -> list[Write]:
+    writes = []
+    for direction, number in node.switched_off:
+        index = COMMUNICATION[direction] + number - 1
+        writes.append(Write(index, 1, (dictionary[index][1].default or 0) | INVALID))
+    for direction in COMMUNICATION:
+        for pdo in plan.pdos_of(node.node_id, direction):
+            writes += _one_pdo(pdo, dictionary)
+    return writes
+
+
+def _one_pdo(pdo: PlannedPdo, dictionary: ObjectDictionary) -> list[Write]:
+    communication = COMMUNICATION[pdo.direction] + pdo.number - 1
+    mapping = MAPPING[pdo.direction] + pdo.number - 1
+    writes = [Write(communication, 1, pdo.cob_id | INVALID), Write(communication, 2, pdo.transmission_type)]
+    if pdo.event_timer_ms:
+        writes.append(Write(communication, 5, pdo.event_timer_ms))
+    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240 and 6 in dictionary[communication]:
+        writes.append(Write(communication, 6, SYNC_START_VALUE))
+    if dictionary[mapping][0].access_type == "rw":
+        writes.append(Write(mapping, 0, 0))
+        writes += [Write(mapping, sub, entry.word) for sub, entry in enumerate(pdo.entries, start=1)]
+        writes.append(Write(mapping, 0, len(pdo.entries)))
+    return [*writes, Write(communication, 1, pdo.cob_id)]
+
+
+def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
+    arm = plan.scene.arm
+    assert arm is not None and plan.sync.interpolation_100us is not None
+    model, axis = MODELS[arm.model], arm.node_ids.index(node.node_id)
+    low, high = software_limits(model)
+    window = round(float(model.counts[axis, axis]) * np.radians(FOLLOWING_WINDOW_DEG))
+    return [
+        Write(0x6060, 0, OperationMode.CYCLIC_SYNC_POSITION),
+        Write(0x60C2, 1, plan.sync.interpolation_100us),
+        Write(0x60C2, 2, -4),
+        Write(0x6065, 0, window),
+        Write(0x6066, 0, FOLLOWING_TIMEOUT_MS),
+        Write(0x607D, 1, int(low[axis])),
+        Write(0x607D, 2, int(high[axis])),
+        Write(0x605A, 0, QUICK_STOP_AND_DISABLE),
+        Write(0x6007, 0, ABORT_QUICK_STOP),
+    ]
+
+
+def software_limits(model: PumaModel) -> tuple[np.ndarray, np.ndarray]:
+    """Extremes of each motor (6,) and (6,), counts, over the joints' ranges; the coupled ones span both joints'."""
+    a, b = model.counts * model.q_min, model.counts * model.q_max
+    return np.floor(np.minimum(a, b).sum(axis=1)), np.ceil(np.maximum(a, b).sum(axis=1))
+
+
+def _sensor_writes(plan: Plan) -> list[Write]:
+    assert plan.scene.sensor is not None
+    writes = [Write(0x2000, 0, TactileMode[plan.scene.sensor.mode.upper()])]
+    if plan.scene.task.kind in ("scan", "press"):  # nothing touches the array yet; a listening cell knows no such moment
+        writes.append(Write(0x2003, 0, TARE, read_back=False))
+    return writes

@@ -1,0 +1,166 @@
+"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else of the world."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from canprobe.bus.clock import elapsed_ns
+from canprobe.bus.port import Port, TimedFrame
+from canprobe.cell.drives import DriveGroup
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.tactile import TactileReceiver
+from canprobe.cell.watch import NodeWatch
+from canprobe.protocol.cia402 import DriveState
+from canprobe.protocol.frames import NmtState, pack_heartbeat
+from canprobe.protocol.sync import SyncCounter, pack_sync
+
+COLLECT_SHARE = 0.5
+"""Share of the period after SYNC in which TPDOs are waited for."""
+
+
+@dataclass(frozen=True, slots=True)
+class CycleSettings:
+    """Times of the cycle.
+
+    Attributes:
+        period_ns: from SYNC to SYNC.
+        sync_overflow: of the SYNC counter (1019h).
+        heartbeat_cycles: cycles between two heartbeats of the master.
+        master_id: node id of the master's heartbeat.
+    """
+
+    period_ns: int
+    sync_overflow: int
+    heartbeat_cycles: int
+    master_id: int
+
+
+@dataclass(slots=True)
+class CycleStatistics:
+    """What the cycle counted and timed: one entry a cycle in the lists."""
+
+    overruns: int = 0
+    period_error_ns: list[int] = field(default_factory=list)
+    compute_ns: list[int] = field(default_factory=list)
+
+
+class Cycle:
+    """One cycle at a time, on absolute deadlines.
+
+    Args:
+        port: the bus.
+        settings: times.
+        drives: the arm's drives; None in a scene without an arm.
+        tactile: the sensor's receiver; None in a scene without a sensor.
+        watch: sees heartbeats and EMCYs.
+        other: takes what nobody here expects (SDO answers).
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        settings: CycleSettings,
+        drives: DriveGroup | None,
+        tactile: TactileReceiver | None,
+        watch: NodeWatch,
+        other: Callable[[list[TimedFrame]], None],
+    ) -> None:
+        self.number = -1
+        self.statistics = CycleStatistics()
+        self.t_first_ns = port.clock.now_ns() + settings.period_ns
+        self.t_ns = 0
+        self._port = port
+        self._s = settings
+        self._drives = drives
+        self._tactile = tactile
+        self._watch = watch
+        self._other = other
+        self._sync = SyncCounter(settings.sync_overflow)
+        self._deadline = self.t_first_ns
+        self._feedback = drives.feedback_ids if drives is not None else frozenset()
+        self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
+        self._started_ns = 0
+        self._sync_times: deque[int] = deque(maxlen=settings.sync_overflow)
+
+    def begin(self) -> Measurement:
+        """Sleep to the deadline, send SYNC, collect the answers."""
+        clock = self._port.clock
+        clock.sleep_until_ns(self._deadline)
+        self._route(self._port.drain())
+        woken = clock.now_ns()
+        self._count_wake(woken)
+        self.number += 1
+        self.t_ns = self._deadline - self.t_first_ns
+        self._sync_times.append(self.t_ns)
+        counter = self._sync.next()
+        self._port.send_batch([pack_sync(counter)])
+        if self._drives is not None:
+            self._drives.begin(self.number)
+        self._collect(self._deadline + int(self._s.period_ns * COLLECT_SHARE))
+        self._started_ns = elapsed_ns()
+        return self._measure(counter or 0)
+
+    def _count_wake(self, woken_ns: int) -> None:
+        error = woken_ns - self._deadline
+        self.statistics.period_error_ns.append(error)
+        if error > self._s.period_ns // 2:
+            self.statistics.overruns += 1
+            self._deadline += error // self._s.period_ns * self._s.period_ns
+
+    def _collect(self, until_ns: int) -> None:
+        port, clock, drives = self._port, self._port.clock, self._drives
+        self._route(port.drain())
+        if drives is None:
+            return
+        while not drives.complete and clock.now_ns() < until_ns:
+            port.wait(until_ns)
+            self._route(port.drain())
+        drives.end_collect()
+
+    def _route(self, frames: list[TimedFrame]) -> None:
+        rest: list[TimedFrame] = []
+        for frame in frames:
+            can_id, data, t_ns = frame
+            if can_id in self._feedback:
+                self._drives.push(can_id, data)  # type: ignore[union-attr]
+            elif can_id in self._taxels:
+                self._tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            elif not self._watch.push(can_id, data, t_ns):
+                rest.append(frame)
+        if rest:
+            self._other(rest)
+
+    def _measure(self, counter: int) -> Measurement:
+        drives, tactile = self._drives, self._tactile
+        sample = tactile.take(self.number, counter, self._sync_times) if tactile is not None else None
+        newest = tactile.newest_cycle if tactile is not None else None
+        age = self.number - newest if newest is not None else None
+        if drives is None:
+            return Measurement(self.number, self.t_ns, enabled=True, tactile=sample, tactile_age=age)
+        return Measurement(
+            cycle=self.number,
+            t_ns=self.t_ns,
+            q=drives.joints() if drives.heard_all else None,
+            q_age=drives.ages(),
+            torque_permille=tuple(drives.torque_permille),
+            statuswords=tuple(drives.statuswords),
+            enabled=drives.all_in(DriveState.OPERATION_ENABLED),
+            tactile=sample,
+            tactile_age=age,
+        )
+
+    def end(self, command: Command | None) -> None:
+        """Send the commands of this cycle and set the next deadline."""
+        frames = []
+        if self._drives is not None:
+            if command is not None:
+                self._drives.set_target(command.q_target)
+            frames = self._drives.frames()
+        if self.number % self._s.heartbeat_cycles == 0:
+            frames.append(pack_heartbeat(self._s.master_id, NmtState.OPERATIONAL))
+        if frames:
+            self._port.send_batch(frames)
+        self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)
+        self._deadline += self._s.period_ns

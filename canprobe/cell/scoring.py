@@ -1,0 +1,107 @@
+"""Scores of a run against the plant's truth: contact over the scan, shape after the first 20 mm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.tasks.shape import ShapeRecord
+
+Array = NDArray[np.float64]
+RUN_IN_M = 0.020
+"""Path that an estimator is given before its answers count."""
+
+
+def curvature_tensor(kappa: Array, direction1: Array, direction2: Array) -> Array:
+    """Curvature tensor (3, 3), 1/m, from principal curvatures (2,) and unit directions (3,)."""
+    return kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
+
+
+def score_contact(truth: Mapping[str, Array], first: int, last: int, target_n: float) -> dict[str, float | None]:
+    """Force, contact and speed over cycles ``first`` ≤ k < ``last``.
+
+    Args:
+        truth: columns of the plant's truth, one row a SYNC.
+        first, last: the scan, as SYNC numbers.
+        target_n: wanted force.
+    """
+    force = truth["force"][first:last]
+    points = truth["contact_point"][first:last]
+    times = truth["t_s"][first:last]
+    if len(force) < 2:
+        return dict.fromkeys(("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s"))
+    travelled = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return {
+        "force_rms_error_n": float(np.sqrt(np.mean((force - target_n) ** 2))),
+        "force_max_n": float(truth["force"].max()),
+        "contact_fraction": float(np.mean(force > 0)),
+        "speed_mean_m_s": travelled / float(times[-1] - times[0]),
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeScore:
+    """Errors of one estimator over a run; None where nothing could be scored.
+
+    Attributes:
+        kappa_true: mean true principal curvatures over the scored estimates (1/m).
+        kappa_est: mean estimated ones (1/m).
+        kappa_rms: RMS Frobenius norm of K_est − K_true (1/m).
+        kappa_rms_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
+        normal_rms_deg, position_rms_mm: of the estimated contact frame.
+        estimates: how many were scored.
+        observed_fraction: share of the answers after the run-in that observed all curvature.
+    """
+
+    kappa_true: tuple[float, float] | None
+    kappa_est: tuple[float, float] | None
+    kappa_rms: float | None
+    kappa_rms_percent: float | None
+    normal_rms_deg: float | None
+    position_rms_mm: float | None
+    estimates: int
+    observed_fraction: float | None
+
+
+def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync_times: Array) -> ShapeScore:
+    """Score estimates against the truth at the instants of their last samples.
+
+    Args:
+        records: the estimates.
+        truth: columns of the plant's truth, one row a SYNC.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+    """
+    late = [r for r in records if r.travelled_m >= RUN_IN_M]
+    seen = [r for r in late if bool(np.all(r.estimate.observed))]
+    if not seen:
+        return ShapeScore(None, None, None, None, None, None, 0, 0.0 if late else None)
+    rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen])
+    errors, norms, tilts, offsets = [], [], [], []
+    for record, row in zip(seen, rows, strict=True):
+        T = record.estimate.T_frame_contact
+        tensor = curvature_tensor(truth["kappa"][row], truth["direction1"][row], truth["direction2"][row])
+        K_true = T[:3, :2].T @ tensor @ T[:3, :2]
+        errors.append(float(np.sum((record.estimate.K - K_true) ** 2)))
+        norms.append(float(np.sum(K_true**2)))
+        cosine = float(-T[:3, 2] @ truth["contact_normal"][row])
+        sine = float(np.linalg.norm(T[:3, 2] + truth["contact_normal"][row] * cosine))
+        tilts.append(np.arctan2(sine, cosine) ** 2)
+        offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
+    rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
+    return ShapeScore(
+        kappa_true=_pair(truth["kappa"][rows].mean(axis=0)),
+        kappa_est=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
+        kappa_rms=rms,
+        kappa_rms_percent=100 * rms / scale if scale > 1e-9 else None,
+        normal_rms_deg=float(np.degrees(np.sqrt(np.mean(tilts)))),
+        position_rms_mm=float(np.sqrt(np.mean(offsets)) * 1e3),
+        estimates=len(seen),
+        observed_fraction=len(seen) / len(late),
+    )
+
+
+def _pair(values: Array) -> tuple[float, float]:
+    return float(values[0]), float(values[1])

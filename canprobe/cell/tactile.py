@@ -1,0 +1,55 @@
+"""The sensor as the cell sees it: whole frames, placed in time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from canprobe.protocol.tactile import FrameAssembler, TactileFrame
+from canprobe.cell.measurement import TactileSample
+
+
+class TactileReceiver:
+    """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
+
+    Args:
+        assembler: puts the frames together.
+        cob_ids: of its PDOs.
+        sync_overflow: at which the SYNC counter starts again.
+    """
+
+    def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
+        self.assembler = assembler
+        self.cob_ids = tuple(cob_ids)
+        self.newest_cycle: int | None = None
+        self.stale = 0
+        self._overflow = sync_overflow
+        self._complete: TactileFrame | None = None
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one tactile PDO."""
+        frame = self.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            self._complete = frame
+
+    def take(self, cycle: int, sync_counter: int, sync_times: Sequence[int]) -> TactileSample | None:
+        """The frame that becomes usable in ``cycle``, or None.
+
+        Args:
+            cycle: the present cycle; its SYNC has not been answered by this frame.
+            sync_counter: counter of the present cycle's SYNC.
+            sync_times: times of the last SYNCs (ns), the present one last.
+        """
+        frame, self._complete = self._complete, None
+        if frame is None:
+            return None
+        cycles_ago = (sync_counter - frame.header.sync_counter) % self._overflow
+        if cycles_ago == 0:
+            self._complete = frame
+            return None
+        trigger = cycle - cycles_ago
+        if cycles_ago >= len(sync_times):
+            self.stale += 1
+            return None
+        self.newest_cycle = trigger
+        t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
+        return TactileSample(frame, t_sample, trigger)

@@ -1,0 +1,1 @@
+"""The controllers of the packaged scenes: scan, press, listen, free."""

@@ -1,0 +1,104 @@
+"""From a measurement to a contact: joints at the sample's instant, patch, and the squeezed layer."""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.robot.kinematics import forward
+from canprobe.robot.puma260 import PumaModel
+from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
+from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
+from canprobe.cell.measurement import Measurement, TactileSample
+
+Vector = NDArray[np.float64]
+
+
+class JointHistory:
+    """The last joint angles with their times, to be interpolated at a tactile sample's instant."""
+
+    def __init__(self, length: int = 64) -> None:
+        self._times: deque[int] = deque(maxlen=length)
+        self._joints: deque[Vector] = deque(maxlen=length)
+
+    def add(self, t_ns: int, q: Vector) -> None:
+        """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""
+        self._times.append(t_ns)
+        self._joints.append(q)
+
+    def at(self, t_ns: int) -> Vector | None:
+        """Joint angles (6,), rad, at ``t_ns``, linear between SYNCs; None outside the history."""
+        if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
+            return None
+        for i in range(len(self._times) - 1, -1, -1):
+            t = self._times[i]
+            if t <= t_ns:
+                if t == t_ns:
+                    return self._joints[i]
+                share = (t_ns - t) / (self._times[i + 1] - t)
+                return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
+        return None
+
+
+class ContactSensing:
+    """Turns tactile samples into contacts in the base frame.
+
+    Args:
+        model: the arm.
+        flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
+        calibration: of the array.
+        radius: of the probe, m.
+        stiffness: K/h of the layer, N/m³.
+    """
+
+    def __init__(
+        self, model: PumaModel, flange_probe: Vector, calibration: PatchCalibration, radius: float, stiffness: float
+    ) -> None:
+        self.model = model
+        self.flange_probe = flange_probe
+        self.radius = radius
+        self.stiffness = stiffness
+        self.kappa = np.zeros(2)
+        self.patch: Patch | None = None
+        self.dropped = 0
+        self._calibration = calibration
+        self._history = JointHistory()
+
+    def step(self, measurement: Measurement) -> Patch | None:
+        """Take one measurement; the patch of a new tactile sample, or None where there is none."""
+        if measurement.q is not None:
+            self._history.add(measurement.t_ns, measurement.q)
+        if measurement.tactile is None:
+            return None
+        self.patch = patch_of(measurement.tactile, self._calibration)
+        return self.patch
+
+    def depth(self, force: float) -> float:
+        """Indentation (m) of the layer at ``force`` (N) on the curvature known so far."""
+        return float(indentation_from_force(force, self.stiffness, self.radius, self.kappa))
+
+    def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
+        q = self._history.at(sample.t_sample_ns)
+        if q is None:
+            self.dropped += 1
+            return None
+        T_base_probe = forward(self.model, q) @ self.flange_probe
+        return contact_sample(
+            t_s=sample.t_sample_ns * 1e-9,
+            T_base_probe=T_base_probe,
+            uv=np.array([patch.u, patch.v]),
+            depth=self.depth(patch.force),
+            radius=self.radius,
+            force_n=patch.force,
+        )
+
+
+def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:
+    """Patch of a tactile frame, whatever the sensor's mode."""
+    frame = sample.frame
+    if frame.features is not None:
+        return patch_from_features(frame.features, calibration)
+    return compute_patch(frame.taxels, calibration, window=frame.window)

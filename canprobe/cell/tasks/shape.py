@@ -1,0 +1,69 @@
+"""The estimator in the loop: what it is fed, and how its answer reaches the servo and the log."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.estimate import SurfaceEstimate
+from canprobe.touch.estimators import Estimator
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ShapeRecord:
+    """One estimate with its place in the run.
+
+    Attributes:
+        t_s: instant of its last sample, on the cycle's clock, s.
+        travelled_m: path of the contact since the start of the scan, m.
+        estimate: the answer, in the base frame's terms.
+    """
+
+    t_s: float
+    travelled_m: float
+    estimate: SurfaceEstimate
+
+
+class ShapeTracker:
+    """Feeds an estimator with the contacts of a scan and keeps what it said.
+
+    Args:
+        estimator: the online estimator.
+        every: samples between two answers.
+    """
+
+    def __init__(self, estimator: Estimator, every: int) -> None:
+        self.records: list[ShapeRecord] = []
+        self.samples: list[ContactSample] = []
+        self.travelled_m = 0.0
+        self._estimator = estimator
+        self._every = max(1, every)
+        self._last: Vector | None = None
+
+    def add(self, sample: ContactSample) -> SurfaceEstimate | None:
+        """Take one contact; the new estimate where one was due and can be given."""
+        if self._last is not None:
+            self.travelled_m += float(np.linalg.norm(sample.p_base - self._last))
+        self._last = sample.p_base
+        self.samples.append(sample)
+        self._estimator.add(sample)
+        if len(self.samples) % self._every:
+            return None
+        estimate = self._estimator.estimate()
+        if estimate is not None:
+            self.records.append(ShapeRecord(sample.t_s, self.travelled_m, estimate))
+        return estimate
+
+
+def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:
+    """Feed recorded contacts to another estimator, as the loop would have."""
+    tracker = ShapeTracker(estimator, every)
+    for sample in samples:
+        tracker.add(sample)
+    return tracker.records

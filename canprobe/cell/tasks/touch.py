@@ -1,0 +1,282 @@
+"""The touch tasks: approach, settle, scan or hold, retreat."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.patch import Patch
+from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
+from canprobe.touch.strategy import PathFollower, Strategy
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.shape import ShapeTracker
+
+Vector = NDArray[np.float64]
+
+
+class Phase(IntEnum):
+    """Phases of a touch task, in their order."""
+
+    MOVE = 0
+    APPROACH = 1
+    SETTLE = 2
+    SCAN = 3
+    RETREAT = 4
+    DONE = 5
+
+
+@dataclass(frozen=True, slots=True)
+class TouchSettings:
+    """What a touch task does, in SI units.
+
+    Attributes:
+        period_s: of the cycle.
+        target_force: N.
+        force_max: N; above it the probe retreats and the cell stops.
+        touch_force: N; contact is made above it, lost below half of it.
+        approach_speed, retreat_speed: m/s.
+        start: expected contact point (3,), m, base frame.
+        axes: (3, 3) rows heading, across, approach normal (outward), base frame.
+        clearance: distance of the probe's surface from ``start`` before the approach, m.
+        search: distance beyond ``start`` at which the approach gives up, m.
+        settle_s: time at rest in contact before the scan.
+        duration_s: of the scan, or of the hold where ``speed`` is 0.
+        speed: contact speed, m/s; 0 holds.
+        ramp_s: time to reach the speed.
+        rolling_share: 0…1.
+        lead_s: from a SYNC to the moment its command has taken effect.
+        tactile_timeout: cycles without a tactile sample after which the probe retreats.
+    """
+
+    period_s: float
+    target_force: float
+    force_max: float
+    start: Vector
+    axes: Vector
+    duration_s: float
+    speed: float
+    rolling_share: float
+    lead_s: float
+    gains: SurfaceGains = SurfaceGains()
+    touch_force: float = 0.15
+    approach_speed: float = 4e-3
+    retreat_speed: float = 20e-3
+    clearance: float = 3e-3
+    search: float = 8e-3
+    retreat: float = 6e-3
+    settle_s: float = 0.5
+    ramp_s: float = 0.1
+    lost_s: float = 0.03
+    tactile_timeout: int = 12
+
+
+class TouchTask:
+    """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
+
+    Args:
+        settings: what to do.
+        sensing: contacts from measurements.
+        motion_from: makes the probe's motion from the first joint angles.
+        strategy: path in the scan plane; None holds.
+        shape: the estimator in the loop; None where no shape is asked for.
+    """
+
+    def __init__(
+        self,
+        settings: TouchSettings,
+        sensing: ContactSensing,
+        motion_from: Callable[[Vector], ProbeMotion],
+        strategy: Strategy | None,
+        shape: ShapeTracker | None,
+    ) -> None:
+        self.phase = Phase.MOVE
+        self.shape = shape
+        self.sensing = sensing
+        self.reason: str | None = None
+        self.scan_cycles: tuple[int, int] | None = None
+        self._s = settings
+        self._motion_from = motion_from
+        self._strategy = strategy
+        self._motion: ProbeMotion | None = None
+        self._line: LineMotion | None = None
+        self._servo: TactileServo | None = None
+        self._t = 0.0
+        self._cycle = 0
+        self._sample_t: float | None = None
+        self._force = 0.0
+        self._lost = 0.0
+        self._contact: ContactSample | None = None
+        self._depth0 = 0.0
+        self._pole0: Vector = np.zeros(3)
+        self._columns: dict[str, float | Vector] = {}
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle of the task."""
+        if self._motion is None:
+            assert measurement.q is not None
+            self._motion = self._motion_from(measurement.q)
+            self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
+        self._cycle = measurement.cycle
+        self._sense(measurement)
+        self._watch(measurement)
+        pose = _STEPS[self.phase](self)
+        self._t += self._s.period_s
+        target = self._motion.step(pose)
+        if self._motion.limit is not None and self.phase is not Phase.RETREAT:
+            self._leave(self._motion.limit)
+        self._columns["phase"] = float(self.phase)
+        return Command(
+            q_target=target,
+            done=self.phase is Phase.DONE and self.reason is None,
+            stop_reason=self.reason if self.phase is Phase.DONE else None,
+            columns=self._columns,
+        )
+
+    # sensing and supervision
+
+    def _sense(self, measurement: Measurement) -> None:
+        patch = self.sensing.step(measurement)
+        if patch is None or measurement.tactile is None:
+            return
+        self._force = patch.force
+        contact = self.sensing.contact(measurement.tactile, patch) if patch.force > self._s.touch_force / 2 else None
+        self._contact = contact
+        if contact is not None and self._servo is not None:
+            elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._s.period_s
+            self._servo.surface.correct(contact.p_base, contact.n_base, elapsed)
+            self._sample_t = contact.t_s
+            if self.phase is Phase.SCAN and self.shape is not None:
+                self._take_shape(contact)
+        self._columns = self._columns_of(measurement, patch, contact)
+
+    def _take_shape(self, contact: ContactSample) -> None:
+        assert self.shape is not None and self._servo is not None
+        estimate = self.shape.add(contact)
+        if estimate is not None and bool(np.all(estimate.observed)):
+            self._servo.surface.set_curvature(estimate.curvature_tensor_base())
+            self.sensing.kappa = np.asarray(estimate.kappa)
+
+    def _columns_of(self, measurement: Measurement, patch: Patch, contact: ContactSample | None) -> dict[str, float | Vector]:
+        nothing = np.full(3, np.nan)
+        assert measurement.tactile is not None
+        return {
+            "phase": float(self.phase),
+            "sample_cycle": float(measurement.tactile.cycle),
+            "force_n": patch.force,
+            "pad_u_mm": patch.u * 1e3,
+            "pad_v_mm": patch.v * 1e3,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
+            "normal": contact.n_base if contact is not None else nothing,
+        }
+
+    def _watch(self, measurement: Measurement) -> None:
+        if self.phase in (Phase.RETREAT, Phase.DONE):
+            return
+        if self._force > self._s.force_max:
+            self._leave(f"measured force {self._force:.2f} N above the limit of {self._s.force_max:.2f} N")
+        elif measurement.tactile_age is not None and measurement.tactile_age > self._s.tactile_timeout:
+            self._leave(f"no tactile frame for {measurement.tactile_age} cycles")
+        elif self.phase in (Phase.SETTLE, Phase.SCAN):
+            self._lost = self._lost + self._s.period_s if self._force < self._s.touch_force / 2 else 0.0
+            if self._lost > self._s.lost_s:
+                self._leave("contact lost")
+
+    def _leave(self, reason: str | None) -> None:
+        """Go to the retreat, for ``reason`` or because the work is done."""
+        assert self._motion is not None
+        if self.phase is Phase.SCAN and self.scan_cycles is not None:
+            self.scan_cycles = (self.scan_cycles[0], self._cycle)
+        self.reason = reason
+        pose = self._motion.pose
+        away = ProbePose(pose.centre - pose.pole * self._s.retreat, pose.pole)
+        self._line = LineMotion(pose, away, self._s.retreat_speed)
+        self._enter(Phase.RETREAT)
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._t = 0.0
+
+    # phases: each returns the pose for this cycle
+
+    def _above(self, distance: float) -> ProbePose:
+        up = self._s.axes[2]
+        return ProbePose(self._s.start + up * (self.sensing.radius + distance), -up)
+
+    def _move(self) -> ProbePose:
+        assert self._line is not None
+        if self._t >= self._line.duration + self._s.lead_s + 0.1:
+            self._enter(Phase.APPROACH)
+        return self._line.at(self._t)
+
+    def _approach(self) -> ProbePose:
+        distance = self._s.clearance - self._s.approach_speed * self._t
+        pose = self._above(distance)
+        if self._contact is not None and self._force > self._s.touch_force:
+            self._touch_down(self._contact, pose)
+        elif distance < -self._s.search:
+            self._leave(f"no object found up to {self._s.search * 1e3:.0f} mm beyond the expected point")
+        return pose
+
+    def _touch_down(self, contact: ContactSample, pose: ProbePose) -> None:
+        surface = LocalSurface(contact.p_base, contact.n_base, self._s.gains)
+        self._servo = TactileServo(
+            surface,
+            PathFollower(self._strategy) if self._strategy is not None else None,
+            axes=self._s.axes,
+            origin=contact.p_base,
+            probe_radius=self.sensing.radius,
+            rolling_share=self._s.rolling_share,
+        )
+        self._depth0 = self.sensing.radius - float(contact.n_base @ (pose.centre - contact.p_base))
+        self._pole0 = pose.pole
+        self._enter(Phase.SETTLE)
+
+    def _target_depth(self) -> float:
+        return self.sensing.depth(self._s.target_force)
+
+    def _settle(self) -> ProbePose:
+        assert self._servo is not None
+        share = smooth_step(self._t / (0.6 * self._s.settle_s))
+        depth = self._depth0 + share * (self._target_depth() - self._depth0)
+        pose = self._servo.step(0.0, depth, self._s.period_s)
+        if self._t >= self._s.settle_s:
+            self._enter(Phase.SCAN)
+            self.scan_cycles = (self._cycle, self._cycle)
+        pole = self._pole0 + share * (pose.pole - self._pole0)
+        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
+
+    def _scan(self) -> ProbePose:
+        assert self._servo is not None and self.scan_cycles is not None
+        left = self._s.duration_s - self._t
+        share = min(1.0, self._t / self._s.ramp_s, max(left, 0.0) / self._s.ramp_s)
+        pose = self._servo.step(self._s.speed * share, self._target_depth(), self._s.period_s)
+        if left <= 0:
+            self._leave(None)
+        return pose
+
+    def _retreat(self) -> ProbePose:
+        assert self._line is not None
+        if self._t >= self._line.duration + self._s.lead_s:
+            self._enter(Phase.DONE)
+        return self._line.at(self._t)
+
+    def _done(self) -> ProbePose:
+        assert self._motion is not None
+        return self._motion.pose
+
+
+_STEPS: dict[Phase, Callable[[TouchTask], ProbePose]] = {
+    Phase.MOVE: TouchTask._move,
+    Phase.APPROACH: TouchTask._approach,
+    Phase.SETTLE: TouchTask._settle,
+    Phase.SCAN: TouchTask._scan,
+    Phase.RETREAT: TouchTask._retreat,
+    Phase.DONE: TouchTask._done,
+}

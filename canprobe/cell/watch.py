@@ -1,0 +1,94 @@
+"""What the nodes say about themselves: boot-ups, heartbeats and emergencies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from canprobe.errors import ProtocolError
+from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
+
+
+@dataclass(frozen=True, slots=True)
+class EmcyEvent:
+    """An emergency message with its sender and time."""
+
+    node_id: int
+    emcy: Emcy
+    t_ns: int
+
+    def __str__(self) -> str:
+        return f"node {self.node_id}: EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+
+
+class NodeWatch:
+    """Follows the error control and emergency messages of the planned nodes.
+
+    Args:
+        node_ids: the nodes that are watched.
+        master_id: our own node id; its heartbeat from anybody else is foreign.
+        heartbeat_timeout_ns: silence after which a node is lost.
+    """
+
+    def __init__(self, node_ids: tuple[int, ...], master_id: int, heartbeat_timeout_ns: int) -> None:
+        self.node_ids = node_ids
+        self.states: dict[int, NmtState] = {}
+        self.boot_ups: dict[int, int] = dict.fromkeys(node_ids, 0)
+        self.emergencies: list[EmcyEvent] = []
+        self.foreign: list[str] = []
+        self._master_id = master_id
+        self._timeout_ns = heartbeat_timeout_ns
+        self._heard: dict[int, int] = {}
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
+        """Take a frame that is no PDO; True where it was one of those watched."""
+        node_id = can_id & 0x7F
+        if can_id == HEARTBEAT_BASE + self._master_id:
+            self.foreign.append(f"a heartbeat of node {self._master_id}, our own id")
+        elif can_id in (SYNC_ID, NMT_ID):
+            self.foreign.append(f"{'SYNC' if can_id == SYNC_ID else 'an NMT command'} from another master")
+        elif can_id == HEARTBEAT_BASE + node_id and node_id in self.boot_ups:
+            self._push_heartbeat(node_id, data, t_ns)
+        elif can_id == EMCY_BASE + node_id and node_id in self.boot_ups:
+            self._push_emcy(node_id, data, t_ns)
+        else:
+            return False
+        return True
+
+    def _push_heartbeat(self, node_id: int, data: bytes, t_ns: int) -> None:
+        try:
+            state = unpack_heartbeat(data)
+        except ProtocolError:
+            return
+        self._heard[node_id] = t_ns
+        self.states[node_id] = state
+        if state is NmtState.INITIALISING:
+            self.boot_ups[node_id] += 1
+
+    def _push_emcy(self, node_id: int, data: bytes, t_ns: int) -> None:
+        try:
+            self.emergencies.append(EmcyEvent(node_id, Emcy.unpack(data), t_ns))
+        except ProtocolError:
+            return
+
+    def forget(self) -> None:
+        """Start the heartbeat supervision afresh: nobody has been heard yet."""
+        self._heard.clear()
+        self.states.clear()
+
+    def start(self, t_ns: int) -> None:
+        """Expect every node's heartbeat from now on."""
+        self._heard = dict.fromkeys(self.node_ids, t_ns)
+
+    def silent(self, t_ns: int) -> int | None:
+        """A node that has been silent for longer than the time-out, or None."""
+        limit = t_ns - self._timeout_ns
+        return next((node_id for node_id, heard in self._heard.items() if heard < limit), None)
+
+    def not_in(self, state: NmtState) -> int | None:
+        """A node whose last heartbeat told another state than ``state``, or None."""
+        return next((node_id for node_id, seen in self.states.items() if seen is not state), None)
+
+    def alarms(self) -> list[EmcyEvent]:
+        """Emergencies that report an error (those that only report its end are left out)."""
+        return [event for event in self.emergencies if event.emcy.code != NO_ERROR]

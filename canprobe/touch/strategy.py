@@ -1,0 +1,121 @@
+"""Exploration strategies: where the contact goes next, as a heading in the scan plane.
+
+The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length, so that
+the contact speed is the same everywhere; the servo lifts the heading into the estimated tangent plane of the surface.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Protocol
+
+
+class Strategy(Protocol):
+    """A smooth closed curve in the scan plane that starts at the origin."""
+
+    def point(self, phase: float) -> tuple[float, float]:
+        """Point of the curve (m, m: along the heading, across) at ``phase`` (rad)."""
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        """Derivative of :meth:`point` by the phase (m/rad)."""
+
+
+class Weave:
+    """A Lissajous figure ``(L/2 sin φ, W/2 sin mφ)``: excites the curvature in both directions.
+
+    Args:
+        length_m: full size along the heading.
+        width_m: full size across it.
+        wavelength_m: mean distance along the heading of one full weave; sets the odd ratio ``m``.
+    """
+
+    def __init__(self, length_m: float, width_m: float, wavelength_m: float) -> None:
+        self._a, self._b = length_m / 2, width_m / 2
+        self._m = max(3, 2 * round(length_m / wavelength_m) + 1)
+
+    def point(self, phase: float) -> tuple[float, float]:
+        return self._a * math.sin(phase), self._b * math.sin(self._m * phase)
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        return self._a * math.cos(phase), self._b * self._m * math.cos(self._m * phase)
+
+
+class Circle:
+    """A circle through the start point, its centre ``diameter/2`` along the heading."""
+
+    def __init__(self, diameter_m: float) -> None:
+        self._r = diameter_m / 2
+
+    def point(self, phase: float) -> tuple[float, float]:
+        return self._r * (1 - math.cos(phase)), self._r * math.sin(phase)
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        return self._r * math.sin(phase), self._r * math.cos(phase)
+
+
+class Straight:
+    """To and fro along the heading: a triangle wave, one stroke of ``length/2`` per quarter turn of the phase.
+
+    A straight path leaves the curvature across it unobserved; that is what this strategy is for.
+
+    Args:
+        length_m: full size along the heading.
+    """
+
+    def __init__(self, length_m: float) -> None:
+        self._slope = length_m / math.pi
+
+    def point(self, phase: float) -> tuple[float, float]:
+        folded = (phase + math.pi / 2) % (2 * math.pi)
+        return self._slope * (min(folded, 2 * math.pi - folded) - math.pi / 2), 0.0
+
+    def tangent(self, phase: float) -> tuple[float, float]:
+        return (self._slope if (phase + math.pi / 2) % (2 * math.pi) < math.pi else -self._slope), 0.0
+
+
+def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: float = 0.012) -> Strategy:
+    """Strategy by name.
+
+    Raises:
+        KeyError: for a name that is none of ``weave``, ``circle``, ``straight``.
+    """
+    makers = {
+        "weave": lambda: Weave(length_m, width_m, wavelength_m),
+        "circle": lambda: Circle(length_m),
+        "straight": lambda: Straight(length_m),
+    }
+    return makers[name]()
+
+
+class PathFollower:
+    """Follows a :class:`Strategy` by arc length.
+
+    Args:
+        strategy: the curve.
+        cross_track_per_m: how strongly the heading turns back to the curve (1/m).
+    """
+
+    def __init__(self, strategy: Strategy, cross_track_per_m: float = 60.0) -> None:
+        self._strategy = strategy
+        self._gain = cross_track_per_m
+        self._phase = 0.0
+
+    def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
+        """Unit heading in the scan plane for the next step.
+
+        Args:
+            x: where the contact is along the heading (m).
+            y: where it is across (m).
+            distance_m: how far the contact moves in the scan plane until the next call.
+
+        Returns:
+            Unit vector (along, across).
+        """
+        tx, ty = self._strategy.tangent(self._phase)
+        norm = math.hypot(tx, ty)
+        self._phase += distance_m / max(norm, 1e-4)
+        px, py = self._strategy.point(self._phase)
+        hx = tx / max(norm, 1e-9) + self._gain * (px - x)
+        hy = ty / max(norm, 1e-9) + self._gain * (py - y)
+        scale = math.hypot(hx, hy)
+        return (hx / scale, hy / scale) if scale > 1e-9 else (1.0, 0.0)
