@@ -1,0 +1,232 @@
+"""The Python API and what the command line calls: run, open_cell, up, emulate, scan."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from canprobe.cell.build import make_task
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.tasks.shape import ShapeRecord, replay_samples
+from canprobe.errors import CanprobeError, NodeError
+from canprobe.results import RunResult, summarise, write_files
+from canprobe.scene import Scene
+from canprobe.session import Session, resolve_scene
+
+__all__ = ["Command", "Measurement", "RunResult", "emulate", "open_cell", "run", "scan", "up"]
+
+Say = Callable[[str], None]
+Progress = Callable[[float, float], None]
+
+
+def _quiet(_: str) -> None:
+    return
+
+
+def run(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    progress: Progress | None = None,
+    say: Say = _quiet,
+    files: bool = True,
+) -> RunResult:
+    """Carry out a scene's task and write what was measured.
+
+    Args:
+        scene: from :func:`canprobe.load_scene`.
+        interface, channel, bitrate: in the place of the scene's bus.
+        out: folder for the files; ``runs/<scene>-<time>`` by default.
+        seed, duration_s: in the place of the scene's.
+        progress: called with (seconds done, seconds in all).
+        say: called with each step of bring-up and stop.
+        files: False writes nothing.
+
+    Raises:
+        UsageError: the scene does not fit; nothing was started.
+        BusError: an interface or a node failed. The drives are disabled and the files written.
+        SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
+    """
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s
+    )
+    folder = _folder(resolved, out) if files else None
+    session = Session(resolved, folder, say)
+    controller = make_task(session.plan)
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    failure: BaseException | None = None
+    try:
+        with session:
+            session.run(controller, _report(progress, resolved.task.duration_s))
+    except (CanprobeError, KeyboardInterrupt) as error:
+        failure = error
+        if not session.opened:
+            raise
+    result = _finish(session, controller, failure)
+    if failure is not None:
+        raise failure
+    return result
+
+
+def _folder(scene: Scene, out: Path | str | None) -> Path:
+    return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S}"
+
+
+def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement], None]:
+    if progress is None:
+        return lambda _: None
+    return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
+
+
+def _finish(session: Session, controller: object, failure: BaseException | None) -> RunResult:
+    estimates = _estimates(session.scene, controller)
+    reason = None if failure is None else (str(failure) or "interrupted")
+    summary = summarise(session, controller, estimates, reason)
+    result = RunResult(
+        session.plan, summary, session.cell.log.arrays(), session.truth, estimates, session.out
+    )
+    if session.out is not None:
+        write_files(result, session.out)
+        _draw(result, session.out)
+    return result
+
+
+def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]:
+    """What the estimator in the loop said, and the others on the same contacts."""
+    tracker = getattr(controller, "shape", None)
+    if tracker is None or scene.shape is None:
+        return {}
+    from canprobe.cell.tasks.build import make_shape_estimator
+
+    every = max(1, round(0.1 * scene.sensor.rate_hz)) if scene.sensor is not None else 1
+    also = [method for method in scene.shape.also if method != scene.shape.method]
+    return {scene.shape.method: tracker.records} | {
+        method: replay_samples(make_shape_estimator(scene, method), tracker.samples, every) for method in also
+    }
+
+
+def _draw(result: RunResult, out: Path) -> None:
+    try:
+        from canprobe.studies.run_figure import draw_run
+    except ImportError:  # the study extra is not installed
+        return
+    draw_run(result, out / "report.png")
+
+
+@contextlib.contextmanager
+def open_cell(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    out: Path | str | None = None,
+    seed: int | None = None,
+    say: Say = _quiet,
+) -> Iterator[Session]:
+    """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
+
+    Example::
+
+        with canprobe.open_cell(canprobe.load_scene("free")) as cell:
+            cell.run(my_controller)
+
+    Args:
+        scene: from :func:`canprobe.load_scene`.
+        interface, channel, bitrate, seed: in the place of the scene's.
+        out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
+        say: called with each step.
+
+    Raises:
+        UsageError: the scene does not fit; nothing was started.
+        BusError: an interface or a node failed.
+    """
+    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    folder = Path(out) if out is not None else None
+    if folder is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+    with Session(resolved, folder, say) as session:
+        yield session
+
+
+def up(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    say: Say = _quiet,
+) -> None:
+    """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
+
+    Raises:
+        UsageError, BusError, SafetyStop: as :func:`run`.
+    """
+    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say) as session:
+        say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
+        session.run(lambda _: Command())
+
+
+def emulate(
+    scene: Scene,
+    *,
+    interface: str,
+    channel: str,
+    bitrate: int,
+    node_ids: tuple[int, ...],
+    seed: int | None = None,
+    truth_path: Path | None = None,
+    say: Say = _quiet,
+) -> None:
+    """Serve emulated nodes on a real interface until interrupted, for any master.
+
+    Raises:
+        UsageError: the scene does not fit.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+    """
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.bus.probe import answering_nodes
+    from canprobe.emulator.build import make_world
+    from canprobe.emulator.serve import serve
+    from canprobe.planning import make_plan
+
+    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    world = make_world(make_plan(resolved), node_ids)
+    port = open_port(interface, channel, bitrate, MonotonicClock())
+    try:
+        if busy := answering_nodes(port, node_ids, 0.1):
+            raise NodeError(busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes")
+        say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
+        serve(world.participants, port, lambda: False)
+    finally:
+        port.close()
+        if truth_path is not None and world.recorder is not None:
+            world.recorder.save(truth_path)
+
+
+def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:
+    """List the nodes that answer on a bus, with the identity that 1018h gives.
+
+    Raises:
+        InterfaceError: no such interface.
+    """
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.cell.scan import scan_nodes
+
+    port = open_port(interface, channel, bitrate, MonotonicClock())
+    try:
+        return scan_nodes(port, timeout_s)
+    finally:
+        port.close()

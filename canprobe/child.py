@@ -1,0 +1,115 @@
+"""The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.port import Port
+from canprobe.errors import BusError, NodeError
+from canprobe.protocol.frames import HEARTBEAT_BASE
+from canprobe.scene import Scene
+from canprobe.scene_writer import dump_scene
+
+START_TIMEOUT_S = 30.0
+END_TIMEOUT_S = 10.0
+_PR_SET_PDEATHSIG = 1
+
+
+def _die_with_parent() -> None:
+    """In the child: be told to stop when the parent is killed. Linux only, and only a second line of defence."""
+    with contextlib.suppress(OSError, AttributeError):
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+class EmulatorChild:
+    """``canprobe emulate`` as a child process.
+
+    It gets a session of its own, so that Ctrl-C reaches only the master, which then stops the drives before their process.
+
+    Args:
+        scene: the resolved scene.
+        out: folder for ``truth.npz``; None uses a temporary one.
+    """
+
+    def __init__(self, scene: Scene, out: Path | None) -> None:
+        self._scene = scene
+        self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        self._truth = (out or self._folder) / "truth.npz"
+        self._errors: IO[bytes] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def start(self, port: Port) -> None:
+        """Start the process and wait for the boot-up of each of its nodes.
+
+        Raises:
+            BusError: the process ended; with its own last words.
+            NodeError: a node did not boot in time.
+        """
+        scene_file = self._folder / "scene.toml"
+        scene_file.write_text(dump_scene(self._scene), encoding="utf-8")
+        bus, nodes = self._scene.bus, self._scene.emulated_node_ids
+        command = [
+            *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
+            *("--bus", bus.interface, "--channel", bus.channel, "--bitrate", str(bus.bitrate)),
+            *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth)),
+        ]
+        self._errors = (self._folder / "stderr").open("w+b")
+        self._process = subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=self._errors,
+            start_new_session=True,
+            preexec_fn=_die_with_parent,  # noqa: PLW1509 - nothing here runs threads
+        )
+        self._await_boot_ups(port, set(nodes))
+
+    def _await_boot_ups(self, port: Port, waiting: set[int]) -> None:
+        assert self._process is not None
+        clock = port.clock
+        deadline = clock.now_ns() + round(START_TIMEOUT_S * 1e9)
+        while waiting:
+            if self._process.poll() is not None:
+                raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
+            if clock.now_ns() > deadline:
+                raise NodeError(min(waiting), f"the emulated node did not boot within {START_TIMEOUT_S:g} s")
+            port.wait(min(deadline, clock.now_ns() + 50_000_000))
+            for can_id, data, _ in port.drain():
+                if data == b"\0":
+                    waiting.discard(can_id - HEARTBEAT_BASE)
+
+    def _last_words(self) -> str:
+        assert self._errors is not None
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("canprobe: ") if lines else ""
+
+    def end(self) -> dict[str, NDArray[np.float64]]:
+        """Stop the process, first politely; the plant's truth where it left any."""
+        if self._process is not None:
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(self._process.pid, number)
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(END_TIMEOUT_S)
+                    break
+        truth = {}
+        if self._truth.exists():
+            with np.load(self._truth, allow_pickle=False) as data:
+                truth = {name: np.asarray(data[name]) for name in data.files}
+        if self._errors is not None:
+            self._errors.close()
+        for leftover in (*self._folder.iterdir(), self._folder):
+            leftover.rmdir() if leftover.is_dir() else leftover.unlink()
+        return truth

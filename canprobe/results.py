@@ -1,0 +1,236 @@
+"""What a run leaves behind: the summary, the log, the scene as resolved."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.cell import Cell
+from canprobe.cell.scoring import ShapeScore, score_contact, score_shape
+from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.planning import Plan
+from canprobe.scene_writer import dump_scene
+from canprobe.session import LOCKSTEP, Session
+
+Array = NDArray[np.float64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """One finished run.
+
+    Attributes:
+        plan: what was planned.
+        summary: the content of ``summary.json``.
+        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit.
+        truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
+        estimates: what each estimator said, by name; the online one first.
+        out: the folder with the files, or None.
+    """
+
+    plan: Plan
+    summary: dict[str, Any]
+    log: dict[str, Array]
+    truth: dict[str, Array]
+    estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
+    out: Path | None = None
+
+    def text(self) -> str:
+        """The summary for people."""
+        return summary_text(self.summary, self.out)
+
+
+def summarise(
+    session: Session,
+    controller: object,
+    estimates: dict[str, list[ShapeRecord]],
+    stop_reason: str | None,
+) -> dict[str, Any]:
+    """The content of ``summary.json``; what does not apply is None."""
+    scene, cell = session.scene, session.cell
+    cycle = cell.cycle
+    sim_time = cycle.number * session.plan.sync.period_ns * 1e-9 if cycle is not None and cycle.number > 0 else 0.0
+    wall = session.wall_ns * 1e-9
+    log = cell.log.arrays()
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "bus": scene.bus.interface,
+        "seed": scene.seed,
+        "completed": stop_reason is None,
+        "stop_reason": stop_reason,
+        "sim_time_s": sim_time,
+        "wall_time_s": wall,
+        "realtime_factor": sim_time / wall if wall > 0 else None,
+        "contact": _contact(session, controller, log),
+        "shape": _shape(session, controller, estimates, log),
+        "cycle": _cycle(cell, scene.cycle.rate_hz),
+        "bus_load": {
+            scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}
+        },
+        "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
+        "faults": list(cell.faults),
+    }
+
+
+def _scan(controller: object) -> tuple[int, int] | None:
+    cycles = getattr(controller, "scan_cycles", None)
+    return cycles if cycles is not None and cycles[1] > cycles[0] else None
+
+
+def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, float | None]:
+    task, scan = session.scene.task, _scan(controller)
+    names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
+    target = task.force_n if task.kind in ("scan", "press") else None
+    figures: dict[str, float | None] = dict.fromkeys(names)
+    measured: float | None = None
+    if scan is not None:
+        force = log["force_n"][scan[0] : scan[1]]
+        measured = float(np.sqrt(np.mean((force - task.force_n) ** 2)))
+        if session.truth:
+            figures = score_contact(session.truth, *scan, task.force_n)
+            if task.kind != "scan":
+                figures["speed_mean_m_s"] = None
+        else:
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
+
+
+def score_all(session: Session, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]) -> dict[str, ShapeScore]:
+    """Score of every estimator against the truth, by name."""
+    return {name: score_shape(records, session.truth, log["t_s"]) for name, records in estimates.items()}
+
+
+def _shape(
+    session: Session, controller: object, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
+) -> dict[str, Any]:
+    names = (
+        *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "cramer_rao_ratio"),
+    )
+    shape: dict[str, Any] = dict.fromkeys(names)
+    if not estimates:
+        return shape
+    method = next(iter(estimates))
+    records = estimates[method]
+    shape["method"] = method
+    if records:
+        shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
+        shape["kappa_est_per_m"] = _numbers(records[-1].estimate.kappa)
+    if not session.truth:
+        return shape
+    scores = score_all(session, estimates, log)
+    score = scores[method]
+    shape |= {
+        "kappa_true_per_m": score.kappa_true,
+        "kappa_est_per_m": score.kappa_est or shape["kappa_est_per_m"],
+        "kappa_rms_error_per_m": score.kappa_rms,
+        "kappa_rms_error_percent": score.kappa_rms_percent,
+        "normal_rms_deg": score.normal_rms_deg,
+        "position_rms_mm": score.position_rms_mm,
+        "methods": {
+            name: {
+                "kappa_rms_error_per_m": s.kappa_rms,
+                "kappa_rms_error_percent": s.kappa_rms_percent,
+                "normal_rms_deg": s.normal_rms_deg,
+                "position_rms_mm": s.position_rms_mm,
+                "estimates": s.estimates,
+                "observed_fraction": s.observed_fraction,
+            }
+            for name, s in scores.items()
+        },
+    }
+    return shape
+
+
+def _numbers(values: Sequence[float] | Array) -> list[float | None]:
+    """Floats for JSON: what is not finite was not observed, and is None."""
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def _cycle(cell: Cell, rate_hz: float) -> dict[str, Any]:
+    cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
+    statistics = cycle.statistics if cycle is not None else None
+    assembler = tactile.assembler if tactile is not None else None
+    return {
+        "rate_hz": rate_hz,
+        "cycles": cycle.number + 1 if cycle is not None else 0,
+        "overruns": statistics.overruns if statistics is not None else 0,
+        "missed_pdos": drives.missed if drives is not None else 0,
+        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans if assembler is not None else 0,
+        "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
+        "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
+    }
+
+
+def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
+    if not values_ns:
+        return dict.fromkeys(("p50", "p99", "p999", "max"))
+    us = np.asarray(values_ns) / 1000
+    p50, p99, p999 = np.percentile(us, (50, 99, 99.9)).tolist()
+    return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
+
+
+def write_files(result: RunResult, out: Path) -> None:
+    """Write ``summary.json``, ``log.npz`` and ``scene.toml`` into ``out``; the other files are there already."""
+    (out / "summary.json").write_text(
+        json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
+    )
+    (out / "scene.toml").write_text(dump_scene(result.plan.scene), encoding="utf-8")
+    np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)  # type: ignore[arg-type]
+
+
+def _figure(value: float | None, unit: str, digits: int = 2) -> str:
+    return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def summary_text(summary: dict[str, Any], out: Path | None) -> str:
+    """A summary as lines for people."""
+    contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
+    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] == LOCKSTEP else "real time"
+    lines = [
+        f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
+        + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
+        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
+        f"  cycle      {cycle['cycles']} at {cycle['rate_hz']:g} Hz, {cycle['overruns']} overruns,"
+        f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
+    ]
+    if contact["force_rms_error_n"] is not None:
+        target = contact["force_target_n"]
+        lines.append(
+            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
+            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
+        )
+    if contact["speed_mean_m_s"] is not None:
+        lines.append(
+            f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
+            f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
+        )
+    if shape["method"] is not None:
+        lines += _shape_lines(shape)
+    if out is not None:
+        lines.append(f"  files      {out}")
+    return "\n".join(lines)
+
+
+def _shape_lines(shape: dict[str, Any]) -> list[str]:
+    def pair(values: Sequence[float | None] | None) -> str:
+        return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
+
+    lines = [f"  curvature  {pair(shape['kappa_est_per_m'])} 1/m, true {pair(shape['kappa_true_per_m'])} 1/m"]
+    for name, score in shape.get("methods", {}).items():
+        percent = score["kappa_rms_error_percent"]
+        lines.append(
+            f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
+            + (f" ({percent:.1f} %)" if percent is not None else "")
+            + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
+            f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+        )
+    return lines

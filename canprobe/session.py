@@ -1,0 +1,211 @@
+"""A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
+
+The composition root: the only place, besides studies and tests, that sees both sides of the bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import replace
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.candump import CandumpWriter, RecordingPort
+from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import Port
+from canprobe.cell.build import make_cell
+from canprobe.cell.cell import Cell
+from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.errors import UsageError
+from canprobe.planning import Plan, make_plan
+from canprobe.protocol.timing import best_case_bits
+from canprobe.scene import Scene
+
+if TYPE_CHECKING:
+    from canprobe.emulator.build import World
+
+Array = NDArray[np.float64]
+LOCKSTEP = "lockstep"
+
+
+def resolve_scene(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    seed: int | None = None,
+    duration_s: float | None = None,
+) -> Scene:
+    """The scene with what the caller put in the place of its own values; None keeps them."""
+    bus = replace(
+        scene.bus,
+        interface=scene.bus.interface if interface is None else interface,
+        channel=scene.bus.channel if channel is None else channel,
+        bitrate=scene.bus.bitrate if bitrate is None else bitrate,
+    )
+    info = scene.scene if seed is None else replace(scene.scene, seed=seed)
+    task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
+    return replace(scene, bus=bus, scene=info, task=task)
+
+
+class TrafficCounter:
+    """Counts frames and bits for the log's writer; bits without stuffing, as canbusload counts by default."""
+
+    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+        self.frames = 0
+        self.bits = 0
+        self._write = write
+        self._bits = [best_case_bits(n) for n in range(9)]
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Count one frame and pass it on."""
+        self.frames += 1
+        self.bits += self._bits[len(data)]
+        self._write(can_id, data, t_ns)
+
+
+class Session:
+    """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
+
+    Args:
+        scene: what to bring up, resolved.
+        out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
+        say: called with each step.
+    """
+
+    def __init__(self, scene: Scene, out: Path | None = None, say: Callable[[str], None] = lambda _: None) -> None:
+        self.scene = scene
+        self.plan: Plan = make_plan(scene)
+        self.out = out
+        self.started_ns = 0
+        self.wall_ns = 0
+        self._bus_start_ns = 0
+        self._bus_time_ns = 0
+        self.traffic: TrafficCounter | None = None
+        self.truth: dict[str, Array] = {}
+        self._say = say
+        self._stack = ExitStack()
+        self._world: World | None = None
+        self._cell: Cell | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, while the session is open or afterwards."""
+        if self._cell is None:
+            raise UsageError("the cell is not open: use `with open_cell(scene) as cell:`")
+        return self._cell
+
+    @property
+    def opened(self) -> bool:
+        """The nodes were brought up; there is something to report."""
+        return self._cell is not None and self._cell.cycle is not None
+
+    @property
+    def bus_load(self) -> float | None:
+        """Measured share of the bit rate, from the first frame to the last."""
+        if self.traffic is None or self._bus_time_ns <= 0:
+            return None
+        return self.traffic.bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
+
+    def __enter__(self) -> Session:
+        self.started_ns = elapsed_ns()
+        try:
+            port = self._open()
+            self._bus_start_ns = port.clock.now_ns()
+            self._stack.callback(self._stop_watch, port)
+            self._cell = make_cell(self.plan, port, self._say)
+            self._stack.enter_context(self._cell)
+        except BaseException:
+            self._close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._close()
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> None:
+        """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`."""
+        self.cell.run(controller, progress)
+
+    def _close(self) -> None:
+        try:
+            self._stack.close()
+        finally:
+            self.wall_ns = elapsed_ns() - self.started_ns
+
+    def _stop_watch(self, port: Port) -> None:
+        self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
+
+    # the two kinds of bus
+
+    def _open(self) -> Port:
+        return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
+
+    def _writer(self, t0_ns: int) -> Callable[[int, bytes, int], None]:
+        write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
+        if self.out is not None:
+            writer = self._stack.enter_context(
+                CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns)
+            )
+            write = writer.write
+        self.traffic = TrafficCounter(write)
+        return self.traffic.write
+
+    def _open_lockstep(self) -> Port:
+        from canprobe.emulator.build import make_world
+
+        missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
+        if missing:
+            raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
+        bus = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        self._world = make_world(self.plan, self.scene.emulated_node_ids)
+        self._stack.callback(self._keep_truth)
+        bus.recorder = self._writer(0)
+        for participant in self._world.participants:
+            bus.attach(participant)
+        return bus.port()
+
+    def _keep_truth(self) -> None:
+        assert self._world is not None
+        if self._world.recorder is not None:
+            self.truth = self._world.recorder.arrays()
+            if self.out is not None:
+                self._world.recorder.save(self.out / "truth.npz")
+
+    def _open_real(self) -> Port:
+        from canprobe.bus.open import open_port
+        from canprobe.child import EmulatorChild
+
+        bus = self.scene.bus
+        clock = MonotonicClock()
+        real = open_port(bus.interface, bus.channel, bus.bitrate, clock)
+        self._stack.callback(real.close)
+        port = RecordingPort(real, _Sink(self._writer(clock.now_ns())))
+        if self.scene.emulated_node_ids:
+            self._say("start the emulated nodes")
+            child = EmulatorChild(self.scene, self.out)
+            self._stack.callback(self._end_child, child)
+            child.start(port)
+        return port
+
+    def _end_child(self, child: Any) -> None:
+        self.truth = child.end()
+
+
+class _Sink:
+    """What a RecordingPort writes to."""
+
+    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+        self.write = write
+

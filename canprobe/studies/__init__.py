@@ -1,0 +1,1 @@
+"""Figures and studies; what needs the ``study`` extra is imported only here."""
