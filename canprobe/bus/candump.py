@@ -6,9 +6,10 @@ Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Protocol
 
 from canprobe.bus.clock import Clock
 from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, TimedFrame
@@ -96,6 +97,15 @@ def _parse_id(match: re.Match[str]) -> int:
     return can_id | RTR_FLAG if match["data"] is None else can_id
 
 
+class FrameWriter(Protocol):
+    """Something frames are written to, such as a `CandumpWriter`."""
+
+    @property
+    def write(self) -> Callable[[int, bytes, int], None]:
+        """Called with (can_id, data, t_ns)."""
+        ...
+
+
 class RecordingPort:
     """A `Port` that writes down what passes through it, sent frames with the time of sending.
 
@@ -107,7 +117,7 @@ class RecordingPort:
         writer: where to write; it is not closed with the port.
     """
 
-    def __init__(self, port: Port, writer: CandumpWriter) -> None:
+    def __init__(self, port: Port, writer: FrameWriter) -> None:
         self._port = port
         self._write = writer.write
 

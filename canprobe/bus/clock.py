@@ -92,7 +92,9 @@ class VirtualClock:
             pass
 
 
-class _Timespec(ctypes.Structure):
+class Timespec(ctypes.Structure):
+    """struct timespec of the C library."""
+
     _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
 
 
@@ -107,7 +109,7 @@ class MonotonicClock:
 
     def __init__(self, spin_ns: int = 0) -> None:
         self._spin_ns = spin_ns
-        self._request = _Timespec()
+        self._request = Timespec()
         self._clock_nanosleep = getattr(ctypes.CDLL(None), "clock_nanosleep", None)
 
     def now_ns(self) -> int:

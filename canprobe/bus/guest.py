@@ -1,0 +1,312 @@
+"""A command in a user-mode Linux guest: a Linux kernel with CAN as an ordinary process on this machine's own files.
+
+The guest has the machine's file system as its root (hostfs), so the same programs, interpreters and folders, and a
+vcan0 of its own. The command's output goes to two files that are followed from outside; signals go in as lines on the
+guest's console; the exit status comes out through a file, because the kernel's own status is always 0.
+
+    JOB/            a folder under the temporary folder, removed afterwards
+      init          the guest's first process: mounts, modules, vcan0, then the command
+      command       working folder, environment and arguments of the command
+      pid status    written by the guest: the command runs, the command has ended
+      stdout stderr console
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from canprobe.errors import BusError
+
+PROGRAM = "linux.uml"
+MODULES = Path("/usr/lib/uml/modules")
+PACKAGE = "user-mode-linux"
+_PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
+_MEMORY = 2 << 30
+_BOOT_S = 60.0
+_HALT_S = 5.0
+_HIDDEN = ("/dev", "/proc", "/run", "/sys")
+
+_INIT = """\
+#!/bin/sh
+PATH={path}
+export PATH
+job={job}
+end() {{
+    sync
+    echo o > /proc/sysrq-trigger
+    sleep 60
+}}
+mount -t proc proc /proc
+mount -t sysfs sysfs /sys
+mount -t tmpfs -o mode=755 tmpfs /run
+mkdir -p /dev/shm /dev/pts /run/lock
+mount -t tmpfs -o mode=1777 tmpfs /dev/shm
+mount -t devpts devpts /dev/pts
+[ -e /dev/fd ] || ln -s /proc/self/fd /dev/fd
+{realtime}
+{python} -I -S {setup} {modules} || end
+mknod /run/canprobe.console c 5 1
+(
+    while read -r name; do kill -s "$name" -- "-$(cat "$job/pid")"; done < /run/canprobe.console
+    end
+) 2> /dev/null &
+setsid sh "$job/command" < /dev/null {redirection}
+echo $? > "$job/status"
+end
+"""
+
+_COMMAND = """\
+echo $$ > {job}/pid
+umask {umask:03o}
+cd {folder} || exit 125
+exec env -i {environment} sh -c 'exec "$@"' sh {command}
+"""
+
+
+class GuestError(BusError):
+    """The guest could not be started, or ended before the command did.
+
+    Attributes:
+        started: whether the command was running already.
+    """
+
+    def __init__(self, message: str, started: bool) -> None:
+        self.started = started
+        super().__init__(message)
+
+
+def is_installed() -> bool:
+    """Return whether the guest's kernel and its CAN modules are on this machine."""
+    return shutil.which(PROGRAM, path=_search_path()) is not None and any(
+        MODULES.glob("*/kernel/drivers/net/can/vcan.ko")
+    )
+
+
+def _search_path() -> str:
+    return os.environ.get("PATH", "") + os.pathsep + _PATH
+
+
+class GuestJob:
+    """A command in a guest that boots when this is made; use as a context manager, which always ends the guest.
+
+    Args:
+        command: program and arguments.
+        environment: the command's whole environment.
+        realtime: pin the guest to the last processor under SCHED_FIFO, and keep that one from idling.
+
+    Raises:
+        GuestError: the guest cannot be started from here.
+    """
+
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str], realtime: bool = False) -> None:
+        self._job = _job_folder()
+        self._spinner: subprocess.Popen[bytes] | None = None
+        self._streams: list[tuple[int, int]] = []
+        try:
+            self._write_scripts(command, environment, realtime)
+            self._streams = self._follow()
+            self._process = self._boot(realtime)
+        except BaseException:
+            self._remove()
+            raise
+        self._boot_deadline = time.monotonic() + _BOOT_S
+
+    def __enter__(self) -> GuestJob:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+        self._remove()
+
+    @property
+    def started(self) -> bool:
+        """Whether the command runs, or ran."""
+        return self._read("pid").endswith("\n")
+
+    def poll(self) -> int | None:
+        """Pass the output on; return the command's exit status once it has ended.
+
+        Raises:
+            GuestError: the guest died, or did not come up in a minute.
+            BrokenPipeError: nobody reads the output any more.
+        """
+        ended = self._process.poll() is not None
+        status = self._read("status")
+        self._pass_output()
+        if status.endswith("\n"):
+            return int(status)
+        if ended:
+            raise self._lost("the guest ended before the command did" if self.started else "the guest did not boot")
+        if not self.started and time.monotonic() > self._boot_deadline:
+            raise self._lost(f"the guest did not boot in {_BOOT_S:.0f} s")
+        return None
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the command's process group; a guest that still boots is ended instead."""
+        if not self.started:
+            self.kill()
+            return
+        console = self._process.stdin
+        assert console is not None
+        with contextlib.suppress(BrokenPipeError):
+            console.write(signal.Signals(number).name.removeprefix("SIG").encode() + b"\n")
+            console.flush()
+
+    def halt(self) -> None:
+        """Give a guest whose command has ended the time to power off."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(_HALT_S)
+
+    def kill(self) -> None:
+        """End the guest at once; nothing of it is left running."""
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+        if self._process.stdin is not None:
+            with contextlib.suppress(BrokenPipeError):
+                self._process.stdin.close()
+        if self._spinner is not None:
+            self._spinner.kill()
+            self._spinner.wait()
+
+    def _read(self, name: str) -> str:
+        try:
+            return (self._job / name).read_text()
+        except FileNotFoundError:
+            return ""
+
+    def _write_scripts(self, command: Sequence[str], environment: Mapping[str, str], realtime: bool) -> None:
+        job = shlex.quote(str(self._job))
+        merged = _same_file(1, 2)
+        script = _INIT.format(
+            path=_PATH,
+            job=job,
+            modules=MODULES,
+            python=shlex.quote(os.path.realpath(sys.executable)),
+            setup=shlex.quote(str(Path(__file__).with_name("guest_setup.py"))),
+            realtime="echo -1 > /proc/sys/kernel/sched_rt_runtime_us" if realtime else "",
+            redirection='>> "$job/stdout" ' + ("2>&1" if merged else '2>> "$job/stderr"'),
+        )
+        init = self._job / "init"
+        init.write_text(script)
+        init.chmod(0o755)
+        os.umask(umask := os.umask(0o077))
+        text = _COMMAND.format(
+            job=job,
+            umask=umask,
+            folder=shlex.quote(_visible_folder()),
+            environment=" ".join(shlex.quote(f"{name}={value}") for name, value in environment.items()),
+            command=" ".join(map(shlex.quote, command)),
+        )
+        (self._job / "command").write_bytes(os.fsencode(text))
+
+    def _follow(self) -> list[tuple[int, int]]:
+        """Make the output files; return (file to read, our descriptor to write to) of each."""
+        streams = []
+        for name, target in (("stdout", 1), ("stderr", 2)):
+            (self._job / name).touch()
+            streams.append((os.open(self._job / name, os.O_RDONLY | os.O_CLOEXEC), target))
+        return streams
+
+    def _pass_output(self) -> None:
+        for source, target in self._streams:
+            while chunk := os.read(source, 1 << 20):
+                _write_all(target, chunk)
+
+    def _boot(self, realtime: bool) -> subprocess.Popen[bytes]:
+        prefix, self._spinner = _pin() if realtime else ([], None)
+        if shutil.which("setpriv"):
+            prefix = ["setpriv", "--pdeathsig", "TERM", *prefix]  # the guest ends with us, however we end
+        memory_folder, memory = _memory()
+        arguments = [
+            *("root=/dev/root", "rootfstype=hostfs", "rootflags=/", "rw", f"init={self._job}/init", "quiet"),
+            *(f"mem={memory >> 20}M", f"umid=canprobe-{uuid.uuid4().hex[:12]}", f"uml_dir={self._job}/"),
+            *("con=null", "con0=fd:0,fd:1", "ssl=null", "panic=-1"),
+        ]
+        with (self._job / "console").open("wb") as console:
+            return subprocess.Popen(
+                [*prefix, PROGRAM, *arguments],
+                stdin=subprocess.PIPE,
+                stdout=console,
+                stderr=console,
+                env={**os.environ, "TMPDIR": memory_folder, "PATH": _search_path()},
+                start_new_session=True,
+            )
+
+    def _lost(self, what: str) -> GuestError:
+        lines = (self._job / "console").read_bytes().decode(errors="replace").replace("\r", "").splitlines()
+        telling = [line for line in lines if "panic" in line.lower()] or [line for line in lines if line.strip()][-3:]
+        return GuestError(": ".join([what, " | ".join(telling) or "its console is empty"]), self.started)
+
+    def _remove(self) -> None:
+        for source, _ in self._streams:
+            os.close(source)
+        self._streams = []
+        shutil.rmtree(self._job, ignore_errors=True)
+
+
+def _job_folder() -> Path:
+    """Make the job's folder where the guest sees it: it has a /run and a /dev of its own."""
+    candidates = [tempfile.gettempdir(), "/tmp", "/var/tmp"]
+    folder = next((f for f in candidates if not _hidden(f) and os.access(f, os.W_OK)), None)
+    if folder is None:
+        raise GuestError(f"no folder for the guest's files: none of {', '.join(candidates)} can be used", False)
+    return Path(tempfile.mkdtemp(prefix="canprobe-vcan-", dir=folder)).resolve()
+
+
+def _visible_folder() -> str:
+    folder = os.getcwd()
+    if _hidden(folder):
+        raise GuestError(f"the working folder {folder} does not exist in the guest, which has its own {_HIDDEN}", False)
+    return folder
+
+
+def _hidden(folder: str) -> bool:
+    path = os.path.realpath(folder)
+    return any(path == top or path.startswith(top + "/") for top in _HIDDEN)
+
+
+def _memory() -> tuple[str, int]:
+    """Return where the guest's memory file lies and its bytes: in RAM if that may be executed, else on disk."""
+    with contextlib.suppress(OSError):
+        state = os.statvfs("/dev/shm")
+        free = state.f_bavail * state.f_frsize
+        if not state.f_flag & os.ST_NOEXEC and free >= _MEMORY // 4:
+            return "/dev/shm", min(_MEMORY, free)
+    return tempfile.gettempdir(), _MEMORY
+
+
+def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
+    """Return the prefix that pins the guest, and the idle-class process that keeps its processor awake."""
+    processors = sorted(os.sched_getaffinity(0))
+    if len(processors) < 2 or shutil.which("chrt") is None or shutil.which("taskset") is None:
+        raise GuestError("--realtime needs two processors and util-linux (taskset, chrt)", False)
+    pin = ["taskset", "-c", str(processors[-1])]
+    if subprocess.run([*pin, "chrt", "-f", "40", "true"], capture_output=True, check=False).returncode:
+        raise GuestError("--realtime needs the right to use SCHED_FIFO (root, or CAP_SYS_NICE)", False)
+    spinner = subprocess.Popen([*pin, "chrt", "-i", "0", sys.executable, "-c", "while True: pass"])
+    return [*pin, "chrt", "-f", "40"], spinner
+
+
+def _same_file(one: int, other: int) -> bool:
+    try:
+        return os.path.samestat(os.fstat(one), os.fstat(other))
+    except OSError:
+        return False
+
+
+def _write_all(target: int, chunk: bytes) -> None:
+    view = memoryview(chunk)
+    while view:
+        view = view[os.write(target, view) :]

@@ -1,0 +1,35 @@
+"""Open a CAN interface by name."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from canprobe.bus.clock import Clock
+from canprobe.bus.port import CanFilter, Port
+from canprobe.errors import InterfaceError
+
+
+def open_port(
+    interface: str, channel: str, bitrate: int, clock: Clock, *, filters: Sequence[CanFilter] | None = None
+) -> Port:
+    """Open `channel` of `interface`.
+
+    Args:
+        interface: `socketcan` for a raw socket of our own, or any of python-can's interfaces.
+        channel: the channel as that interface names it, such as `can0`.
+        bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
+        clock: a clock in real time.
+        filters: what is let in; everything by default.
+
+    Raises:
+        InterfaceError: it is missing, down, or cannot be opened; with what to do.
+    """
+    if interface == "socketcan":
+        from canprobe.bus.socketcan import SocketCanPort
+
+        return SocketCanPort(channel, clock, filters=filters)
+    if interface == "lockstep":
+        raise InterfaceError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
+    from canprobe.bus.pythoncan import PythonCanPort
+
+    return PythonCanPort(interface, channel, bitrate, clock, filters=filters)

@@ -1,0 +1,273 @@
+"""A `Port` on a SocketCAN interface, with a raw socket of its own: bursts of frames a system call, kernel time stamps.
+
+Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
+the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
+29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`; CAN FD frames are not received.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import select
+import socket
+import struct
+import time
+from collections.abc import Sequence
+
+from canprobe.bus.clock import Clock, Timespec
+from canprobe.bus.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, Row, frame_socket
+from canprobe.bus.port import ERR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.errors import InterfaceError
+
+_SOL_CAN_RAW = 101
+_CAN_RAW_FILTER = 1
+_CAN_RAW_ERR_FILTER = 2
+_CAN_ERR_MASK = 0x1FFFFFFF
+_CAN_ERR_CRTL, _CAN_ERR_BUSOFF, _CAN_ERR_RESTARTED = 0x004, 0x040, 0x100
+_CRTL_ACTIVE, _CRTL_PASSIVE, _CRTL_WARNING = 0x40, 0x30, 0x0C
+_SO_RCVBUFFORCE = 33
+_SIOCGIFFLAGS = 0x8913
+_IFF_UP = 0x1
+_RECEIVE_BUFFER = 4 << 20
+_RETRIES = 50
+_RETRY_S = 200e-6
+_RECALIBRATE_NS = 1_000_000_000
+
+
+class SocketCanPort:
+    """One raw socket on one interface; it does not hear itself, but it hears every other socket of this machine.
+
+    Args:
+        channel: the interface, such as `can0`.
+        clock: a clock that shows CLOCK_MONOTONIC.
+        filters: what the kernel lets in; everything by default.
+        batched: use recvmmsg and sendmmsg where they exist.
+
+    Attributes:
+        counters: what has passed; `overruns` are frames that the kernel dropped for this socket.
+        state: the controller's state as the last error frame told; always ACTIVE on vcan.
+
+    Raises:
+        InterfaceError: the interface is missing, down, or no CAN interface; with the line to type.
+    """
+
+    def __init__(
+        self, channel: str, clock: Clock, *, filters: Sequence[CanFilter] | None = None, batched: bool = True
+    ) -> None:
+        check_interface(channel)
+        self.clock = clock
+        self.channel = channel
+        self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
+        self._socket = _open(channel, filters)
+        self._frames = frame_socket(self._socket, batched)
+        self._poll = _Poll(self._socket.fileno())
+        self._offset_ns = self._calibrated_ns = 0
+
+    def send_batch(self, frames: Sequence[Frame]) -> None:
+        """Send `frames` in order; a full queue is waited for up to 10 ms.
+
+        Raises:
+            InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
+        """
+        self._check_open()
+        for can_id, data in frames:
+            if len(data) > 8 or (can_id > 0x7FF and can_id < ERR_FLAG):
+                raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no classic CAN frame")
+        sent = tries = 0
+        while sent < len(frames):
+            try:
+                sent += self._frames.send(frames[sent:] if sent else frames)
+            except OSError as error:
+                self._retry_or_raise(error, tries, len(frames) - sent)
+                tries += 1
+        self.counters.sent += sent
+
+    def drain(self) -> list[TimedFrame]:
+        """Return every frame that has arrived, with the kernel's time of its arrival."""
+        self._check_open()
+        try:
+            rows = self._frames.receive()
+        except OSError as error:
+            raise self._failed(error) from error
+        if not rows:
+            return []
+        self._follow_clock(rows[-1][2])
+        self.counters.overruns = max(self.counters.overruns, rows[-1][3])
+        offset_ns = self._offset_ns
+        frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
+        if len(frames) < len(rows):
+            self._note_errors(rows)
+        self.counters.received += len(frames)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Sleep until a frame is there, at `until_ns` at the latest."""
+        self._check_open()
+        while (left_ns := until_ns - self.clock.now_ns()) > 0:
+            if self._poll(left_ns):
+                return
+
+    def close(self) -> None:
+        """Close the socket."""
+        self._socket.close()
+
+    def _check_open(self) -> None:
+        if self._socket.fileno() < 0:
+            raise InterfaceError(f"{self.channel}: this port is closed")
+
+    def _retry_or_raise(self, error: OSError, tries: int, left: int) -> None:
+        if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
+            raise self._failed(error) from error
+        self.counters.transmit_full += 1
+        if tries >= _RETRIES:
+            raise InterfaceError(
+                f"{self.channel}: the transmit queue stays full, {left} frames not sent: nobody acknowledges, the bus "
+                f"is overloaded, or the queue is short; type: {_sudo()}ip link set {self.channel} txqueuelen 1000"
+            ) from error
+        time.sleep(_RETRY_S)
+
+    def _failed(self, error: OSError) -> InterfaceError:
+        if error.errno == errno.ENETDOWN:
+            return _down(self.channel)
+        return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
+
+    def _follow_clock(self, stamp_ns: int) -> None:
+        if not 0 <= stamp_ns - self._calibrated_ns < _RECALIBRATE_NS:
+            self._calibrated_ns = stamp_ns
+            self._offset_ns = _realtime_minus_monotonic()
+
+    def _note_errors(self, rows: Sequence[Row]) -> None:
+        for can_id, data, _, _ in rows:
+            if can_id & ERR_FLAG:
+                self.counters.error_frames += 1
+                self.state = _state_after(self.state, can_id, data)
+
+
+def has_socketcan() -> bool:
+    """Return whether this kernel (and this Python) has SocketCAN; loads the module if it is allowed to."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except (AttributeError, OSError):
+        return False
+    return True
+
+
+def check_interface(channel: str) -> None:
+    """Return if `channel` is a CAN interface that is up.
+
+    Raises:
+        InterfaceError: it is not, with the line to type.
+    """
+    if not has_socketcan():
+        raise InterfaceError(
+            f"{channel}: this kernel has no SocketCAN (AF_CAN); for a virtual bus type: canprobe vcan -- COMMAND"
+        )
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+        try:
+            flags = struct.unpack("=16sH14x", fcntl.ioctl(probe, _SIOCGIFFLAGS, _ifreq(channel)))[1]
+        except OSError as error:
+            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+        try:
+            probe.bind((channel,))
+        except OSError as error:
+            raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
+        if not flags & _IFF_UP:
+            raise _down(channel)
+
+
+def _ifreq(channel: str) -> bytes:
+    name = os.fsencode(channel)
+    if not 0 < len(name) < 16:
+        raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+    return struct.pack("=16sH14x", name, 0)
+
+
+def _down(channel: str) -> InterfaceError:
+    options = "" if channel.startswith("v") else " type can bitrate 1000000"
+    return InterfaceError(f"{channel}: interface is down; type: {_sudo()}ip link set {channel} up{options}")
+
+
+def _how_to_make(channel: str) -> str:
+    if channel.startswith("vcan"):
+        sudo = _sudo()
+        return f"type: {sudo}ip link add dev {channel} type vcan && {sudo}ip link set {channel} up"
+    return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
+
+
+def _sudo() -> str:
+    return "" if os.geteuid() == 0 else "sudo "
+
+
+def _open(channel: str, filters: Sequence[CanFilter] | None) -> socket.socket:
+    sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+    try:
+        sock.setblocking(False)
+        if filters is not None:
+            packed = b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
+        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK))
+        sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
+        _enlarge_buffer(sock)
+        sock.bind((channel,))
+    except OSError as error:
+        sock.close()
+        raise InterfaceError(f"{channel}: cannot be opened: {error.strerror}") from error
+    return sock
+
+
+def _enlarge_buffer(sock: socket.socket) -> None:
+    try:
+        sock.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, _RECEIVE_BUFFER)
+    except PermissionError:  # needs CAP_NET_ADMIN; without it the kernel caps the size at net.core.rmem_max
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER)
+
+
+def _realtime_minus_monotonic() -> int:
+    """Return the difference of the clocks in ns, from the quickest of three readings."""
+    readings = []
+    for _ in range(3):
+        before = time.monotonic_ns()
+        realtime = time.time_ns()
+        after = time.monotonic_ns()
+        readings.append((after - before, realtime - (before + after) // 2))
+    return min(readings)[1]
+
+
+def _state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerState:
+    """Return the controller's state after an error frame. Source: Linux include/uapi/linux/can/error.h."""
+    if can_id & _CAN_ERR_BUSOFF:
+        return ControllerState.BUS_OFF
+    if can_id & _CAN_ERR_RESTARTED:
+        return ControllerState.ACTIVE
+    if can_id & _CAN_ERR_CRTL and len(data) > 1:
+        for bits, told in (
+            (_CRTL_PASSIVE, ControllerState.PASSIVE),
+            (_CRTL_WARNING, ControllerState.WARNING),
+            (_CRTL_ACTIVE, ControllerState.ACTIVE),
+        ):
+            if data[1] & bits:
+                return told
+    return state
+
+
+class _PollFd(ctypes.Structure):
+    _fields_ = (("fd", ctypes.c_int), ("events", ctypes.c_short), ("revents", ctypes.c_short))
+
+
+class _Poll:
+    """ppoll on one descriptor: a wait in ns with one system call."""
+
+    def __init__(self, fd: int) -> None:
+        self._ppoll = ctypes.CDLL(None, use_errno=True).ppoll
+        self._pollfd = _PollFd(fd, select.POLLIN, 0)
+        self._timeout = Timespec()
+
+    def __call__(self, timeout_ns: int) -> bool:
+        """Return whether something is there; a signal ends the wait early with False."""
+        self._timeout.tv_sec, self._timeout.tv_nsec = divmod(timeout_ns, 1_000_000_000)
+        return bool(self._ppoll(ctypes.byref(self._pollfd), 1, ctypes.byref(self._timeout), None) > 0)

@@ -1,0 +1,166 @@
+"""Run a command where a real vcan0 exists: here if there is one or one can be made, else in a guest.
+
+In this order: a vcan0 that is up; one in a network namespace of its own; one made by root and removed afterwards; a
+user-mode Linux guest (`canprobe.bus.guest`). The command finds the way taken in the environment: CANPROBE_VCAN is
+`here`, `namespace`, `link` or `guest`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+
+from canprobe.bus.guest import PACKAGE, GuestError, GuestJob, is_installed
+from canprobe.bus.socketcan import check_interface, has_socketcan
+from canprobe.bus.supervise import LocalJob, Signals, caught_signals, supervise
+from canprobe.errors import InterfaceError
+
+CHANNEL = "vcan0"
+NO_VCAN = 125
+GUEST_LOST = 123
+WAY = "CANPROBE_VCAN"
+
+_MAKE_LINK = f"ip link add dev {CHANNEL} type vcan && ip link set {CHANNEL} up"
+_IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && exec "$@"'
+
+
+def run_with_vcan(
+    command: Sequence[str], *, timeout_s: float | None = None, install: bool = False, realtime: bool = False
+) -> int:
+    """Run `command` on a machine that has a vcan0, with the same working folder and environment, without stdin.
+
+    Args:
+        command: program and arguments.
+        timeout_s: how long the command may run; booting a guest does not count.
+        install: install the guest's Debian package if a guest is needed.
+        realtime: steady the guest's timing; see `GuestJob`.
+
+    Returns:
+        The command's exit status (128 + n after signal n); 124 after the time-out; 125 if no vcan can be had; 123 if
+        the guest died under the command. Messages go to stderr.
+    """
+    with caught_signals() as signals:
+        if has_socketcan():
+            with _local_way() as way:
+                if way is not None:
+                    return _run_here([*way[1], *command], way[0], signals, timeout_s)
+        return _run_in_guest(command, signals, timeout_s, install, realtime)
+
+
+def _run_here(command: Sequence[str], way: str, signals: Signals, timeout_s: float | None) -> int:
+    status, timed_out = supervise(LocalJob(command, {**os.environ, WAY: way}), signals, timeout_s)
+    _report_time_out(timed_out, timeout_s)
+    return status
+
+
+def _run_in_guest(
+    command: Sequence[str], signals: Signals, timeout_s: float | None, install: bool, realtime: bool
+) -> int:
+    if not is_installed():
+        line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {PACKAGE}"
+        if not install:
+            return _no_vcan(f"this kernel has no vcan, and the guest that would is not installed; type:  {line}")
+        if not _install(line):
+            return _no_vcan(f"this failed:  {line}")
+    try:
+        with GuestJob(command, {**os.environ, WAY: "guest"}, realtime) as job:
+            return _supervise_guest(job, signals, timeout_s)
+    except GuestError as error:
+        if not error.started:
+            return _no_vcan(str(error))
+        _say(str(error))
+        return GUEST_LOST
+
+
+def _supervise_guest(job: GuestJob, signals: Signals, timeout_s: float | None) -> int:
+    """Wait for the boot, which may be interrupted but does not count as running time, then for the command."""
+    interrupted, _ = supervise(_Boot(job), signals, None)
+    if interrupted:
+        return interrupted
+    status, timed_out = supervise(job, signals, timeout_s)
+    _report_time_out(timed_out, timeout_s)
+    job.halt()
+    return status
+
+
+class _Boot:
+    """The boot of a guest as a job of its own: ends with 0 when the command starts, with 128 + n at a signal."""
+
+    def __init__(self, job: GuestJob) -> None:
+        self._job = job
+        self._signal = 0
+
+    def poll(self) -> int | None:
+        if self._signal:
+            return 128 + self._signal
+        self._job.poll()
+        return 0 if self._job.started else None
+
+    def send_signal(self, number: int) -> None:
+        self._signal = number
+        self._job.kill()
+
+    def kill(self) -> None:
+        self._job.kill()
+
+
+@contextlib.contextmanager
+def _local_way() -> Iterator[tuple[str, list[str]] | None]:
+    """Yield (name of the way, prefix of the command) of the first way that works on this kernel, or None."""
+    namespace = ["unshare", "--net" if os.geteuid() == 0 else "-rn", "--", "sh", "-c", _IN_NAMESPACE, "sh"]
+    if _has_vcan():
+        yield "here", []
+    elif shutil.which("unshare") and _succeeds([*namespace, "true"]):
+        yield "namespace", namespace
+    elif os.geteuid() == 0 and _succeeds(["sh", "-c", _MAKE_LINK]):
+        try:
+            yield "link", []
+        finally:
+            _succeeds(["ip", "link", "delete", CHANNEL])
+    else:
+        yield None
+
+
+def _has_vcan() -> bool:
+    try:
+        check_interface(CHANNEL)
+    except InterfaceError:
+        return False
+    return True
+
+
+def _succeeds(command: Sequence[str]) -> bool:
+    try:
+        return subprocess.run(command, capture_output=True, stdin=subprocess.DEVNULL, check=False).returncode == 0
+    except OSError:
+        return False
+
+
+def _install(line: str) -> bool:
+    """Run the apt line, after an update if it fails at first; its output goes to stderr."""
+    environment = {**os.environ, "DEBIAN_FRONTEND": "noninteractive"}
+    update = line.partition("install")[0] + "update"
+    for attempt in (line, f"{update} && {line}"):
+        _say(attempt)
+        done = subprocess.run(["sh", "-c", attempt], stdin=subprocess.DEVNULL, stdout=2, env=environment, check=False)
+        if done.returncode == 0:
+            return is_installed()
+    return False
+
+
+def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
+    if timed_out:
+        _say(f"the command was stopped after {timeout_s:g} s")
+
+
+def _no_vcan(why: str) -> int:
+    _say(why)
+    return NO_VCAN
+
+
+def _say(text: str) -> None:
+    print(f"canprobe: vcan: {text}", file=sys.stderr, flush=True)
