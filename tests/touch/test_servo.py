@@ -1,0 +1,130 @@
+"""The servo against exact surfaces: a delayed, noise-free sensor and a probe that does as it is told, late."""
+
+from collections import deque
+
+import numpy as np
+import pytest
+
+from canprobe.touch.servo import LocalSurface, SurfaceGains, TactileServo
+from canprobe.touch.strategy import PathFollower, make_strategy
+
+RADIUS_P = 0.040
+DEPTH = 0.426e-3
+DT = 2.5e-3
+AXES = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+
+
+class Sphere:
+    """A sphere of radius ``r``, or a bowl for negative ``r``, touching z = 0 from below at the origin."""
+
+    def __init__(self, r: float) -> None:
+        self.r = r
+        self.centre = np.array((0.0, 0.0, -r))
+
+    def closest(self, x):
+        d = x - self.centre
+        n = d / np.linalg.norm(d) * np.sign(self.r)
+        return self.centre + n * self.r, n
+
+
+class Cylinder:
+    """A cylinder along base x, its crown at the origin."""
+
+    def __init__(self, r: float) -> None:
+        self.r = r
+
+    def closest(self, x):
+        axis = np.array((x[0], 0.0, -self.r))
+        d = x - axis
+        n = d / np.linalg.norm(d)
+        return axis + n * self.r, n
+
+
+def curvature_of(surface, n):
+    if isinstance(surface, Cylinder):
+        t = np.cross(n, (1.0, 0.0, 0.0))
+        return np.outer(t, t) / surface.r
+    return (np.eye(3) - np.outer(n, n)) / surface.r
+
+
+def follow(surface, *, know_curvature=True, seconds=3.0, delay=10, stiffness_error=0.0, gains=SurfaceGains()):
+    """Depth errors (m) and contact points of a closed loop; each command acts ``delay`` cycles later."""
+    p, n = surface.closest(np.array((0.0, 0.0, RADIUS_P)))
+    local = LocalSurface(p, n, gains)
+    servo = TactileServo(
+        local,
+        PathFollower(make_strategy("weave", 0.03, 0.008)),
+        axes=AXES,
+        origin=p,
+        probe_radius=RADIUS_P,
+        rolling_share=0.0,
+    )
+    first = p + n * (RADIUS_P - DEPTH)
+    line = deque([first] * delay, maxlen=delay)
+    depths, points = [], []
+    for k in range(round(seconds / DT)):
+        centre = line[0]
+        p, n = surface.closest(centre)
+        depth = RADIUS_P - float(n @ (centre - p))
+        depths.append(depth - DEPTH)
+        points.append(p)
+        if k % 2 == 0:
+            felt = DEPTH + (depth - DEPTH) * (1 + stiffness_error)
+            local.correct(centre - n * (RADIUS_P - felt), n, 2 * DT)
+            if know_curvature:
+                local.set_curvature(curvature_of(surface, n))
+        line.append(servo.step(25e-3, DEPTH, DT).centre)
+    return np.array(depths), np.array(points)
+
+
+@pytest.mark.parametrize("surface", [Sphere(0.05), Sphere(-0.12), Cylinder(0.036), Sphere(10.0)])
+def test_depth_is_kept_while_the_curvature_is_known(surface):
+    depths, _ = follow(surface)
+    assert np.abs(depths).max() < 3e-6
+
+
+@pytest.mark.parametrize("surface", [Sphere(0.05), Cylinder(0.036)])
+def test_without_curvature_contact_is_kept_all_the_same(surface):
+    depths, _ = follow(surface, know_curvature=False)
+    assert np.abs(depths).max() < 60e-6  # a seventh of the indentation
+
+
+@pytest.mark.parametrize("surface", [Sphere(0.05), Cylinder(0.036)])
+def test_contact_speed_is_the_asked_one(surface):
+    _, points = follow(surface)
+    travelled = np.linalg.norm(np.diff(points[100:], axis=0), axis=1).sum()
+    assert travelled / (DT * (len(points) - 101)) == pytest.approx(25e-3, rel=0.01)
+
+
+@pytest.mark.parametrize("error", [-0.4, 0.4])
+def test_a_wrong_stiffness_leaves_no_steady_error(error):
+    surface = Sphere(0.05)
+    p, n = surface.closest(np.array((0.0, 0.0, RADIUS_P)))
+    local = LocalSurface(p + n * 50e-6, n, SurfaceGains())  # starts 50 µm wrong
+    servo = TactileServo(local, None, axes=AXES, origin=p, probe_radius=RADIUS_P, rolling_share=0.0)
+    line = deque([p + n * (RADIUS_P - DEPTH)] * 10, maxlen=10)
+    depth = DEPTH
+    for k in range(800):
+        depth = RADIUS_P - float(n @ (line[0] - p))
+        if k % 2 == 0:
+            felt = DEPTH + (depth - DEPTH) * (1 + error)
+            local.correct(line[0] - n * (RADIUS_P - felt), n, 2 * DT)
+        line.append(servo.step(0.0, DEPTH, DT).centre)
+    assert depth == pytest.approx(DEPTH, abs=1e-7)
+
+
+def test_local_surface_bends_away_from_the_outward_normal_where_convex():
+    local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
+    local.set_curvature(np.diag((20.0, 0.0, 0.0)))
+    foot, normal = local.foot(np.array((1e-3, 0.0, 5.0)))
+    assert foot == pytest.approx((1e-3, 0.0, -10e-6))
+    assert normal[0] == pytest.approx(0.02, rel=1e-3)
+
+
+@pytest.mark.parametrize(("share", "tilt"), [(0.0, 0.1), (1.0, 0.0)])
+def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
+    local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
+    servo = TactileServo(local, None, axes=AXES, origin=np.zeros(3), probe_radius=RADIUS_P, rolling_share=share)
+    local.normal = np.array((np.sin(0.1), 0.0, np.cos(0.1)))
+    pole = servo.step(0.0, DEPTH, DT).pole
+    assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))
