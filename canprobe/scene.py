@@ -94,16 +94,16 @@ class ObjectSettings:
     """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
 
     The object frame's origin lies on the surface with z outward. The cylinder's axis runs along x; a saddle is
-    z = −x²/(2 radius_x) + y²/(2 radius_y), convex along x and hollow along y; a bowl is the inside of a sphere, seen
-    from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
+    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); a bowl is the inside of a
+    sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
     radius_mm: Annotated[
         float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder", "bowl"), required=True)
     ] = None
-    radius_x_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("saddle",), required=True)] = None
-    radius_y_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )

@@ -46,10 +46,10 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     Raises:
         ValueError: for a matrix that is no surface through the object's origin with z outward.
     """
-    params: dict[str, object] = {}
-    for name in OBJECT_PARAMETERS[settings.kind]:
-        value = settings.matrix if name == "matrix" else getattr(settings, f"{name}_mm")
-        params[name] = np.array(value) if name == "matrix" else value * 1e-3
+    params: dict[str, object] = {
+        name: np.array(settings.matrix) if name == "matrix" else getattr(settings, f"{name}_mm") * 1e-3
+        for name in OBJECT_PARAMETERS[settings.kind]
+    }
     return make_object(settings.kind, T_base_object=T_base_object(settings), **params)
 
 

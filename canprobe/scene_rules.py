@@ -98,6 +98,12 @@ def _heading_along_normal(kind: str, normal: tuple[float, ...] | None, heading: 
     return f"expected a heading across task.approach_normal, got {heading:g}, which runs along it"
 
 
+def _saddle_radii(kind: str | None, x: float | None, y: float | None) -> str | None:
+    if kind != "saddle" or x is None or y is None or (x * y < 0 and min(abs(x), abs(y)) >= 1):
+        return None
+    return f"expected the radii of a saddle to have opposite signs and 1 mm or more, got {x:g} and {y:g}"
+
+
 def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
     if kind not in ("scan", "press") or force is None or limit is None or force < limit:
         return None
@@ -116,6 +122,7 @@ RULES: tuple[Rule, ...] = (
     Rule("sensor.emulated", ("task.kind", "arm.emulated", "sensor.emulated"), _half_emulated),
     Rule("shape.also", ("shape.method", "shape.also"), _main_method_repeated),
     Rule("task.heading_deg", ("task.kind", "task.approach_normal", "task.heading_deg"), _heading_along_normal),
+    Rule("object.radius_y_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _saddle_radii),
     Rule("task.force_n", ("task.kind", "task.force_n", "limits.force_max_n"), _force_target),
     Rule("sensor.rate_hz", ("cycle.rate_hz", "sensor.rate_hz"), _sensor_rate),
 )

@@ -1,0 +1,91 @@
+"""The plan as JSON types, for `canprobe plan --json` and other tools."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from canprobe.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Demand,
+    Plan,
+    PlannedNode,
+    PlannedPdo,
+)
+
+SCHEMA = 1
+
+
+def plan_dict(plan: Plan) -> dict[str, Any]:
+    """Every field of the plan; what does not apply is None."""
+    bus = plan.scene.bus
+    return {
+        "schema": SCHEMA,
+        "scene": plan.scene.name,
+        "title": plan.scene.title,
+        "bus": {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate},
+        "sync": asdict(plan.sync),
+        "heartbeat": {
+            "master_node_id": MASTER_NODE_ID,
+            "produced_ms": HEARTBEAT_PRODUCED_MS,
+            "consumed_ms": HEARTBEAT_CONSUMED_MS,
+        },
+        "nodes": [_node(node) for node in plan.nodes],
+        "pdos": [_pdo(pdo) for pdo in plan.pdos],
+        "bus_load": {
+            bus.channel: {
+                "planned_worst": plan.traffic.load,
+                "parts": dict(plan.traffic.parts),
+                "demands": [_demand(demand) for demand in plan.traffic.demands],
+                "sync_response_us": _us(plan.traffic.sync_response_ns),
+            }
+        },
+        "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
+        "estimator": plan.estimator,
+        "offline_estimators": list(plan.offline_estimators),
+        "strategy": plan.strategy,
+        "fidelity": plan.fidelity,
+        "outputs": list(plan.outputs),
+        "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
+        "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
+    }
+
+
+def _node(node: PlannedNode) -> dict[str, Any]:
+    switched_off = [{"direction": direction, "number": number} for direction, number in node.switched_off]
+    return asdict(node) | {"switched_off": switched_off}
+
+
+def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
+    return {
+        "node_id": pdo.node_id,
+        "direction": pdo.direction,
+        "number": pdo.number,
+        "cob_id": pdo.cob_id,
+        "entries": [
+            {"index": entry.index, "subindex": entry.subindex, "bits": entry.bits, "name": entry.name}
+            for entry in pdo.entries
+        ],
+        "transmission_type": pdo.transmission_type,
+        "rate_hz": pdo.rate_hz,
+        "bytes": pdo.layout.length,
+        "bits_worst": pdo.bits_worst,
+        "deadline_us": _us(pdo.deadline_ns),
+        "response_us": _us(pdo.response_ns),
+        "event_timer_ms": pdo.event_timer_ms or None,
+    }
+
+
+def _demand(demand: Demand) -> dict[str, Any]:
+    return {
+        "what": demand.what,
+        "cycles": demand.cycles,
+        "used_us": _us(demand.used_ns),
+        "available_us": _us(demand.available_ns),
+    }
+
+
+def _us(t_ns: int | None) -> float | None:
+    return None if t_ns is None else t_ns / 1000

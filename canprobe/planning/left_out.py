@@ -1,0 +1,123 @@
+"""What a scene does not need, and why: one table."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+
+from canprobe.scene import Scene
+
+_Reason = Callable[[Scene], str | None]
+
+
+def _no_arm(scene: Scene) -> str | None:
+    return None if scene.arm else f'no [arm]: task.kind = "{scene.task.kind}" moves nothing'
+
+
+def _no_sensor(scene: Scene) -> str | None:
+    return None if scene.sensor else f'no [sensor]: task.kind = "{scene.task.kind}" feels nothing'
+
+
+def _no_image(scene: Scene) -> str | None:
+    if scene.sensor is None or scene.sensor.mode == "image":
+        return None
+    return "the 8×8 window round the contact holds the patch" if scene.sensor.mode == "window" else _by_sensor(scene)
+
+
+def _no_window(scene: Scene) -> str | None:
+    if scene.sensor is None or scene.sensor.mode == "window":
+        return None
+    return "the full image is sent" if scene.sensor.mode == "image" else _by_sensor(scene)
+
+
+def _by_sensor(scene: Scene) -> str | None:
+    if scene.sensor is None or scene.sensor.mode != "features":
+        return None
+    return 'sensor.mode = "features": the sensor computes force, centroid and moments itself'
+
+
+def _no_shape(scene: Scene) -> str | None:
+    if scene.shape is not None:
+        return None
+    why = {"press": "one touch without motion shows no shape", "listen": "nothing moves", "free": "nothing is touched"}
+    return why.get(scene.task.kind, "no [shape]")
+
+
+def _no_strategy(scene: Scene) -> str | None:
+    why = {
+        "press": "the probe holds still",
+        "listen": "nothing moves",
+        "free": "the joints swing, no surface is followed",
+    }
+    return why.get(scene.task.kind)
+
+
+def _no_servo(scene: Scene) -> str | None:
+    return None if scene.servo is not None else f'task.kind = "{scene.task.kind}" controls no force'
+
+
+def _no_emulator(scene: Scene) -> str | None:
+    return None if scene.emulated_node_ids else "every node is real"
+
+
+def _no_truth(scene: Scene) -> str | None:
+    if scene.emulated_node_ids and (scene.object is not None or scene.task.kind == "free"):
+        return None
+    return "no emulated node" if not scene.emulated_node_ids else "no [object]: nothing to compare with"
+
+
+def _no_dynamics(scene: Scene) -> str | None:
+    emulated_arm = scene.arm is not None and scene.arm.emulated
+    return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
+
+
+def _no_figure(_: Scene) -> str | None:
+    if importlib.util.find_spec("matplotlib") is not None:
+        return None
+    return "the study extra is not installed: pip install 'canprobe[study]'"
+
+
+def _switch(name: str) -> _Reason:
+    def reason(scene: Scene) -> str | None:
+        off = scene.plant is not None and scene.sensor is not None and not getattr(scene.plant, name)
+        return f"plant.{name} = false" if off else None
+
+    return reason
+
+
+_TABLE: tuple[tuple[str, _Reason], ...] = (
+    ("six drives, their PDOs, joint limits", _no_arm),
+    ("tactile node and its PDOs", _no_sensor),
+    ("full image (32 PDOs)", _no_image),
+    ("window (8 PDOs)", _no_window),
+    ("taxels and patch features in the master", _by_sensor),
+    ("surface estimator", _no_shape),
+    ("exploration strategy", _no_strategy),
+    ("tactile servo", _no_servo),
+    ("emulator", _no_emulator),
+    ("truth and scores against it", _no_truth),
+    ("arm dynamics", _no_dynamics),
+    ("taxel noise", _switch("noise")),
+    ("taxel gain error", _switch("gain_error")),
+    ("cover blur", _switch("blur")),
+    ("taxel hysteresis", _switch("hysteresis")),
+    ("taxel creep", _switch("creep")),
+    ("taxel crosstalk", _switch("crosstalk")),
+    ("figure", _no_figure),
+)
+
+
+def left_out(scene: Scene) -> tuple[tuple[str, str], ...]:
+    """Everything that this scene leaves out, as (what, why)."""
+    reasons = ((what, reason(scene)) for what, reason in _TABLE)
+    return tuple((what, why) for what, why in reasons if why is not None)
+
+
+def outputs(scene: Scene) -> tuple[str, ...]:
+    """The files that a run of this scene writes."""
+    files = ["summary.json", "log.npz", "bus.log", "scene.toml"]
+    if _no_truth(scene) is None:
+        files.append("truth.npz")
+    if _no_figure(scene) is None:
+        files.append("report.png")
+    return tuple(files)

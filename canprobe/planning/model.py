@@ -1,0 +1,214 @@
+"""The plan: frozen data that bring-up, cycle, emulator and command line all work from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
+from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.scene import Scene
+
+MASTER_NODE_ID = 127
+HEARTBEAT_PRODUCED_MS = 100
+HEARTBEAT_CONSUMED_MS = 250
+SYNC_OVERFLOW = 240
+
+NodeKind = Literal["drive", "tactile"]
+Direction = Literal["tpdo", "rpdo"]
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Object 1018h as the EDS gives it; None where the EDS leaves it open."""
+
+    vendor_id: int | None
+    product_code: int | None
+    revision_number: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedNode:
+    """A node that is brought up.
+
+    Attributes:
+        node_id: 1–126.
+        kind: `drive` or `tactile`.
+        role: for people: `joint 1`, `tactile array`.
+        eds: name or path of its EDS.
+        identity: what 1018h must answer.
+        emulated: served by the emulator.
+        switched_off: PDOs of the EDS that the scene does not need, (direction, number).
+    """
+
+    node_id: int
+    kind: NodeKind
+    role: str
+    eds: str
+    identity: Identity
+    emulated: bool
+    switched_off: tuple[tuple[Direction, int], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedPdo:
+    """One PDO of one node.
+
+    Attributes:
+        node_id: the node.
+        direction: from the device's view.
+        number: 1 for 1400h/1600h or 1800h/1A00h.
+        layout: COB-ID, mapping entries and transmission type.
+        rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
+        bits_worst: length on the wire with worst-case stuffing.
+        deadline_ns: after the SYNC, or after its own queueing where event-driven.
+        response_ns: worst-case response time; None where the bus is overloaded.
+        event_timer_ms: 14xxh:05, 0 without.
+    """
+
+    node_id: int
+    direction: Direction
+    number: int
+    layout: PdoLayout
+    rate_hz: float
+    bits_worst: int
+    deadline_ns: int
+    response_ns: int | None = None
+    event_timer_ms: int = 0
+
+    @property
+    def cob_id(self) -> int:
+        """11-bit identifier."""
+        return self.layout.cob_id
+
+    @property
+    def entries(self) -> tuple[PdoEntry, ...]:
+        """Mapped objects, dummies included."""
+        return self.layout.entries
+
+    @property
+    def transmission_type(self) -> int:
+        """18xxh:02 or 14xxh:02."""
+        return self.layout.transmission_type
+
+
+@dataclass(frozen=True, slots=True)
+class SyncPlan:
+    """SYNC as 1005h, 1006h, 1019h and 60C2h express it.
+
+    Attributes:
+        rate_hz: as the scene asks.
+        period_ns: integer.
+        period_us: 1006h.
+        overflow: 1019h.
+        interpolation_100us: 60C2h:01 with index −4; None without drives.
+    """
+
+    rate_hz: float
+    period_ns: int
+    period_us: int
+    overflow: int
+    interpolation_100us: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What the frames that one trigger releases ask of the bus, worst case.
+
+    Attributes:
+        what: which frames.
+        cycles: within how many cycles they must be through.
+        used_ns: wire time they and everything of higher priority take meanwhile.
+        available_ns: the cycles' length.
+    """
+
+    what: str
+    cycles: int
+    used_ns: int
+    available_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class Traffic:
+    """The bus, worst case.
+
+    Attributes:
+        load: share of the bit rate, everything that repeats.
+        parts: the same by (what, share).
+        demands: peaks behind one SYNC.
+        sync_response_ns: worst-case response time of SYNC.
+    """
+
+    load: float
+    parts: tuple[tuple[str, float], ...]
+    demands: tuple[Demand, ...]
+    sync_response_ns: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class JointSpeeds:
+    """Fastest joint motion that the task asks for, (6,) each, deg/s."""
+
+    needed_deg_s: tuple[float, ...]
+    limit_deg_s: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Everything that follows from a scene before anything is started.
+
+    Attributes:
+        scene: what it was made from.
+        nodes: ascending node ids.
+        pdos: by priority on the bus.
+        sync: the cycle.
+        traffic: whether it fits, with numbers.
+        joint_speeds: None without an arm.
+        estimator: in the loop; None where no shape is estimated.
+        offline_estimators: on the same data after the run.
+        strategy: of the exploration; None without one.
+        fidelity: of the emulated plant; None where nothing is emulated.
+        outputs: files that a run writes.
+        left_out: what this scene does not bring up, and why.
+        not_available: what the EDS files could not give.
+    """
+
+    scene: Scene
+    nodes: tuple[PlannedNode, ...]
+    pdos: tuple[PlannedPdo, ...]
+    sync: SyncPlan
+    traffic: Traffic
+    joint_speeds: JointSpeeds | None
+    estimator: str | None
+    offline_estimators: tuple[str, ...]
+    strategy: str | None
+    fidelity: str | None
+    outputs: tuple[str, ...]
+    left_out: tuple[tuple[str, str], ...]
+    not_available: tuple[tuple[str, str], ...]
+
+    @property
+    def node_ids(self) -> tuple[int, ...]:
+        """Ids of the nodes that are brought up."""
+        return tuple(node.node_id for node in self.nodes)
+
+    def pdos_of(self, node_id: int, direction: Direction) -> tuple[PlannedPdo, ...]:
+        """PDOs of one node in one direction, by number."""
+        found = [pdo for pdo in self.pdos if pdo.node_id == node_id and pdo.direction == direction]
+        return tuple(sorted(found, key=lambda pdo: pdo.number))
+
+    @property
+    def frame_ids(self) -> frozenset[int]:
+        """Every identifier that may be on the bus; anything else is foreign."""
+        services = (EMCY_BASE, SDO_RX_BASE, SDO_TX_BASE, HEARTBEAT_BASE)
+        return frozenset(
+            {NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE_ID}
+            | {base + node for base in services for node in self.node_ids}
+            | {pdo.cob_id for pdo in self.pdos}
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """The plan as JSON types; COB-IDs and indices as numbers."""
+        from canprobe.planning.export import plan_dict
+
+        return plan_dict(self)

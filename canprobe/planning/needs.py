@@ -1,0 +1,39 @@
+"""Objects without which a device cannot take its part, and what they are needed for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from canprobe.planning.abilities import Abilities
+from canprobe.planning.model import NodeKind
+from canprobe.scene import Scene
+
+_EVERY_NODE: Mapping[int, str] = {
+    0x1000: "device type",
+    0x1005: "COB-ID of SYNC",
+    0x1017: "producer heartbeat",
+    0x1018: "identity",
+}
+_OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
+    "drive": {
+        0x6040: "controlword",
+        0x6041: "statusword",
+        0x6060: "modes of operation",
+        0x6061: "modes of operation display",
+        0x6064: "position actual value",
+        0x607A: "target position",
+        0x60C2: "interpolation time period",
+    },
+    "tactile": {0x2000: "tactile mode"},
+}
+
+
+def missing_objects(device: Abilities, kind: NodeKind, scene: Scene) -> list[str]:
+    """One line for every object that the EDS lacks."""
+    needed = {**_EVERY_NODE, **_OF_KIND[kind]}
+    section = "arm" if kind == "drive" else "sensor"
+    return [
+        f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {scene.name} needs it"
+        for index, what in needed.items()
+        if index not in device.od
+    ]

@@ -1,0 +1,118 @@
+"""The path that a scan will take over the object as the scene describes it: points, normals, curvature."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.scene import Scene
+from canprobe.scene_geometry import approach_normal, scan_axes, true_object
+from canprobe.touch.objects import PlacedShape
+from canprobe.touch.strategy import make_strategy
+
+Array = NDArray[np.float64]
+
+_SAMPLES = 240
+_STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
+
+
+@dataclass(frozen=True, slots=True)
+class SurfacePath:
+    """Contacts that the task will make.
+
+    Attributes:
+        points: (n, 3) m, base frame; the first is where the approach ends.
+        normals: (n, 3) outward unit normals there.
+        hollow_radius: smallest concave radius met, m; inf without one.
+    """
+
+    points: Array
+    normals: Array
+    hollow_radius: float
+
+
+def surface_path(scene: Scene) -> tuple[SurfacePath | None, list[str]]:
+    """Points of the object under the task's path; without a described object the plane that the approach expects.
+
+    Args:
+        scene: a scan or a press.
+    """
+    problems: list[str] = []
+    shape = _shape(scene, problems)
+    if problems:
+        return None, problems
+    start = np.array(scene.task.start_mm) * 1e-3
+    down = approach_normal(scene.task)
+    if shape is None:
+        points = _plane_points(scene)
+        return SurfacePath(points, np.tile(down, (len(points), 1)), math.inf), []
+    miss = _along(shape, start, down)
+    if miss is None or not -scene.task.search_mm <= 1e3 * miss <= scene.task.clearance_mm:
+        return None, [_missed(scene, miss)]
+    contacts = []
+    for point in _plane_points(scene):
+        height = _along(shape, point, down)
+        if height is None:
+            return None, [_left_object(point)]
+        contacts.append(shape.closest(point + height * down))
+    points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
+    return SurfacePath(points, normals, shape.tightest_concave_radius(points)), []
+
+
+def _shape(scene: Scene, problems: list[str]) -> PlacedShape | None:
+    if scene.object is None:
+        return None
+    try:
+        return true_object(scene.object)
+    except ValueError as error:
+        problems.append(f"object: {error}")
+        return None
+
+
+def _plane_points(scene: Scene) -> Array:
+    """Points of the path in the scan plane, (n, 3) m; one point for a press."""
+    task = scene.task
+    start = np.array(task.start_mm) * 1e-3
+    if task.kind != "scan":
+        return start[None, :]
+    along, across, _ = scan_axes(task)
+    strategy = make_strategy(task.strategy, task.length_mm * 1e-3, task.width_mm * 1e-3, task.wavelength_mm * 1e-3)
+    flat = [strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, _SAMPLES, endpoint=False)]
+    points: Array = start + np.array([x * along + y * across for x, y in flat])
+    return points
+
+
+def _along(shape: PlacedShape, point: Array, up: Array) -> float | None:
+    """Height of the surface over `point` along `up`, m, by Newton; None where the line misses or grazes it."""
+    height = 0.0
+    for _ in range(50):
+        foot = shape.closest(point + height * up)
+        steepness = float(foot.normal @ up)
+        if steepness < math.cos(_STEEPEST):
+            return None
+        if abs(foot.distance) < 1e-9:
+            return height
+        height -= foot.distance / steepness
+    return None
+
+
+def _missed(scene: Scene, miss: float | None) -> str:
+    x, y, z = scene.task.start_mm
+    where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
+    if miss is None:
+        return f"{where}: the approach does not meet the object; move start_mm over it or the object under it"
+    return (
+        f"{where}: the object lies {abs(1e3 * miss):.1f} mm {'above' if miss > 0 else 'below'} along the approach, "
+        f"searched from {scene.task.clearance_mm:g} mm above to {scene.task.search_mm:g} mm below; move one of them"
+    )
+
+
+def _left_object(point: Array) -> str:
+    x, y, z = (1e3 * point).tolist()
+    return (
+        f"task: at ({x:.1f}, {y:.1f}, {z:.1f}) mm the path leaves the object or meets it steeper than "
+        f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn task.heading_deg"
+    )

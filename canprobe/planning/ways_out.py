@@ -1,0 +1,61 @@
+"""What to change when a scene does not fit its bus: each way is planned too, and only those that fit are named."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator
+
+from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
+from canprobe.planning.model import Traffic
+from canprobe.scene import Scene, TactileModeName
+
+Fit = Callable[[Scene], Traffic | None]
+"""Traffic of a changed scene, or None where that does not fit either."""
+
+
+def ways_out(scene: Scene, fit: Fit) -> str:
+    """Changes that make the scene fit, with the load that they leave, in one line."""
+    found = []
+    for text, changed in (*_changes(scene), *_slower(scene, fit)):
+        traffic = fit(changed)
+        if traffic is not None:
+            peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
+            numbers = f"{100 * traffic.load:.0f} %, {peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
+            found.append(f"{text} ({numbers})")
+    return "; or ".join(found) if found else "fewer nodes or a faster bus"
+
+
+def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
+    if scene.bus.bitrate < 1_000_000:
+        yield "bus.bitrate = 1000000", dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, bitrate=1_000_000))
+    if scene.arm is not None and not scene.arm.grouped_rpdo:
+        yield (
+            "arm.grouped_rpdo = true",
+            dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, grouped_rpdo=True)),
+        )
+    if scene.sensor is None:
+        return
+    smaller: dict[TactileModeName, tuple[TactileModeName, ...]] = {
+        "image": ("window", "features"),
+        "window": ("features",),
+    }
+    for mode in smaller.get(scene.sensor.mode, ()):
+        yield f'sensor.mode = "{mode}"', dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode=mode))
+    if scene.arm is not None:
+        yield "a bus of its own for the sensor", dataclasses.replace(scene, arm=None)
+
+
+def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
+    """The fastest cycle that fits, at the same number of cycles a tactile frame."""
+    now = round(1e6 / scene.cycle.rate_hz / INTERPOLATION_US)
+    for units in range(now + 1, INTERPOLATION_MAX + 1):
+        rate = 1e6 / (units * INTERPOLATION_US)
+        changed = dataclasses.replace(scene, cycle=dataclasses.replace(scene.cycle, rate_hz=rate))
+        text = f"cycle.rate_hz = {rate:.6g}"
+        if scene.sensor is not None:
+            tactile = rate * scene.sensor.rate_hz / scene.cycle.rate_hz
+            changed = dataclasses.replace(changed, sensor=dataclasses.replace(scene.sensor, rate_hz=tactile))
+            text += f" with sensor.rate_hz = {tactile:.6g}"
+        if fit(changed) is not None:
+            yield text, changed
+            return
