@@ -1,0 +1,121 @@
+"""Values of a node's object dictionary, with the checks an access over the bus must pass.
+
+Services hang their rules here: a *check* may refuse a value before it is stored, a *hook* acts after, a *refresh*
+brings a live value up to date before it is read.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from canopen.objectdictionary import ObjectDictionary
+
+from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.entries import Entry, Value, key_of, read_entries
+
+Check = Callable[[int, Value], None]
+Hook = Callable[[int, Value], None]
+
+
+class Dictionary:
+    """The object dictionary of one node.
+
+    Attributes:
+        entries: by key (index << 8 | subindex).
+        values: present values by key; cyclic code reads and writes here directly.
+        written: called with the key after a value was stored over SDO, or over an RPDO that needs checks or hooks.
+    """
+
+    def __init__(self, od: ObjectDictionary) -> None:
+        self.entries: dict[int, Entry] = {entry.key: entry for entry in read_entries(od)}
+        self.values: dict[int, Value] = {}
+        self._indices = {key >> 8 for key in self.entries}
+        self._checks: dict[int, list[Check]] = {}
+        self._hooks: dict[int, list[Hook]] = {}
+        self._refreshers: dict[int, Callable[[int], None]] = {}
+        self.written: Callable[[int], None] = _nothing
+        self.restore(self.entries)
+
+    def restore(self, keys: Iterable[int]) -> None:
+        """Put the EDS's defaults back, without checks or hooks."""
+        for key in keys:
+            self.values[key] = self.entries[key].default
+
+    def __contains__(self, key: int) -> bool:
+        return key in self.entries
+
+    def has_index(self, index: int) -> bool:
+        """Whether any entry of that index exists."""
+        return index in self._indices
+
+    def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
+        """An integer value, or `default` where the EDS has no such entry."""
+        value = self.values.get(key_of(index, subindex), default)
+        return int(value) if not isinstance(value, bytes) else default
+
+    def put(self, index: int, subindex: int, value: Value) -> None:
+        """Store a value of the device's own; nothing happens where the EDS has no such entry."""
+        key = key_of(index, subindex)
+        if key in self.entries:
+            self.values[key] = value
+
+    def on_check(self, index: int, check: Check) -> None:
+        """`check(subindex, value)` may raise SdoAbort before a value of `index` is stored."""
+        self._checks.setdefault(index, []).append(check)
+
+    def on_write(self, index: int, hook: Hook) -> None:
+        """`hook(subindex, value)` after a value of `index` was stored over SDO or RPDO."""
+        self._hooks.setdefault(index, []).append(hook)
+
+    def on_read(self, index: int, refresh: Callable[[int], None]) -> None:
+        """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
+        self._refreshers[index] = refresh
+
+    def is_plain(self, key: int) -> bool:
+        """Whether a write needs nothing but the assignment."""
+        entry, index = self.entries[key], key >> 8
+        limited = entry.low is not None or entry.high is not None
+        return not (limited or index in self._checks or index in self._hooks)
+
+    def find(self, index: int, subindex: int) -> Entry:
+        """The entry, or SdoAbort: no object, or no such subindex of it."""
+        entry = self.entries.get(key_of(index, subindex))
+        if entry is None:
+            raise SdoAbort(Abort.NO_SUBINDEX if index in self._indices else Abort.NO_OBJECT)
+        return entry
+
+    def find_writable(self, index: int, subindex: int) -> Entry:
+        """The entry, or SdoAbort also when it is read-only."""
+        entry = self.find(index, subindex)
+        if not entry.writable:
+            raise SdoAbort(Abort.READ_ONLY)
+        return entry
+
+    def read(self, index: int, subindex: int) -> bytes:
+        """SDO upload. Raises SdoAbort."""
+        entry = self.find(index, subindex)
+        if not entry.readable:
+            raise SdoAbort(Abort.WRITE_ONLY)
+        if refresh := self._refreshers.get(index):
+            refresh(subindex)
+        return entry.to_bytes(self.values[entry.key])
+
+    def write(self, index: int, subindex: int, data: bytes) -> None:
+        """SDO download. Raises SdoAbort; the value is then unchanged."""
+        entry = self.find_writable(index, subindex)
+        self.write_value(entry, entry.from_bytes(data))
+
+    def write_value(self, entry: Entry, value: Value) -> None:
+        """Limits, checks, store, hooks: the common end of SDO and RPDO. Raises SdoAbort."""
+        index, subindex = entry.key >> 8, entry.key & 0xFF
+        entry.check_limits(value)
+        for check in self._checks.get(index, ()):
+            check(subindex, value)
+        self.values[entry.key] = value
+        for hook in self._hooks.get(index, ()):
+            hook(subindex, value)
+        self.written(entry.key)
+
+
+def _nothing(key: int) -> None:
+    return None

@@ -1,0 +1,71 @@
+"""What a drive tells of itself: actual and demand values, brought up to date only where somebody reads them.
+
+Source: CiA 402-2, objects 6062h, 6064h, 606Ch, 6077h, 60F4h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from canprobe.emulator.drive_motion import AxisPlant, Motion
+from canprobe.emulator.node import SlaveNode
+
+_I16, _I32 = 1 << 15, 1 << 31
+
+
+def _within(value: float, limit: int) -> int:
+    return min(max(round(value), -limit), limit - 1)
+
+
+class DriveFeedback:
+    """Actual values of one axis.
+
+    Attributes:
+        counts: motor position at the last `measure`.
+    """
+
+    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion) -> None:
+        self._core, self._axis, self._plant, self._motion = node.core, axis, plant, motion
+        self.counts = 0.0
+        self._velocity = 0.0
+        self._t_ns: int | None = None
+        sources: dict[int, Callable[[], int]] = {
+            0x6062: lambda: _within(motion.demand(self._t_ns or 0), _I32),
+            0x6064: lambda: _within(self.counts, _I32),
+            0x606C: lambda: _within(self._velocity, _I32),
+            0x6077: lambda: _within(plant.torque_permille(axis), _I16),
+            0x60F4: lambda: _within(motion.demand(self._t_ns or 0) - self.counts, _I32),
+        }
+        for index, source in sources.items():
+            if node.dictionary.has_index(index):
+                node.pdos.on_trigger(index, self._sampler(index, source))
+                node.dictionary.on_read(index, self._reader(index, source))
+
+    def reset(self, t_ns: int) -> None:
+        """Velocity starts anew."""
+        self._t_ns = None
+        self._velocity = 0.0
+
+    def measure(self, t_ns: int) -> float:
+        """Position at `t_ns`, counts; the velocity is the mean since the last call."""
+        last_ns = self._t_ns
+        if t_ns != last_ns:
+            self._plant.advance(t_ns)
+            counts = self._plant.motor_counts(self._axis)
+            if last_ns is not None:
+                self._velocity = (counts - self.counts) / (t_ns - last_ns) * 1e9
+            self.counts, self._t_ns = counts, t_ns
+        return self.counts
+
+    def _sampler(self, index: int, source: Callable[[], int]) -> Callable[[int], None]:
+        values, key = self._core.dictionary.values, index << 8
+
+        def sample(t_ns: int) -> None:
+            self.measure(t_ns)
+            values[key] = source()
+
+        return sample
+
+    def _reader(self, index: int, source: Callable[[], int]) -> Callable[[int], None]:
+        sample = self._sampler(index, source)
+        return lambda _subindex: sample(self._core.now_ns)

@@ -1,0 +1,100 @@
+"""The reference that one drive gives to its axis of the plant: ramps, hold, deceleration to standstill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol
+
+from canprobe.emulator.timers import Timers
+
+STEP_NS = 2_500_000
+
+
+class AxisPlant(Protocol):
+    """What a drive needs of the plant. Positions are motor counts, calls at one instant are idempotent."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`."""
+
+    def motor_counts(self, axis: int) -> float:
+        """True motor position, counts."""
+
+    def torque_permille(self, axis: int) -> int:
+        """Motor torque, 1/1000 of the rated torque."""
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
+
+
+class Motion:
+    """Reference of one axis; remembers the ramp it gave last."""
+
+    def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
+        self._axis, self._plant = axis, plant
+        self._timer = timers.new(self._step)
+        self._start = self._end = 0.0
+        self._t0 = self._t1 = 0
+        self._speed = self._rate = 0.0
+        self._done: Callable[[int], None] = _nothing
+
+    @property
+    def stopping(self) -> bool:
+        """A deceleration is under way."""
+        return self._timer.due_ns is not None
+
+    def hold(self, t_ns: int) -> float:
+        """Stay where the motor is; returns that position, counts."""
+        self._timer.cancel()
+        self._plant.advance(t_ns)
+        here = self._plant.motor_counts(self._axis)
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        return here
+
+    def reach(self, counts: float, t_ns: int, duration_ns: int) -> None:
+        """From the end of the present ramp to `counts`, in `duration_ns` from now."""
+        self._ramp(self._end, counts, t_ns, t_ns + duration_ns)
+
+    def demand(self, t_ns: int) -> float:
+        """The reference at `t_ns`, counts."""
+        if t_ns >= self._t1:
+            return self._end
+        return self._start + (self._end - self._start) * max(0, t_ns - self._t0) / (self._t1 - self._t0)
+
+    def speed(self, t_ns: int) -> float:
+        """Speed of the reference, counts/s."""
+        moving = self._t0 <= t_ns < self._t1
+        return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
+
+    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None]) -> None:
+        """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
+
+        A rate of 0 stops the reference at once.
+        """
+        self._speed = self.speed(t_ns) if rate > 0 else 0.0
+        self._rate, self._done = rate, done
+        here = self.demand(t_ns)
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        if self._speed:
+            self._step(t_ns)
+        else:
+            self._timer.arm(t_ns + STEP_NS)
+
+    def _step(self, due_ns: int) -> None:
+        speed = self._speed
+        if not speed:
+            self._done(due_ns)
+            return
+        seconds = min(STEP_NS * 1e-9, abs(speed) / self._rate)
+        rest = speed - self._rate * seconds * (1 if speed > 0 else -1)
+        self._speed = rest if seconds == STEP_NS * 1e-9 and rest * speed > 0 else 0.0
+        travel = (speed + self._speed) / 2 * seconds
+        self._ramp(self._end, self._end + travel, due_ns, due_ns + max(1, round(seconds * 1e9)))
+        self._timer.arm(due_ns + STEP_NS)
+
+    def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
+        self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
+        self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+
+
+def _nothing(t_ns: int) -> None:
+    return None

@@ -1,0 +1,132 @@
+"""EMCY producer, error register 1001h and error history 1003h.
+
+Source: CiA 301, "Emergency object", objects 1001h, 1003h, 1014h, 1015h.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.entries import Value
+from canprobe.protocol.emcy import NO_ERROR, Emcy
+from canprobe.protocol.frames import NmtState, is_restricted
+
+INVALID = 1 << 31
+_GENERIC = 0x01
+# Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.
+_REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x80, 0xF: 0x80}
+_SENDING = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+
+
+def register_bit(code: int) -> int:
+    """The bit of the error register 1001h that an emergency error code sets beside the generic one."""
+    if code & 0xF000 == 0x8000:
+        return 0x10 if code & 0x0F00 <= 0x0200 else 0x20
+    return _REGISTER_BITS.get(code >> 12, 0)
+
+
+class Emergency:
+    """Reports errors once, tells when they are gone, and remembers them.
+
+    Attributes:
+        any: whether any error is present.
+    """
+
+    def __init__(self, core: NodeCore) -> None:
+        self._core = core
+        self._active: set[int] = set()
+        self.any = False
+        self._history: list[int] = []
+        self._waiting: deque[bytes] = deque()
+        self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
+        self._timer = core.timers.new(self._inhibit_over)
+        core.dictionary.on_check(0x1003, self._check_history)
+        core.dictionary.on_write(0x1003, self._cleared)
+        core.dictionary.on_read(0x1003, self._check_read)
+        core.dictionary.on_check(0x1014, self._check_cob_id)
+
+    def reset(self, t_ns: int) -> None:
+        """No error, nothing waiting; the history survives (it is non-volatile where a device can keep it)."""
+        self._active.clear()
+        self._waiting.clear()
+        self._timer.cancel()
+        self._show()
+
+    def entered(self, t_ns: int) -> None:
+        """Nothing: errors of the stopped state stay in the history only."""
+
+    def routes(self) -> Mapping[int, Route]:
+        """A producer listens to nothing."""
+        return NO_ROUTES
+
+    @property
+    def active(self) -> frozenset[int]:
+        """Codes of the errors present."""
+        return frozenset(self._active)
+
+    def report(self, code: int, data: bytes = b"") -> None:
+        """An error is present: remember and send it, once until `clear`."""
+        if code in self._active:
+            return
+        self._active.add(code)
+        self._history.insert(0, code | int.from_bytes(data[:2], "little") << 16)
+        self._show()
+        self._send(code, data)
+
+    def clear(self, code: int) -> None:
+        """An error is gone: EMCY 0000h with what remains in the register."""
+        if code in self._active:
+            self._active.discard(code)
+            self._show()
+            self._send(NO_ERROR, b"")
+
+    def _send(self, code: int, data: bytes) -> None:
+        cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
+        if cob_id & INVALID or self._core.state not in _SENDING:
+            return
+        self._waiting.append(Emcy(code, self._register(), data).pack())
+        if self._timer.due_ns is None:
+            self._inhibit_over(self._core.now_ns)
+
+    def _inhibit_over(self, due_ns: int) -> None:
+        if self._waiting:
+            cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
+            self._core.send(cob_id & 0x7FF, self._waiting.popleft())
+            if inhibit := self._core.dictionary.number(0x1015):
+                self._timer.arm(due_ns + inhibit * 100_000)
+
+    def _register(self) -> int:
+        bits = _GENERIC if self._active else 0
+        for code in self._active:
+            bits |= register_bit(code)
+        return bits
+
+    def _show(self) -> None:
+        dictionary = self._core.dictionary
+        self.any = bool(self._active)
+        dictionary.put(0x1001, 0, self._register())
+        del self._history[self._room :]
+        dictionary.put(0x1003, 0, len(self._history))
+        for subindex in range(1, self._room + 1):
+            dictionary.put(0x1003, subindex, self._history[subindex - 1] if subindex <= len(self._history) else 0)
+
+    def _check_read(self, subindex: int) -> None:
+        if subindex > len(self._history):
+            raise SdoAbort(Abort.NO_DATA)
+
+    def _cleared(self, subindex: int, value: Value) -> None:
+        self._history.clear()
+        self._show()
+
+    def _check_history(self, subindex: int, value: Value) -> None:
+        if subindex == 0 and value != 0:
+            raise SdoAbort(Abort.VALUE)
+
+    def _check_cob_id(self, subindex: int, value: Value) -> None:
+        new, old = int(value), self._core.dictionary.number(0x1014)
+        changed_while_valid = not (new | old) & INVALID and (new ^ old) & 0x7FF
+        if new & 0x7FFFF800 or changed_while_valid or (not new & INVALID and is_restricted(new & 0x7FF)):
+            raise SdoAbort(Abort.VALUE)

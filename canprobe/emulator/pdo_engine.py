@@ -1,0 +1,197 @@
+"""All PDOs of a node: which frame goes where, and what a SYNC does.
+
+At a SYNC in operational: waiting synchronous RPDOs are applied, the application moves on, then every TPDO whose turn
+it is is sampled and packed. TPDOs of equal type and start value share one group, so they always go together.
+Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+from canprobe.emulator.application import Application
+from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.emergency import Emergency
+from canprobe.emulator.entries import Value, key_of
+from canprobe.emulator.pdo_rules import PdoRules
+from canprobe.emulator.rpdo import Rpdo
+from canprobe.emulator.tpdo import Tpdo
+from canprobe.protocol.frames import NmtState
+
+Sampler = Callable[[int], None]
+
+
+class _Group:
+    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`."""
+
+    __slots__ = ("every", "first", "samplers", "start", "tpdos")
+
+    def __init__(self, every: int, start: int) -> None:
+        self.every, self.start = every, start
+        self.first: int | None = None
+        self.tpdos: list[Tpdo] = []
+        self.samplers: list[Sampler] = []
+
+
+class PdoEngine:
+    """The PDOs of one node."""
+
+    def __init__(self, core: NodeCore, emcy: Emergency, application: Application) -> None:
+        self._core, self._application = core, application
+        self._samplers: dict[int, Sampler] = {}
+        self._rpdos: list[Rpdo] = []
+        self._tpdos: list[Tpdo] = []
+        self._all: list[Rpdo | Tpdo] = []
+        self._waiting: list[Rpdo] = []
+        self._groups: list[_Group] = []
+        self._on_event: list[Tpdo] = []
+        self._count = self._sync_ns = self._window_ns = 0
+        for rules in _discover(core, 0x1400, transmits=False):
+            self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
+            self._watch(rules, rpdo)
+        for rules in _discover(core, 0x1800, transmits=True):
+            self._tpdos.append(tpdo := Tpdo(core, rules))
+            self._watch(rules, tpdo)
+        core.dictionary.written = self.event_key
+        core.dictionary.on_write(0x1007, lambda _sub, _value: self._rebuild())
+
+    def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
+        def reconfigure(subindex: int, value: Value) -> None:
+            pdo.configure()
+            self._rebuild()
+            self._core.reroute()
+
+        self._all.append(pdo)
+        dictionary = self._core.dictionary
+        dictionary.on_check(rules.communication, rules.check_communication)
+        dictionary.on_check(rules.mapping, rules.check_mapping)
+        dictionary.on_write(rules.communication, reconfigure)
+        dictionary.on_write(rules.mapping, reconfigure)
+
+    def on_trigger(self, index: int, sampler: Sampler) -> None:
+        """`sampler(t_ns)` is called once before TPDOs that map `index` are packed."""
+        self._samplers[index] = sampler
+
+    def reset(self, t_ns: int) -> None:
+        """Read all parameters."""
+        for pdo in self._all:
+            pdo.configure()
+        self._rebuild()
+
+    def entered(self, t_ns: int) -> None:
+        """Count SYNCs anew in operational; be silent elsewhere."""
+        for pdo in self._all:
+            pdo.stop()
+        if self._core.state is NmtState.OPERATIONAL:
+            self._rebuild()
+            for tpdo in self._on_event:
+                tpdo.started(t_ns)
+
+    def routes(self) -> Mapping[int, Route]:
+        """RPDO identifiers, in operational only; PDOs that share one are all served."""
+        if self._core.state is not NmtState.OPERATIONAL:
+            return NO_ROUTES
+        routes: dict[int, Route] = {}
+        for rpdo in self._rpdos:
+            if rpdo.cob_id is not None:
+                routes[rpdo.cob_id] = _both(routes.get(rpdo.cob_id), self._route(rpdo))
+        return routes
+
+    def _route(self, rpdo: Rpdo) -> Route:
+        if not (self._window_ns and rpdo.synchronous):
+            return rpdo.receive
+
+        def inside_window(data: bytes, t_ns: int) -> None:
+            if t_ns - self._sync_ns <= self._window_ns:
+                rpdo.receive(data, t_ns)
+
+        return inside_window
+
+    def receives(self, index: int) -> bool:
+        """Whether an RPDO that is in use carries an object of `index`."""
+        return any(key >> 8 == index for rpdo in self._rpdos if rpdo.cob_id is not None for key in rpdo.keys)
+
+    def event(self, index: int, subindex: int = 0) -> None:
+        """A value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
+        self.event_key(key_of(index, subindex))
+
+    def event_key(self, key: int) -> None:
+        """As `event`, by dictionary key."""
+        if self._core.state is NmtState.OPERATIONAL:
+            for tpdo in self._on_event:
+                if key in tpdo.keys:
+                    tpdo.event(self._core.now_ns)
+
+    def sync(self, t_ns: int, counter: int, elapsed: int) -> None:
+        """A SYNC in operational.
+
+        Args:
+            t_ns: its time.
+            counter: its counter, 0 without one.
+            elapsed: SYNCs since the last one heard, lost ones included (the counter tells).
+        """
+        self._sync_ns = t_ns
+        count = self._count = self._count + elapsed
+        for rpdo in self._waiting:
+            if rpdo.pending is not None:
+                rpdo.apply(rpdo.pending)
+        self._application.sync(t_ns, counter)
+        for group in self._groups:
+            if group.first is None and counter == group.start:
+                group.first = count
+            if group.first is not None and (count - group.first) % group.every == 0:
+                for sampler in group.samplers:
+                    sampler(t_ns)
+                for tpdo in group.tpdos:
+                    tpdo.send()
+        for tpdo in self._on_event:
+            if tpdo.requested:
+                tpdo.before(t_ns)
+                tpdo.send()
+
+    def _rebuild(self) -> None:
+        dictionary = self._core.dictionary
+        self._window_ns = dictionary.number(0x1007) * 1000
+        self._waiting = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None and rpdo.synchronous]
+        active = [tpdo for tpdo in self._tpdos if tpdo.active]
+        self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
+        counted = bool(dictionary.number(0x1019))
+        groups: dict[tuple[int, int], _Group] = {}
+        for tpdo in active:
+            if 1 <= tpdo.type <= 240:
+                key = tpdo.type, tpdo.start if counted else 0
+                groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
+        for tpdo in self._on_event:
+            tpdo.before = _all(self._samplers_of([tpdo]))
+        self._groups = list(groups.values())
+        for group in self._groups:
+            group.samplers = self._samplers_of(group.tpdos)
+            group.first = None if group.start else self._count
+
+    def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:
+        indices = dict.fromkeys(key >> 8 for tpdo in tpdos for key in tpdo.keys)
+        return list(dict.fromkeys(self._samplers[index] for index in indices if index in self._samplers))
+
+
+def _discover(core: NodeCore, first: int, transmits: bool) -> list[PdoRules]:
+    indices = range(first, first + 0x200)
+    return [PdoRules(core.dictionary, i, i + 0x200, transmits) for i in indices if core.dictionary.has_index(i)]
+
+
+def _both(first: Route | None, second: Route) -> Route:
+    if first is None:
+        return second
+
+    def route(data: bytes, t_ns: int) -> None:
+        first(data, t_ns)
+        second(data, t_ns)
+
+    return route
+
+
+def _all(samplers: list[Sampler]) -> Sampler:
+    def sample(t_ns: int) -> None:
+        for sampler in samplers:
+            sampler(t_ns)
+
+    return sample

@@ -1,0 +1,108 @@
+"""One RPDO: reception, length check, event timer, and what happens to its values.
+
+Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
+"""
+
+from __future__ import annotations
+
+from canprobe.emulator.aborts import SdoAbort
+from canprobe.emulator.core import NodeCore
+from canprobe.emulator.emergency import Emergency
+from canprobe.emulator.entries import key_of
+from canprobe.emulator.pdo_rules import COB_ID, EVENT, TYPE, PdoRules
+from canprobe.protocol.emcy import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT
+from canprobe.protocol.pdo import PdoLayout
+
+
+class Rpdo:
+    """One receive PDO, compiled from its parameters by `configure`.
+
+    Attributes:
+        cob_id: identifier, or None while the PDO is not valid.
+        synchronous: applied at the next SYNC (types 0–240).
+        pending: data waiting for that SYNC.
+    """
+
+    __slots__ = (
+        "_core",
+        "_emcy",
+        "_event_ns",
+        "_layout",
+        "_plan",
+        "_rules",
+        "_timer",
+        "cob_id",
+        "pending",
+        "synchronous",
+    )
+
+    def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
+        self._core, self._emcy, self._rules = core, emcy, rules
+        self._timer = core.timers.new(self._timed_out)
+        self._layout = PdoLayout(0, ())
+        self._plan: tuple[tuple[int, bool], ...] = ()
+        self._event_ns = 0
+        self.cob_id: int | None = None
+        self.synchronous = False
+        self.pending: bytes | None = None
+
+    def configure(self) -> None:
+        """Read the parameters. A mapping that makes no sense leaves the PDO without values."""
+        dictionary, index = self._core.dictionary, self._rules.communication
+        try:
+            entries = self._rules.entries()
+        except SdoAbort:
+            entries = ()
+        self.stop()
+        self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
+        self._layout = PdoLayout(self.cob_id or 0, entries)
+        keys = [key_of(signal.index, signal.subindex) for signal in self._layout.signals]
+        self._plan = tuple((key, dictionary.is_plain(key)) for key in keys)
+        self.synchronous = dictionary.number(index, TYPE) <= 240
+        self._event_ns = dictionary.number(index, EVENT) * 1_000_000
+
+    @property
+    def keys(self) -> tuple[int, ...]:
+        """Mapped dictionary keys, dummies left out."""
+        return tuple(key for key, _ in self._plan)
+
+    def stop(self) -> None:
+        """Forget what waits; the event timer starts again at the next reception."""
+        self.pending = None
+        self._timer.cancel()
+
+    def receive(self, data: bytes, t_ns: int) -> None:
+        """A frame with this PDO's identifier."""
+        length = self._layout.length
+        if len(data) != length:
+            if len(data) < length:
+                self._emcy.report(PDO_TOO_SHORT)
+                return
+            self._emcy.report(PDO_TOO_LONG)
+            data = data[:length]
+        elif self._emcy.any:
+            self._emcy.clear(PDO_TOO_SHORT)
+            self._emcy.clear(PDO_TOO_LONG)
+            self._emcy.clear(RPDO_TIMEOUT)
+        if self._event_ns:
+            self._timer.arm(t_ns + self._event_ns)
+        if self.synchronous:
+            self.pending = data
+        else:
+            self.apply(data)
+
+    def apply(self, data: bytes) -> None:
+        """Store the values; one that the dictionary refuses is dropped."""
+        self.pending = None
+        dictionary = self._core.dictionary
+        for value, (key, plain) in zip(self._layout.unpack(data), self._plan, strict=True):
+            if plain:
+                dictionary.values[key] = value
+                continue
+            try:
+                dictionary.write_value(dictionary.entries[key], value)
+            except SdoAbort:
+                continue
+
+    def _timed_out(self, due_ns: int) -> None:
+        self._emcy.report(RPDO_TIMEOUT)

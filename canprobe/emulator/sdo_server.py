@@ -1,0 +1,151 @@
+"""One SDO server: expedited, segmented and block transfers on the node's dictionary.
+
+A new initiate request while a transfer is open takes its place: a master that was restarted is served at once.
+Source: CiA 301, "Service data object (SDO)".
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping
+
+from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.sdo_block import BlockDownload, BlockUpload
+from canprobe.emulator.sdo_transfers import SegmentedDownload, SegmentedUpload, Transfer, check_size
+from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtState
+
+TIMEOUT_NS = 1_000_000_000
+_INVALID = 1 << 31
+_HEAD = struct.Struct("<BHBI")
+_SERVED = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
+
+
+class SdoServer:
+    """The server of one channel, 1200h by default; `index` 1201h… makes an additional one."""
+
+    def __init__(self, core: NodeCore, index: int = 0x1200) -> None:
+        self._core = core
+        self._index = index
+        self._transfer: Transfer | None = None
+        self._multiplexer = (0, 0)
+        self._timer = core.timers.new(self._timed_out)
+        self._initiate: dict[int, Callable[[bytes], bytes]] = {
+            1: self._download,
+            2: self._upload,
+            5: self._block_upload,
+            6: self._block_download,
+        }
+        if index != 0x1200:
+            core.dictionary.on_write(index, lambda _sub, _value: core.reroute())
+
+    def reset(self, t_ns: int) -> None:
+        """Drop what is open."""
+        self._drop()
+
+    def entered(self, t_ns: int) -> None:
+        """A transfer does not survive the stopped state."""
+        if self._core.state not in _SERVED:
+            self._drop()
+
+    def routes(self) -> Mapping[int, Route]:
+        """The request identifier, in pre-operational and operational."""
+        cob_id = self._cob_id(1, SDO_RX_BASE)
+        if self._core.state not in _SERVED or (cob_id | self._cob_id(2, SDO_TX_BASE)) & _INVALID:
+            return NO_ROUTES
+        return {cob_id & 0x7FF: self._receive}
+
+    def _cob_id(self, subindex: int, base: int) -> int:
+        default = base + self._core.node_id if self._index == 0x1200 else _INVALID
+        return self._core.dictionary.number(self._index, subindex, default)
+
+    def _receive(self, data: bytes, t_ns: int) -> None:
+        if len(data) != 8:
+            return
+        if data[0] == 0x80:
+            self._drop()
+            return
+        try:
+            answers = self._answer(data)
+        except SdoAbort as abort:
+            self._abort(abort.code)
+            return
+        for answer in answers:
+            self._send(answer)
+        if self._transfer is None or self._transfer.done:
+            self._drop()
+        else:
+            self._timer.arm(t_ns + TIMEOUT_NS)
+
+    def _answer(self, data: bytes) -> list[bytes]:
+        transfer = self._transfer
+        if transfer is not None and transfer.streaming:
+            return transfer.receive(data)
+        if initiate := self._initiation(data[0]):
+            _, index, subindex, _ = _HEAD.unpack(data)
+            self._transfer = None
+            self._multiplexer = (index, subindex)
+            return [initiate(data)]
+        if transfer is None:
+            self._multiplexer = _HEAD.unpack(data)[1:3]
+            raise SdoAbort(Abort.COMMAND)
+        return transfer.receive(data)
+
+    def _initiation(self, command: int) -> Callable[[bytes], bytes] | None:
+        specifier = command >> 5
+        if (specifier == 5 and command & 3) or (specifier == 6 and command & 1):
+            return None  # later steps of a block transfer
+        return self._initiate.get(specifier)
+
+    def _download(self, data: bytes) -> bytes:
+        index, subindex = self._multiplexer
+        entry = self._core.dictionary.find_writable(index, subindex)
+        command = data[0]
+        if command & 2:
+            size = 4 - (command >> 2 & 3) if command & 1 else min(entry.bits // 8 or 4, 4)
+            check_size(entry, size)
+            self._write(data[4 : 4 + size])
+        else:
+            announced = int.from_bytes(data[4:8], "little") if command & 1 else None
+            self._transfer = SegmentedDownload(entry, announced, self._write)
+        return _HEAD.pack(0x60, index, subindex, 0)
+
+    def _upload(self, data: bytes) -> bytes:
+        value = self._core.dictionary.read(*self._multiplexer)
+        if 1 <= len(value) <= 4:
+            return _HEAD.pack(0x43 | (4 - len(value)) << 2, *self._multiplexer, 0)[:4] + value.ljust(4, b"\0")
+        self._transfer = SegmentedUpload(value)
+        return _HEAD.pack(0x41, *self._multiplexer, len(value))
+
+    def _block_download(self, data: bytes) -> bytes:
+        index, subindex = self._multiplexer
+        entry = self._core.dictionary.find_writable(index, subindex)
+        announced = int.from_bytes(data[4:8], "little") if data[0] & 2 else None
+        self._transfer = BlockDownload(entry, announced, bool(data[0] & 4), self._write)
+        return _HEAD.pack(0xA4, index, subindex, 127)
+
+    def _block_upload(self, data: bytes) -> bytes:
+        value = self._core.dictionary.read(*self._multiplexer)
+        block_size, threshold = data[4], data[5]
+        transfer = BlockUpload(value, block_size, bool(data[0] & 4))
+        if 0 < len(value) <= threshold:
+            return self._upload(data)
+        self._transfer = transfer
+        return _HEAD.pack(0xC6, *self._multiplexer, len(value))
+
+    def _write(self, data: bytes) -> None:
+        self._core.dictionary.write(*self._multiplexer, data)
+
+    def _send(self, data: bytes) -> None:
+        self._core.send(self._cob_id(2, SDO_TX_BASE) & 0x7FF, data)
+
+    def _abort(self, code: Abort) -> None:
+        self._drop()
+        self._send(_HEAD.pack(0x80, *self._multiplexer, code))
+
+    def _drop(self) -> None:
+        self._transfer = None
+        self._timer.cancel()
+
+    def _timed_out(self, due_ns: int) -> None:
+        self._abort(Abort.TIMED_OUT)

@@ -1,0 +1,75 @@
+"""Store and restore parameters (1010h, 1011h) in a memory that survives the resets of the node.
+
+Source: CiA 301, objects 1010h and 1011h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.entries import Value
+
+SAVE = int.from_bytes(b"save", "little")
+LOAD = int.from_bytes(b"load", "little")
+_ALL = range(0x1000, 0x10000)
+_COMMUNICATION = range(0x1000, 0x2000)
+_APPLICATION = range(0x2000, 0x10000)
+_GROUPS = {1: _ALL, 2: _COMMUNICATION, 3: _APPLICATION}
+_NEVER = frozenset({0x1003, 0x1010, 0x1011})
+
+
+class Store:
+    """Parameters of one node, kept by "save" and forgotten by "load" (from the next reset on).
+
+    Attributes:
+        saved: stored values by dictionary key; hand it to another node's store to model a power cycle.
+        volatile: indices that are process data, never stored.
+    """
+
+    def __init__(self, core: NodeCore) -> None:
+        self._core = core
+        self.saved: dict[int, Value] = {}
+        self.volatile: set[int] = set()
+        core.dictionary.on_check(0x1010, self._save)
+        core.dictionary.on_check(0x1011, self._load)
+        core.dictionary.on_write(0x1010, self._show)
+        core.dictionary.on_write(0x1011, self._show)
+
+    def reset(self, t_ns: int) -> None:
+        """Nothing: the node calls `recall`."""
+
+    def entered(self, t_ns: int) -> None:
+        """Nothing."""
+
+    def routes(self) -> Mapping[int, Route]:
+        """Listens to nothing."""
+        return NO_ROUTES
+
+    def recall(self, communication_only: bool) -> None:
+        """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
+        area = _COMMUNICATION if communication_only else range(0x10000)
+        dictionary = self._core.dictionary
+        dictionary.restore(key for key in dictionary.entries if key >> 8 in area)
+        for key, value in self.saved.items():
+            if key >> 8 in area:
+                dictionary.values[key] = value
+
+    def _save(self, subindex: int, value: Value) -> None:
+        if value != SAVE or subindex not in _GROUPS:
+            raise SdoAbort(Abort.CANNOT_STORE)
+        dictionary, skip = self._core.dictionary, _NEVER | self.volatile
+        for key, entry in dictionary.entries.items():
+            if entry.writable and entry.readable and key >> 8 in _GROUPS[subindex] and key >> 8 not in skip:
+                self.saved[key] = dictionary.values[key]
+
+    def _load(self, subindex: int, value: Value) -> None:
+        if value != LOAD or subindex not in _GROUPS:
+            raise SdoAbort(Abort.CANNOT_STORE)
+        self.saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
+
+    def _show(self, subindex: int, value: Value) -> None:
+        for index in (0x1010, 0x1011):
+            for sub in _GROUPS:
+                self._core.dictionary.put(index, sub, 1)

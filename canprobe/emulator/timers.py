@@ -1,0 +1,100 @@
+"""Deadlines of one node: a heap that forgives re-arming, because a cyclic node re-arms on every SYNC."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from heapq import heappop, heappush
+
+
+class Timer:
+    """One deadline. Re-arming to a later time costs an assignment; the heap is put right when the old time comes.
+
+    Attributes:
+        due_ns: when it fires, or None while it is not armed.
+    """
+
+    __slots__ = ("_callback", "_owner", "_queued_ns", "due_ns")
+
+    def __init__(self, owner: Timers, callback: Callable[[int], None]) -> None:
+        self._owner = owner
+        self._callback = callback
+        self._queued_ns: int | None = None
+        self.due_ns: int | None = None
+
+    def arm(self, due_ns: int) -> None:
+        """Fire at `due_ns`, in place of any earlier order."""
+        self.due_ns = due_ns
+        queued = self._queued_ns
+        if queued is None or due_ns < queued:
+            self._queued_ns = due_ns
+            self._owner.queue(due_ns, self)
+
+    def arm_next(self, due_ns: int, period_ns: int) -> None:
+        """Fire one period after `due_ns`; periods already missed are skipped, the phase is kept."""
+        late = self._owner.now_ns - due_ns
+        self.arm(due_ns + period_ns * (1 + max(0, late) // period_ns))
+
+    def cancel(self) -> None:
+        """Do not fire."""
+        self.due_ns = None
+
+    def surfaced(self, queued_ns: int) -> bool:
+        """Take the entry of `queued_ns` off the heap; queue again when it was re-armed. True when it is due then."""
+        if queued_ns != self._queued_ns:
+            return False
+        self._queued_ns = None
+        if self.due_ns == queued_ns:
+            return True
+        if self.due_ns is not None:
+            self.arm(self.due_ns)
+        return False
+
+    def fire(self, due_ns: int) -> None:
+        """Disarm and call back with the time that was ordered."""
+        self.due_ns = None
+        self._callback(due_ns)
+
+
+class Timers:
+    """All deadlines of a node.
+
+    Attributes:
+        now_ns: the time up to which `run` was last called.
+    """
+
+    __slots__ = ("_count", "_heap", "now_ns")
+
+    def __init__(self) -> None:
+        self._heap: list[tuple[int, int, Timer]] = []
+        self._count = 0
+        self.now_ns = 0
+
+    def new(self, callback: Callable[[int], None]) -> Timer:
+        """A timer that calls `callback(due_ns)`; not armed."""
+        return Timer(self, callback)
+
+    def queue(self, due_ns: int, timer: Timer) -> None:
+        """Put an entry on the heap (for `Timer`)."""
+        self._count += 1
+        heappush(self._heap, (due_ns, self._count, timer))
+
+    @property
+    def next_ns(self) -> int | None:
+        """The earliest deadline, or None."""
+        heap = self._heap
+        while heap:
+            due, _, timer = heap[0]
+            if timer.due_ns == due:
+                return due
+            heappop(heap)
+            timer.surfaced(due)
+        return None
+
+    def run(self, t_ns: int) -> None:
+        """Fire everything due up to and at `t_ns`, in order of time, then of arming."""
+        self.now_ns = t_ns
+        heap = self._heap
+        while heap and heap[0][0] <= t_ns:
+            due, _, timer = heappop(heap)
+            if timer.surfaced(due):
+                timer.fire(due)

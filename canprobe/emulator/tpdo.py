@@ -1,0 +1,141 @@
+"""One TPDO: packing, and the events that send it outside the SYNC cycle.
+
+Source: CiA 301, "TPDO", objects 1800h and 1A00h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from operator import itemgetter
+from typing import Any
+
+from canprobe.emulator.aborts import SdoAbort
+from canprobe.emulator.core import NodeCore
+from canprobe.emulator.entries import key_of
+from canprobe.emulator.pdo_rules import COB_ID, EVENT, INHIBIT, START, TYPE, PdoRules
+from canprobe.protocol.pdo import PdoLayout
+
+Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
+
+
+def _fetcher(keys: tuple[int, ...]) -> Fetch:
+    """All mapped values at once, by one call into C."""
+    if len(keys) == 1:
+        return lambda values, key=keys[0]: (values[key],)  # type: ignore[misc]
+    return itemgetter(*keys)
+
+
+class Tpdo:
+    """One transmit PDO, compiled from its parameters by `configure`.
+
+    Attributes:
+        active: valid and with something mapped.
+        keys: mapped dictionary keys.
+        type: transmission type.
+        start: SYNC start value (18xxh:06).
+        requested: an event waits for the next SYNC (type 0).
+    """
+
+    __slots__ = (
+        "_cob_id",
+        "_core",
+        "_earliest_ns",
+        "_event_ns",
+        "_event_timer",
+        "_fetch",
+        "_inhibit_ns",
+        "_inhibit_timer",
+        "_pack",
+        "_rules",
+        "active",
+        "before",
+        "keys",
+        "requested",
+        "start",
+        "type",
+    )
+
+    def __init__(self, core: NodeCore, rules: PdoRules) -> None:
+        self._core, self._rules = core, rules
+        self._event_timer = core.timers.new(self._event_due)
+        self._inhibit_timer = core.timers.new(self._inhibit_over)
+        self._pack: Callable[..., bytes] = bytes
+        self._fetch: Fetch = _no_values
+        self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
+        self.active = self.requested = False
+        self.keys: tuple[int, ...] = ()
+        self.type = self.start = 0
+        self.before: Callable[[int], None] = _nothing
+
+    def configure(self) -> None:
+        """Read the parameters. A mapping that makes no sense leaves the PDO silent."""
+        number, index = self._core.dictionary.number, self._rules.communication
+        try:
+            entries = self._rules.entries()
+        except SdoAbort:
+            entries = ()
+        self.stop()
+        self._cob_id = number(index, COB_ID) & 0x7FF
+        self.active = self._rules.valid and bool(entries)
+        self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
+        self.type, self.start = number(index, TYPE), number(index, START)
+        self._inhibit_ns = number(index, INHIBIT) * 100_000
+        self._event_ns = number(index, EVENT) * 1_000_000
+        if self.active:
+            self._pack, self._fetch = PdoLayout(self._cob_id, entries, self.type).pack, _fetcher(self.keys)
+
+    @property
+    def by_event(self) -> bool:
+        """Sent on events at once (254, 255), not at a SYNC."""
+        return self.type >= 254
+
+    def stop(self) -> None:
+        """No longer operational: nothing is due."""
+        self._event_timer.cancel()
+        self._inhibit_timer.cancel()
+        self.requested = False
+
+    def started(self, t_ns: int) -> None:
+        """Operational: an event-driven PDO tells its first values."""
+        if self.active and self.by_event:
+            self._earliest_ns = t_ns
+            self.event(t_ns)
+
+    def event(self, t_ns: int) -> None:
+        """A mapped value changed."""
+        if not self.active:
+            return
+        if not self.by_event:
+            self.requested = self.type == 0
+        elif t_ns >= self._earliest_ns:
+            self._send_now(t_ns)
+        elif self._inhibit_timer.due_ns is None:
+            self._inhibit_timer.arm(self._earliest_ns)
+
+    def send(self) -> None:
+        """Pack the present values and send them."""
+        self.requested = False
+        core = self._core
+        core.out.append((self._cob_id, self._pack(*self._fetch(core.dictionary.values))))
+
+    def _send_now(self, t_ns: int) -> None:
+        self.before(t_ns)
+        self.send()
+        self._earliest_ns = t_ns + self._inhibit_ns
+        if self._event_ns:
+            self._event_timer.arm(t_ns + self._event_ns)
+
+    def _event_due(self, due_ns: int) -> None:
+        now_ns = self._core.timers.now_ns
+        self.event(now_ns if now_ns - due_ns > self._event_ns else due_ns)  # late: do not catch up
+
+    def _inhibit_over(self, due_ns: int) -> None:
+        self._send_now(due_ns)
+
+
+def _no_values(values: Mapping[int, Any]) -> tuple[int, ...]:
+    return ()
+
+
+def _nothing(t_ns: int) -> None:
+    return None
