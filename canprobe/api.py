@@ -92,7 +92,13 @@ def _finish(session: Session, controller: object, failure: BaseException | None)
     reason = None if failure is None else (str(failure) or "interrupted")
     summary = summarise(session, controller, estimates, reason)
     result = RunResult(
-        session.plan, summary, session.cell.log.arrays(), session.truth, estimates, session.out
+        session.plan,
+        summary,
+        session.cell.log.arrays(),
+        session.truth,
+        estimates,
+        getattr(controller, "taxels", None),
+        session.out,
     )
     if session.out is not None:
         write_files(result, session.out)

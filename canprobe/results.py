@@ -32,6 +32,7 @@ class RunResult:
         log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit.
         truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
         estimates: what each estimator said, by name; the online one first.
+        taxels: (16, 16) counts of the task's last tactile frame, or None.
         out: the folder with the files, or None.
     """
 
@@ -40,6 +41,7 @@ class RunResult:
     log: dict[str, Array]
     truth: dict[str, Array]
     estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
+    taxels: NDArray[np.uint8] | None = None
     out: Path | None = None
 
     def text(self) -> str:

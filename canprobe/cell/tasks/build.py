@@ -56,6 +56,8 @@ def _settings(scene: Scene, period_s: float, tactile_timeout: int) -> TouchSetti
         speed=task.speed_mm_s * 1e-3 if scanning else 0.0,
         rolling_share=task.rolling_share if scanning else 0.0,
         approach_speed=task.approach_mm_s * 1e-3,
+        clearance=task.clearance_mm * 1e-3,
+        search=task.search_mm * 1e-3,
         lead_s=CYCLES_TO_EFFECT * period_s + servo.drive_lag_ms * 1e-3,
         gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
         tactile_timeout=tactile_timeout,

@@ -100,6 +100,7 @@ class TouchTask:
         self.shape = shape
         self.sensing = sensing
         self.reason: str | None = None
+        self.taxels: NDArray[np.uint8] | None = None
         self.scan_cycles: tuple[int, int] | None = None
         self._s = settings
         self._motion_from = motion_from
@@ -116,6 +117,7 @@ class TouchTask:
         self._depth0 = 0.0
         self._pole0: Vector = np.zeros(3)
         self._columns: dict[str, float | Vector] = {}
+        self._shape_columns: dict[str, float | Vector] = {}
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
@@ -146,6 +148,8 @@ class TouchTask:
         if patch is None or measurement.tactile is None:
             return
         self._force = patch.force
+        if self.phase is Phase.SCAN:
+            self.taxels = measurement.tactile.frame.taxels
         contact = self.sensing.contact(measurement.tactile, patch) if patch.force > self._s.touch_force / 2 else None
         self._contact = contact
         if contact is not None and self._servo is not None:
@@ -159,7 +163,15 @@ class TouchTask:
     def _take_shape(self, contact: ContactSample) -> None:
         assert self.shape is not None and self._servo is not None
         estimate = self.shape.add(contact)
-        if estimate is not None and bool(np.all(estimate.observed)):
+        if estimate is None:
+            return
+        self._shape_columns = {
+            "kappa_per_m": np.where(estimate.observed, estimate.kappa, np.nan),
+            "T_base_contact_m": estimate.T_frame_contact,
+            "K_per_m": estimate.K,
+            "K_covariance_per_m2": estimate.covariance,
+        }
+        if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             self.sensing.kappa = np.asarray(estimate.kappa)
 
@@ -174,6 +186,7 @@ class TouchTask:
             "pad_v_mm": patch.v * 1e3,
             "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
             "normal": contact.n_base if contact is not None else nothing,
+            **self._shape_columns,
         }
 
     def _watch(self, measurement: Measurement) -> None:

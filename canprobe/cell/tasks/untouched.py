@@ -63,12 +63,14 @@ class ListenTask:
         self._left = duration_s
         self._period = period_s
         self._timeout = tactile_timeout
+        self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Vector] = {}
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
         self._left -= self._period
         if measurement.tactile is not None:
+            self.taxels = measurement.tactile.frame.taxels
             patch = patch_of(measurement.tactile, self._calibration)
             self._columns = {
                 "sample_cycle": float(measurement.tactile.cycle),

@@ -1,0 +1,89 @@
+"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from canprobe.eds import load_eds
+from canprobe.emulator.drive import make_drive_node
+from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.emulator.plant.world import Plant, PlantConfig, PressMotion
+from canprobe.emulator.tactile import make_tactile_node
+from canprobe.emulator.truth import TruthRecorder
+from canprobe.planning import Plan
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene import PlantSettings, ProbeSettings, Scene
+from canprobe.scene_geometry import T_flange_probe, true_object
+
+EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk")
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The emulated nodes and what they share.
+
+    Attributes:
+        nodes: the slaves, ascending by node id.
+        plant: arm, probe, object and array.
+        recorder: notes the truth at every SYNC.
+    """
+
+    nodes: tuple[SlaveNode, ...]
+    plant: Plant
+    recorder: TruthRecorder
+
+    @property
+    def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
+        """Everything that lives on the bus; the recorder listens only."""
+        return (*self.nodes, self.recorder)
+
+
+def make_world(plan: Plan, node_ids: Collection[int]) -> World:
+    """The emulated nodes of a plan, behind one plant.
+
+    Args:
+        plan: of the scene.
+        node_ids: which of its nodes to emulate.
+    """
+    scene = plan.scene
+    plant = Plant(_plant_config(scene))
+    nodes = []
+    for node in plan.nodes:
+        if node.node_id not in node_ids:
+            continue
+        dictionary = load_eds(node.eds, node.node_id)
+        if node.kind == "drive":
+            assert scene.arm is not None
+            axis = scene.arm.node_ids.index(node.node_id)
+            nodes.append(make_drive_node(dictionary, node.node_id, axis, plant))
+        else:
+            nodes.append(make_tactile_node(dictionary, node.node_id, plant))
+    return World(tuple(nodes), plant, TruthRecorder(plant))
+
+
+def _plant_config(scene: Scene) -> PlantConfig:
+    settings, probe, arm = scene.plant or PlantSettings(), scene.probe or ProbeSettings(), scene.arm
+    config = PlantConfig(
+        model=MODELS[arm.model] if arm is not None else None,
+        T_flange_probe_centre=T_flange_probe(probe),
+        radius_m=probe.radius_mm * 1e-3,
+        stiffness_n_m3=probe.stiffness_n_m3,
+        damping_s_m=settings.contact_damping_s_m,
+        object=true_object(scene.object) if scene.object is not None else None,
+        taxels=_taxels(scene, settings),
+        bandwidth_hz=settings.drive_bandwidth_hz,
+        press=PressMotion(force_n=scene.task.force_n),
+        seed=scene.seed,
+    )
+    return config if arm is None else replace(config, q0=np.radians(arm.start_deg))
+
+
+def _taxels(scene: Scene, settings: PlantSettings) -> TaxelConfig | None:
+    if scene.sensor is None:
+        return None
+    array = TaxelConfig(full_scale_pa=scene.sensor.full_scale_kpa * 1e3)
+    return array.without(*(effect for effect in EFFECTS if not getattr(settings, effect)))
