@@ -1,0 +1,162 @@
+"""The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
+
+A trigger is a SYNC at which the header's TPDO is due. The array is sampled there; what goes out is the image of an
+earlier trigger, because a real sensor needs a frame to process it. The header's sample age says so.
+Source: objects 2000h–2130h of `tactile_array.eds`; wire form in `protocol.tactile`.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Protocol
+
+import numpy as np
+from canopen.objectdictionary import ObjectDictionary
+from numpy.typing import NDArray
+
+from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.application import Application
+from canprobe.emulator.entries import Value
+from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.tactile_image import Image, compute_features, correct, follow, is_overloaded
+from canprobe.protocol.frames import NmtState
+from canprobe.protocol.tactile import Features, TactileHeader, TactileMode, pack_frame
+
+TARE = int.from_bytes(b"tare", "little")
+MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
+IMAGE_ROWS, WINDOW_ROWS, HEADER, FEATURES = 0x2100, 0x2110, 0x2120, 0x2130
+_CONTENT = {TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
+_MAX_AGE_US = 0xFFFF
+
+
+class TactilePlant(Protocol):
+    """What the sensor needs of the plant."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`; idempotent."""
+
+    def sample_image(self, t_ns: int) -> NDArray[np.uint8]:
+        """Raw counts of the array at `t_ns`, uint8 (16, 16)."""
+
+
+class TactileApplication(Application):
+    """The sensor function of one node. A tare command takes the mean of the next images as zero."""
+
+    def __init__(self, plant: TactilePlant, latency_frames: int = 1, tare_images: int = 16) -> None:
+        """Make the sensor.
+
+        Args:
+            plant: shared with the other nodes.
+            latency_frames: triggers between sampling an image and sending it.
+            tare_images: images averaged by one tare command.
+        """
+        self._plant = plant
+        self._latency, self._tare_images = latency_frames, tare_images
+        self._pipeline: deque[tuple[int, Image]] = deque()
+        self._tare: NDArray[np.float64] | None = None
+        self._kept_tare: NDArray[np.float64] | None = None
+        self._taring: list[Image] | None = None
+        self._frames = 0
+        self._origin = (4, 4)
+        self._counter = 0
+        self._triggered_ns: int | None = None
+
+    def attach(self, node: SlaveNode) -> None:
+        """Hang the sensor's objects on the node."""
+        self._node = node
+        for index in (HEADER, FEATURES, IMAGE_ROWS, WINDOW_ROWS):
+            node.pdos.on_trigger(index, self._trigger)
+        node.dictionary.on_check(TARE_COMMAND, _check_tare)
+        node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
+        node.dictionary.on_write(0x1010, lambda _sub, _value: self._keep_tare(self._tare))
+        node.dictionary.on_write(0x1011, lambda _sub, _value: self._keep_tare(None))
+
+    def reset(self, t_ns: int) -> None:
+        """Power on."""
+        self._pipeline.clear()
+        self._tare, self._taring = self._kept_tare, None
+        self._frames = 0
+        self._origin = (4, 4)
+
+    def entered(self, t_ns: int) -> None:
+        """Sample at once on entering operational, so that the first frame shows something real."""
+        self._pipeline.clear()
+        self._triggered_ns = None
+        if self._node.state is NmtState.OPERATIONAL:
+            self._sample(t_ns)
+
+    def advance(self, t_ns: int) -> None:
+        """The plant moves on."""
+        self._plant.advance(t_ns)
+
+    def sync(self, t_ns: int, counter: int) -> None:
+        """Remember the counter; the trigger, if there is one, follows."""
+        self._counter = counter
+
+    def _sample(self, t_ns: int) -> None:
+        self._plant.advance(t_ns)
+        raw = self._plant.sample_image(t_ns)
+        self._pipeline.append((t_ns, raw))
+        if self._taring is not None:
+            self._taring.append(raw)
+            if len(self._taring) == self._tare_images:
+                self._tare, self._taring = np.mean(self._taring, axis=0), None
+
+    def _trigger(self, t_ns: int) -> None:
+        if t_ns == self._triggered_ns:
+            return  # PDOs of one frame in different groups
+        self._triggered_ns = t_ns
+        self._sample(t_ns)
+        pipeline = self._pipeline
+        while len(pipeline) > self._latency + 1:
+            pipeline.popleft()
+        sampled_ns, raw = pipeline.popleft() if len(pipeline) > self._latency else pipeline[0]
+        self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
+
+    def _show(self, raw: Image, age_us: int) -> None:
+        """Put one frame into the objects that the TPDOs carry."""
+        dictionary = self._node.dictionary
+        number = dictionary.number
+        mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
+        image = correct(raw, self._tare, number(GAIN, 0, 1000), number(THRESHOLD))
+        overload = is_overloaded(raw) or is_overloaded(image)
+        self._origin = follow(image, self._origin)
+        row, column = self._origin if mode is TactileMode.WINDOW else (0, 0)
+        header = TactileHeader(self._frames, self._counter, row, column, mode, overload, age_us)
+        self._frames = (self._frames + 1) % 256
+        content: Image | Features = image
+        if mode is TactileMode.FEATURES:
+            content = compute_features(image, number(FULL_SCALE_PA, 0, 100_000))
+        words = [int.from_bytes(payload, "little") for payload in pack_frame(header, content)]
+        dictionary.put(OVERLOAD, 0, int(overload))
+        dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
+        if mode is TactileMode.FEATURES:
+            dictionary.put(FEATURES, 1, words[0])
+            dictionary.put(FEATURES, 2, words[1])
+        else:
+            for subindex, word in enumerate(words[1:], start=1):
+                dictionary.put(_CONTENT[mode], subindex, word)
+        dictionary.put(HEADER, 0, words[0])
+
+    def _begin_tare(self, subindex: int, value: Value) -> None:
+        self._tare, self._taring = None, []
+
+    def _keep_tare(self, tare: NDArray[np.float64] | None) -> None:
+        self._kept_tare = tare
+
+
+def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1) -> SlaveNode:
+    """A tactile node on the plant.
+
+    Args:
+        od: of `tactile_array.eds`, for this node id.
+        node_id: 1–127.
+        plant: shared by all nodes.
+        latency_frames: triggers between sampling an image and sending it.
+    """
+    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames))
+
+
+def _check_tare(subindex: int, value: Value) -> None:
+    if value != TARE:
+        raise SdoAbort(Abort.CANNOT_STORE)

@@ -1,0 +1,82 @@
+"""What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.protocol.tactile import SIDE, WINDOW, Features
+
+Image = NDArray[np.uint8]
+FULL_SCALE = 255
+GAIN_ONE = 1000
+_HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
+_LAST_ORIGIN = SIDE - WINDOW
+_INDEX = np.arange(SIDE, dtype=np.float64)
+TAXEL_AREA_M2 = 1.5875e-3**2
+
+
+def is_overloaded(raw: Image) -> bool:
+    """Whether a taxel has reached full scale."""
+    return bool(raw.max() == FULL_SCALE)
+
+
+def correct(raw: Image, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
+    """Raw counts (16, 16) → counts with the tare subtracted, times the gain, saturated, zero below the threshold."""
+    if tare is None and gain_permille == GAIN_ONE:
+        return np.where(raw >= threshold, raw, np.uint8(0))
+    counts = raw.astype(np.float64)
+    if tare is not None:
+        counts -= tare
+    rounded = np.clip(np.rint(counts * (gain_permille / GAIN_ONE)), 0, FULL_SCALE).astype(np.uint8)
+    return np.where(rounded >= threshold, rounded, np.uint8(0))
+
+
+def _moments(image: Image) -> tuple[float, float, float]:
+    """Sum, centroid row, centroid column; the centre of the pad without a contact."""
+    rows, columns = image.sum(axis=1, dtype=np.float64), image.sum(axis=0, dtype=np.float64)
+    total = float(rows.sum())
+    if total == 0.0:
+        return 0.0, (SIDE - 1) / 2, (SIDE - 1) / 2
+    return total, float(rows @ _INDEX) / total, float(columns @ _INDEX) / total
+
+
+def follow(image: Image, origin: tuple[int, int]) -> tuple[int, int]:
+    """First taxel (row, column), 0..8 each, of the window round the contact.
+
+    The window stays while the contact's centroid is near its middle, and where it is without a contact.
+    """
+    total, row, column = _moments(image)
+    if total == 0.0:
+        return origin
+    return _shift(origin[0], row), _shift(origin[1], column)
+
+
+def _shift(origin: int, centroid: float) -> int:
+    ideal = centroid - (WINDOW - 1) / 2
+    if abs(ideal - origin) <= _HYSTERESIS:
+        return origin
+    return min(max(round(ideal), 0), _LAST_ORIGIN)
+
+
+def compute_features(image: Image, full_scale_pa: float) -> Features:
+    """Force, centroid and central second moments of the whole pad.
+
+    Args:
+        image: corrected counts, (16, 16).
+        full_scale_pa: pressure at 255 counts, Pa.
+    """
+    total, row, column = _moments(image)
+    if total == 0.0:
+        return Features(0.0, row, column, 0.0, 0.0, 0.0, 0)
+    weights = image / total
+    d_row, d_column = _INDEX - row, _INDEX - column
+    return Features(
+        force_n=total / FULL_SCALE * full_scale_pa * TAXEL_AREA_M2,
+        row=row,
+        col=column,
+        var_rr=float(d_row**2 @ weights.sum(axis=1)),
+        var_rc=float(d_row @ weights @ d_column),
+        var_cc=float(d_column**2 @ weights.sum(axis=0)),
+        peak=int(image.max()),
+    )

@@ -1,0 +1,67 @@
+"""Records what is true in the plant at every SYNC, beside what the nodes measure."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.protocol.frames import SYNC_ID, Frame
+
+
+class TruePlant(Protocol):
+    """A plant that tells its present true values."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`; idempotent."""
+
+    def truth(self) -> Mapping[str, Any]:
+        """Present true values: numbers and arrays, always under the same names."""
+
+
+class TruthRecorder:
+    """A silent participant of the bus that writes down the plant's truth at every SYNC."""
+
+    name = "truth recorder"
+
+    def __init__(self, plant: TruePlant) -> None:
+        self._plant = plant
+        self._rows: list[tuple[int, int, Mapping[str, Any]]] = []
+
+    @property
+    def next_deadline_ns(self) -> None:
+        """Only a SYNC wakes it."""
+        return None
+
+    def start(self, t_ns: int) -> list[Frame]:
+        """Nothing to say."""
+        return []
+
+    def advance(self, t_ns: int) -> list[Frame]:
+        """Nothing is ever due."""
+        return []
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
+        """On a SYNC, take the truth."""
+        if can_id == SYNC_ID:
+            self._plant.advance(t_ns)
+            self._rows.append((t_ns, data[0] if data else 0, self._plant.truth()))
+        return []
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
+        columns: dict[str, NDArray[Any]] = {
+            "t_s": np.array([t_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
+            "sync_count": np.arange(len(self._rows), dtype=np.int64),
+            "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
+        }
+        for name in self._rows[0][2] if self._rows else ():
+            columns[name] = np.array([row[name] for _, _, row in self._rows])
+        return columns
+
+    def save(self, path: Path) -> None:
+        """Write the columns as a compressed npz file."""
+        np.savez_compressed(path, **self.arrays())  # type: ignore[arg-type]
