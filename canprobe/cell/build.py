@@ -26,6 +26,7 @@ from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene
 
 TACTILE_DEADLINE_CYCLES = 2
+COMMAND_REPEAT_NS = 100_000_000
 TACTILE_TIMEOUT_PERIODS = 6
 
 
@@ -56,9 +57,11 @@ def _drives(plan: Plan) -> DriveGroup | None:
     if arm is None:
         return None
     axes = tuple(
-        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, plan.pdos_of(n, "rpdo")[0].layout) for n in arm.node_ids
+        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, tuple(pdo.layout for pdo in plan.pdos_of(n, "rpdo")))
+        for n in arm.node_ids
     )
-    return DriveGroup(axes, MODELS[arm.model])
+    repeat = max(1, COMMAND_REPEAT_NS // plan.sync.period_ns)
+    return DriveGroup(axes, MODELS[arm.model], repeat)
 
 
 def _tactile(plan: Plan) -> TactileReceiver | None:

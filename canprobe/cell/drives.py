@@ -16,6 +16,9 @@ from canprobe.protocol.pdo import PdoLayout
 from canprobe.robot.puma260 import PumaModel, counts_to_joints, joints_to_counts
 
 Vector = NDArray[np.float64]
+SYNCHRONOUS_MAX = 240
+"""Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
+_COMMAND_OBJECTS = (0x6040, 0x607A)
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +28,34 @@ class DriveAxis:
     Attributes:
         node_id: the node.
         feedback: layout of its TPDO: statusword, position (counts), torque (permille).
-        command: layout of its RPDO: controlword, target position (counts).
+        commands: layouts of its RPDOs, which between them map controlword and target position (counts) once. Drives
+            whose RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
     """
 
     node_id: int
     feedback: PdoLayout
-    command: PdoLayout
+    commands: tuple[PdoLayout, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _CommandFrame:
+    """One RPDO frame: who has a part in it, and whether it goes in every cycle or on change."""
+
+    cob_id: int
+    every_cycle: bool
+    parts: tuple[tuple[int, PdoLayout, tuple[int, ...]], ...]  # axis, layout, positions of its values in (word, target)
+
+
+def _command_frames(axes: tuple[DriveAxis, ...]) -> tuple[_CommandFrame, ...]:
+    parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
+    for i, axis in enumerate(axes):
+        for layout in axis.commands:
+            picks = tuple(_COMMAND_OBJECTS.index(entry.index) for entry in layout.entries if not entry.is_dummy)
+            parts.setdefault(layout.cob_id, []).append((i, layout, picks))
+    return tuple(
+        _CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
+        for cob_id, group in sorted(parts.items())
+    )
 
 
 class DriveGroup:
@@ -39,9 +64,10 @@ class DriveGroup:
     Args:
         axes: the drives, joint 1 first.
         model: the arm, for counts ↔ joint angles.
+        repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
     """
 
-    def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel) -> None:
+    def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
@@ -53,6 +79,10 @@ class DriveGroup:
         self._counts = [0] * len(axes)
         self._heard = [-1] * len(axes)
         self._targets: list[int] | None = None
+        self._words = [0] * len(axes)
+        self._frames = _command_frames(axes)
+        self._sent: dict[int, tuple[bytes, int]] = {}
+        self._repeat = repeat_cycles
         self._pending = 0
         self._open = False
         self._cycle = -1
@@ -118,7 +148,22 @@ class DriveGroup:
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
         targets = self._targets if self._targets is not None else self._counts
-        return [
-            (axis.command.cob_id, axis.command.pack(controlword_toward(state, self.goal), target))
-            for axis, state, target in zip(self.axes, self.states, targets, strict=True)
-        ]
+        self._words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]
+        values = list(zip(self._words, targets, strict=True))
+        frames = []
+        for frame in self._frames:
+            data = b""
+            for axis, layout, picks in frame.parts:
+                part = layout.pack(*(values[axis][pick] for pick in picks))
+                data = bytes(a | b for a, b in zip(data, part, strict=True)) if data else part
+            if frame.every_cycle or self._due(frame.cob_id, data):
+                frames.append((frame.cob_id, data))
+        return frames
+
+    def _due(self, cob_id: int, data: bytes) -> bool:
+        """An event-driven frame goes on a change, and again before its receiver's event timer runs out."""
+        sent, cycle = self._sent.get(cob_id, (b"", 0))
+        if data == sent and self._cycle - cycle < self._repeat:
+            return False
+        self._sent[cob_id] = (data, self._cycle)
+        return True
