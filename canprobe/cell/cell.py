@@ -16,7 +16,7 @@ from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
-from canprobe.protocol.frames import NmtState
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
@@ -61,6 +61,12 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
+        for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
+            for base in (HEARTBEAT_BASE, EMCY_BASE):
+                self._network.subscribe(base + node_id, self._watched)
+
+    def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
+        self.watch.push(can_id, bytes(data), round(t_s * 1e9))
 
     def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
         """A frame that arrived during an SDO transfer and is not canopen's."""

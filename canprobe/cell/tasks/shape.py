@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators import Estimator
+if TYPE_CHECKING:
+    from canprobe.touch.contact import ContactSample
+    from canprobe.touch.estimate import SurfaceEstimate
+    from canprobe.touch.estimators import Estimator
 
 Vector = NDArray[np.float64]
 
