@@ -63,7 +63,7 @@ class ArmSettings:
     node_ids: Annotated[NodeIds, Distinct()] = (1, 2, 3, 4, 5, 6)
     eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
     emulated: bool = True
-    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)  # selects the branch; an emulated arm stands here at first
+    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)  # selects the branch; an emulated arm stands here in `free`, above the start in others
     grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
 
 

@@ -15,10 +15,13 @@ from canprobe.emulator.plant.world import Plant, PlantConfig, PressMotion
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.planning import Plan
-from canprobe.robot.puma260 import MODELS
+from canprobe.robot.puma260 import MODELS, Array
+from canprobe.robot.touching import start_posture
 from canprobe.scene import PlantSettings, ProbeSettings, Scene
-from canprobe.scene_geometry import T_flange_probe, true_object
+from canprobe.scene_geometry import T_flange_probe, approach_normal, true_object
 
+PARKED_ABOVE_MM = 5.0
+"""How far above the approach's first point an emulated arm stands at power on."""
 EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk")
 
 
@@ -79,7 +82,24 @@ def _plant_config(scene: Scene) -> PlantConfig:
         press=PressMotion(force_n=scene.task.force_n),
         seed=scene.seed,
     )
-    return config if arm is None else replace(config, q0=np.radians(arm.start_deg))
+    return config if arm is None else replace(config, q0=_first_posture(scene))
+
+
+def _first_posture(scene: Scene) -> Array:
+    """Joint angles (6,), rad, at power on: above the start point of a touch, else as the scene says."""
+    assert scene.arm is not None
+    given = np.radians(scene.arm.start_deg)
+    if scene.probe is None or scene.task.kind not in ("scan", "press"):
+        return given
+    return start_posture(
+        MODELS[scene.arm.model],
+        np.array(scene.task.start_mm) * 1e-3,
+        approach_normal(scene.task),
+        radius_m=scene.probe.radius_mm * 1e-3,
+        T_flange_probe=T_flange_probe(scene.probe),
+        clearance_m=(scene.task.clearance_mm + PARKED_ABOVE_MM) * 1e-3,
+        q_near=given,
+    )
 
 
 def _taxels(scene: Scene, settings: PlantSettings) -> TaxelConfig | None:

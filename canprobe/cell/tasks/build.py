@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,10 +15,12 @@ from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene, ServoSettings, TaskSettings
 from canprobe.scene_geometry import T_flange_probe, scan_axes
-from canprobe.touch.estimators import Estimator, make_estimator
 from canprobe.touch.patch import PatchCalibration
 from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import Strategy, make_strategy
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimators import Estimator
 
 SIGMA_POINT_M = 0.03e-3
 SIGMA_NORMAL_RAD = 1.5e-3
@@ -72,6 +75,8 @@ def _strategy(task: TaskSettings) -> Strategy | None:
 
 def make_shape_estimator(scene: Scene, method: str) -> Estimator:
     """An estimator as the scene sets it, by name."""
+    from canprobe.touch.estimators import make_estimator  # only where a shape is asked for
+
     assert scene.shape is not None and scene.probe is not None and scene.sensor is not None
     memory = scene.shape.memory_mm * 1e-3
     window = max(8, round(memory / (scene.task.speed_mm_s * 1e-3) * scene.sensor.rate_hz))
