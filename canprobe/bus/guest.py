@@ -35,6 +35,7 @@ _PATH = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 _MEMORY = 2 << 30
 _BOOT_S = 60.0
 _HALT_S = 5.0
+_TERMINATE_S = 2.0
 _HIDDEN = ("/dev", "/proc", "/run", "/sys")
 
 _INIT = """\
@@ -170,6 +171,10 @@ class GuestJob:
 
     def kill(self) -> None:
         """End the guest at once; nothing of it is left running."""
+        if self._process.poll() is None:
+            self._process.terminate()  # the kernel ends its own processes
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.wait(_TERMINATE_S)
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
@@ -246,7 +251,8 @@ class GuestJob:
 
     def _lost(self, what: str) -> GuestError:
         lines = (self._job / "console").read_bytes().decode(errors="replace").replace("\r", "").splitlines()
-        telling = [line for line in lines if "panic" in line.lower()] or [line for line in lines if line.strip()][-3:]
+        panics = [line for line in lines if "Kernel panic" in line]
+        telling = panics[:1] or [line for line in lines if line.strip()][-3:]
         return GuestError(": ".join([what, " | ".join(telling) or "its console is empty"]), self.started)
 
     def _remove(self) -> None:

@@ -1,0 +1,211 @@
+"""Plumbing of the whole suite: tests marked `vcan` run on a real SocketCAN interface, in a guest machine if need be.
+
+Where this kernel has a vcan0, they simply run. Elsewhere one `canprobe vcan -- python -m pytest ...` runs all of them
+beside the other tests, and each one's outcome there, with its duration and failure text, becomes its outcome here.
+Where no vcan can be had they are skipped, and the summary says what to type.
+
+    CANPROBE_REQUIRE_VCAN=1   a missing vcan is a failure, never a skip
+    CANPROBE_INSTALL=1        install the guest's Debian package if it is missing (needs root)
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import hypothesis
+import pytest
+
+from canprobe.bus.socketcan import check_interface
+from canprobe.errors import InterfaceError
+
+hypothesis.settings.register_profile("canprobe", deadline=None, print_blob=True)  # no test asserts time
+hypothesis.settings.load_profile("canprobe")
+
+_CHANNEL = "vcan0"
+_INNER = "CANPROBE_TEST_VCAN_FOLDER"
+_NO_VCAN = 125
+_CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
+_OUTER_KEY = pytest.StashKey["OuterRun"]()
+
+
+@pytest.fixture
+def vcan0() -> str:
+    """The name of a real SocketCAN interface that is up; the test fails without one."""
+    _require_interface()
+    return _CHANNEL
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if folder := os.environ.get(_INNER):
+        config.pluginmanager.register(InnerRun(config, Path(folder)))
+    elif not _has_interface():
+        config.stash[_OUTER_KEY] = OuterRun(config)
+        config.pluginmanager.register(config.stash[_OUTER_KEY])
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if _is_vcan(item):
+        _require_interface()
+
+
+def _is_vcan(item: pytest.Item) -> bool:
+    return item.get_closest_marker("vcan") is not None
+
+
+def _has_interface() -> bool:
+    try:
+        check_interface(_CHANNEL)
+    except InterfaceError:
+        return False
+    return True
+
+
+def _require_interface() -> None:
+    try:
+        check_interface(_CHANNEL)
+    except InterfaceError as error:
+        pytest.fail(f"a vcan test needs a real {_CHANNEL}: {error}", pytrace=False)
+
+
+class InnerRun:
+    """The session where the vcan is: run only the tests asked for, and write each report down as it comes."""
+
+    def __init__(self, config: pytest.Config, folder: Path) -> None:
+        self._config = config
+        self._wanted = set(json.loads((folder / "items.json").read_text()))
+        self._reports = (folder / "reports.jsonl").open("a", encoding="utf-8")
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = [item for item in items if item.nodeid in self._wanted]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        data = self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
+        self._reports.write(json.dumps(data, default=str) + "\n")
+        self._reports.flush()
+
+    def pytest_unconfigure(self) -> None:
+        self._reports.close()
+
+
+class OuterRun:
+    """The session without a vcan: start the inner one beside it, and report what that one found."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reports: dict[str, list[pytest.TestReport]] = {}
+        self._lines: Iterator[str] = iter(())
+        self._not_run = 0
+        self._why = ""
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items.sort(key=_is_vcan)  # last, while the inner session runs beside the others
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtestloop(self, session: pytest.Session) -> None:
+        items = [item for item in session.items if _is_vcan(item)]
+        if items and not session.testsfailed and not session.config.option.collectonly:
+            self._start(items)
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_runtest_protocol(self, item: pytest.Item) -> bool | None:
+        if not _is_vcan(item) or self._process is None:
+            return None
+        item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+        for report in self._wait_for(item):
+            item.ihook.pytest_runtest_logreport(report=report)
+        item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+        return True
+
+    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
+        if self._not_run:
+            terminalreporter.section("vcan", sep="!", red=True, bold=True)
+            terminalreporter.line(f"{self._not_run} tests were NOT RUN for want of a vcan. {self._why}", red=True)
+
+    def pytest_unconfigure(self) -> None:
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+            try:
+                self._process.wait(20)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if self._folder is not None:
+            self._folder.cleanup()
+
+    def _start(self, items: Iterable[pytest.Item]) -> None:
+        self._folder = tempfile.TemporaryDirectory(prefix="canprobe-tests-", ignore_cleanup_errors=True)
+        folder = Path(self._folder.name)
+        nodeids = [item.nodeid for item in items]
+        (folder / "items.json").write_text(json.dumps(nodeids))
+        (folder / "reports.jsonl").touch()
+        install = ["--install"] if os.environ.get("CANPROBE_INSTALL") == "1" else []
+        files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
+        options = ["-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        with (folder / "output").open("wb") as output:
+            self._process = subprocess.Popen(
+                [*_CANPROBE, "vcan", *install, "--", sys.executable, "-m", "pytest", *options, *files],
+                cwd=self._config.rootpath,
+                env={**os.environ, _INNER: str(folder)},
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self._lines = _follow(folder / "reports.jsonl", self._process)
+
+    def _wait_for(self, item: pytest.Item) -> list[pytest.TestReport]:
+        """Return the item's reports from the inner session; whatever is missing there is a failure here."""
+        mine = self._reports.setdefault(item.nodeid, [])
+        for line in self._lines:
+            report = self._config.hook.pytest_report_from_serializable(config=self._config, data=json.loads(line))
+            self._reports.setdefault(report.nodeid, []).append(report)
+            if report.nodeid == item.nodeid and report.when == "teardown":
+                break
+        if mine and mine[-1].when == "teardown":
+            return mine
+        return [*mine, self._missing(item)]
+
+    def _missing(self, item: pytest.Item) -> pytest.TestReport:
+        assert self._process is not None and self._folder is not None
+        status = self._process.wait()
+        output = (Path(self._folder.name) / "output").read_text(errors="replace")
+        required = os.environ.get("CANPROBE_REQUIRE_VCAN") == "1"
+        if status == _NO_VCAN and not required:
+            self._not_run += 1
+            self._why = output.strip().rpartition("\n")[2]
+            path, line, _ = item.location
+            return _report(item, "skipped", (path, (line or 0) + 1, f"Skipped: {self._why}"))
+        tail = "\n".join(output.splitlines()[-40:])
+        return _report(item, "failed", f"not reported where the vcan is; that session ended with {status}:\n{tail}")
+
+
+def _report(item: pytest.Item, outcome: Any, longrepr: Any) -> pytest.TestReport:
+    keywords = dict.fromkeys(item.keywords, 1)
+    return pytest.TestReport(item.nodeid, item.location, keywords, outcome, longrepr, "setup")
+
+
+def _follow(path: Path, process: subprocess.Popen[bytes]) -> Iterator[str]:
+    """Yield the lines of a file that grows until the process has ended."""
+    with path.open(encoding="utf-8") as file:
+        rest = ""
+        while True:
+            ended = process.poll() is not None
+            rest += file.read()
+            while "\n" in rest:
+                line, _, rest = rest.partition("\n")
+                yield line
+            if ended:
+                return
+            time.sleep(0.05)
