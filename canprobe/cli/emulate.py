@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_ids, whole
 from canprobe.cli.target import target_of
 from canprobe.errors import UsageError
@@ -56,6 +57,7 @@ def run(args: argparse.Namespace) -> int:
             node_ids=wanted,
             seed=args.seed,
             truth_path=args.truth,
+            say=say,
         )
     return 0
 

@@ -24,6 +24,17 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
         print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
 
 
+def say(line: str) -> None:
+    """One step of what is going on, on stderr."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def say_on_terminal(line: str) -> None:
+    """One step, where somebody is there to read it."""
+    if sys.stderr.isatty():
+        say(line)
+
+
 def progress_bar(stream: TextIO | None = None, width: int = 40) -> Progress | None:
     """A progress bar on a terminal, None elsewhere.
 

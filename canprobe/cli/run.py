@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
 from canprobe.cli.interrupts import termination_interrupts
-from canprobe.cli.output import print_json, progress_bar
+from canprobe.cli.output import print_json, progress_bar, say_on_terminal
 from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, whole
 from canprobe.cli.target import target_of
 
@@ -36,7 +35,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the scene; the summary goes to stdout, the progress to stderr."""
+    """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     from canprobe.scene_loader import load_scene
 
     scene = load_scene(args.scene)
@@ -54,12 +53,10 @@ def run(args: argparse.Namespace) -> int:
             seed=args.seed,
             duration_s=args.duration,
             progress=progress_bar(),
+            say=say_on_terminal,
         )
     if args.json:
         print_json(result.summary)
     else:
         print(result.text())
-    if result.summary["completed"]:
-        return 0
-    print(f"canprobe: stopped: {result.summary['stop_reason']}", file=sys.stderr)
-    return 1
+    return 0

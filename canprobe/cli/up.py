@@ -6,6 +6,7 @@ import argparse
 import contextlib
 
 from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene
 from canprobe.cli.target import target_of
 
@@ -33,5 +34,5 @@ def run(args: argparse.Namespace) -> int:
     from canprobe import api
 
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
-        api.up(scene, interface=target.interface, channel=target.channel, bitrate=target.bitrate)
+        api.up(scene, interface=target.interface, channel=target.channel, bitrate=target.bitrate, say=say)
     return 0

@@ -35,8 +35,9 @@ def make_plan(scene: Scene) -> Plan:
     if bus is not None:
         problems += bus.problems
         if bus.overload:
-            ways = ways_out(scene, lambda changed: _fits(changed, devices))
-            problems += [f"{reason}; ways out: {ways}" for reason in bus.overload]
+            known = frozenset(bus.problems)
+            ways = ways_out(scene, lambda changed: _fits(changed, devices, known))
+            problems += [*bus.overload[:-1], f"{bus.overload[-1]}; ways out: {ways}"]
     joint_speeds, unreachable = check_motion(scene)
     problems += unreachable
     if problems or bus is None:
@@ -82,9 +83,10 @@ def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
     return _BusPlan(sync, tuple(pdos), traffic, planning.problems, overload, tuple(planning.not_available))
 
 
-def _fits(scene: Scene, devices: Mapping[int, Abilities]) -> Traffic | None:
+def _fits(scene: Scene, devices: Mapping[int, Abilities], known: frozenset[str]) -> Traffic | None:
+    """The traffic of a changed scene if it fits and brings no problem that is not known already."""
     bus = _plan_bus(scene, devices)
-    return None if bus.problems or bus.overload else bus.traffic
+    return None if bus.overload or not known.issuperset(bus.problems) else bus.traffic
 
 
 def _node_ids(scene: Scene) -> tuple[int, ...]:

@@ -46,12 +46,10 @@ def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
 
 
 def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
-    """The fastest cycle that fits, at the same number of cycles a tactile frame."""
-    now = round(1e6 / scene.cycle.rate_hz / INTERPOLATION_US)
-    for units in range(now + 1, INTERPOLATION_MAX + 1):
-        rate = 1e6 / (units * INTERPOLATION_US)
+    """The fastest cycle of whole hertz that fits, at the same number of cycles a tactile frame."""
+    for rate in _representable_rates(below=scene.cycle.rate_hz):
         changed = dataclasses.replace(scene, cycle=dataclasses.replace(scene.cycle, rate_hz=rate))
-        text = f"cycle.rate_hz = {rate:.6g}"
+        text = f"cycle.rate_hz = {rate:g}"
         if scene.sensor is not None:
             tactile = rate * scene.sensor.rate_hz / scene.cycle.rate_hz
             changed = dataclasses.replace(changed, sensor=dataclasses.replace(scene.sensor, rate_hz=tactile))
@@ -59,3 +57,10 @@ def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
         if fit(changed) is not None:
             yield text, changed
             return
+
+
+def _representable_rates(below: float) -> list[float]:
+    """Whole rates that 1006h and 60C2h can express, fastest first."""
+    per_second = 1_000_000 // INTERPOLATION_US
+    rates = [per_second / units for units in range(1, INTERPOLATION_MAX + 1) if per_second % units == 0]
+    return [rate for rate in rates if rate < below]

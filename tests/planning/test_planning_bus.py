@@ -1,0 +1,317 @@
+"""The bus part of a plan against the budget table of the cell, and what does not fit."""
+
+import dataclasses
+import importlib.resources
+import math
+import re
+
+import pytest
+
+from canprobe.errors import PlanError
+from canprobe.planning import make_plan
+from canprobe.planning.abilities import Abilities
+from canprobe.planning.model import PlannedPdo
+from canprobe.planning.pdos import identifier_problems
+from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.scene_loader import load_scene
+
+
+def change(scene, **sections):
+    """A scene with some fields of some sections replaced."""
+    changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
+    return dataclasses.replace(scene, **changed)
+
+
+def reasons(scene):
+    with pytest.raises(PlanError) as caught:
+        make_plan(scene)
+    return caught.value.problems
+
+
+@pytest.fixture(scope="module")
+def cylinder():
+    return load_scene("cylinder")
+
+
+@pytest.fixture(scope="module")
+def cylinder_plan(cylinder):
+    return make_plan(cylinder)
+
+
+# Independent truth: 55 + 10 n bits a frame, counted by hand from the mapping table; shares of 1 Mbit/s.
+SYNC, DRIVE_TPDO, DRIVE_RPDO, FULL, CONTROLWORD = 65, 135, 115, 135, 75
+
+
+@pytest.mark.parametrize(
+    ("name", "sections", "part", "bits_per_second", "percent"),
+    [
+        ("free", {}, ("SYNC", "drives"), 400 * (SYNC + 6 * (DRIVE_TPDO + DRIVE_RPDO)), 63),
+        (
+            "free",
+            {"arm": {"grouped_rpdo": True}},
+            ("SYNC", "drives"),
+            400 * (SYNC + 6 * DRIVE_TPDO + 3 * FULL) + 10 * 6 * CONTROLWORD,
+            51.65,
+        ),
+        ("listen", {"sensor": {"mode": "image"}}, ("tactile",), 200 * 33 * FULL, 89),
+        ("listen", {}, ("tactile",), 200 * 9 * FULL, 24),
+        ("listen", {"sensor": {"mode": "features"}}, ("tactile",), 200 * 2 * FULL, 5.4),
+        ("cylinder", {}, ("SYNC", "drives", "tactile"), 626_000 + 243_000, 87),
+    ],
+)
+def test_budget_table(name, sections, part, bits_per_second, percent):
+    plan = make_plan(change(load_scene(name), **sections))
+    load = sum(share for what, share in plan.traffic.parts if what in part)
+    assert load == pytest.approx(bits_per_second / 1e6)
+    assert 100 * load == pytest.approx(percent, abs=0.5)
+    heartbeats = 10 * 65 * (len(plan.nodes) + 1) / 1e6
+    assert plan.traffic.load == pytest.approx(sum(share for _, share in plan.traffic.parts), abs=1e-6)
+    assert dict(plan.traffic.parts)["heartbeats"] == pytest.approx(heartbeats)
+
+
+@pytest.mark.parametrize(
+    ("sections", "drives_us", "tactile_us"),
+    [({}, 1565, 4345), ({"arm": {"grouped_rpdo": True}}, 1280, 3775)],
+)
+def test_peak_demand_behind_one_sync(cylinder, sections, drives_us, tactile_us):
+    plan = make_plan(change(cylinder, **sections))
+    one, two = plan.traffic.demands
+    assert (one.cycles, one.used_ns, one.available_ns) == (1, drives_us * 1000, 2_500_000)
+    assert (two.cycles, two.used_ns, two.available_ns) == (2, tactile_us * 1000, 5_000_000)
+
+
+def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
+    problems = reasons(change(cylinder, sensor={"mode": "image"}))
+    assert any("worst-case load 152 %" in problem for problem in problems)
+    (peak,) = [problem for problem in problems if "7585 µs of the 5000 µs in 2 cycles" in problem]
+    for way in ('sensor.mode = "window" (87 %, 4345 of 5000 µs)', "a bus of its own for the sensor (92 %", "250"):
+        assert way in peak
+    assert "grouped" not in peak, "grouping alone does not make it fit and must not be named"
+
+
+def test_named_ways_out_really_fit(cylinder):
+    image = change(cylinder, sensor={"mode": "image"})
+    slow = re.search(r"cycle.rate_hz = (\d+) with sensor.rate_hz = (\d+)", reasons(image)[-1])
+    plan = make_plan(change(image, cycle={"rate_hz": float(slow[1])}, sensor={"rate_hz": float(slow[2])}))
+    assert plan.traffic.load < 1
+
+
+def test_average_below_one_but_peak_too_high_is_refused(cylinder):
+    """At 50 Hz the image takes 85 % on average, yet a frame is not through before its deadline of two cycles."""
+    problems = reasons(change(cylinder, sensor={"mode": "image", "rate_hz": 50.0}))
+    assert not any("load" in problem.split("ways out")[0] for problem in problems)
+    assert any("7585 µs of the 5000 µs" in problem for problem in problems)
+
+
+def test_slower_bus_is_refused_and_the_faster_one_named(cylinder):
+    assert "bus.bitrate = 1000000" in reasons(change(cylinder, bus={"bitrate": 500_000}))[-1]
+
+
+def test_six_drives_alone_end_at_500_hz():
+    """At 625 Hz 1565 of 1600 µs would do, but a heartbeat that was first (65 µs) makes the last RPDO late."""
+    free = load_scene("free")
+    assert make_plan(change(free, cycle={"rate_hz": 500.0})).traffic.load < 0.8
+    (problem,) = reasons(change(free, cycle={"rate_hz": 625.0}))
+    assert "RPDO 206h is 1630 µs, its deadline 1600 µs" in problem
+    assert "cycle.rate_hz = 500" in problem
+    assert any("worst-case load" in problem for problem in reasons(change(free, cycle={"rate_hz": 1000.0})))
+
+
+@pytest.mark.parametrize(
+    ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
+)
+def test_sync_period(rate, period_us, units):
+    sync = make_plan(change(load_scene("free"), cycle={"rate_hz": float(rate)})).sync
+    assert (sync.period_us, sync.period_ns, sync.interpolation_100us) == (period_us, period_us * 1000, units)
+    assert sync.overflow == 240
+
+
+@pytest.mark.parametrize(("rate", "near"), [(300.0, "294.118 or 303.03"), (440.0, "434.783 or 454.545")])
+def test_sync_period_that_60c2h_cannot_hold(rate, near):
+    (problem,) = reasons(change(load_scene("free"), cycle={"rate_hz": rate}))
+    assert near in problem
+
+
+def test_sync_period_of_a_sensor_alone_needs_only_whole_microseconds():
+    scene = change(load_scene("listen"), cycle={"rate_hz": 320.0}, sensor={"rate_hz": 160.0})
+    assert make_plan(scene).sync.period_us == 3125
+    (problem,) = reasons(change(scene, cycle={"rate_hz": 300.0}, sensor={"rate_hz": 150.0}))
+    assert "1006h counts µs" in problem
+
+
+def test_sync_too_slow_for_60c2h():
+    assert any("at most 255" in problem for problem in reasons(change(load_scene("free"), cycle={"rate_hz": 20.0})))
+
+
+@pytest.mark.parametrize("rate", [150.0, 300.0, 400 / 7])
+def test_tactile_rate_that_no_trigger_gives(cylinder, rate):
+    problems = reasons(change(cylinder, sensor={"rate_hz": rate}))
+    assert [problem for problem in problems if "sensor.rate_hz" in problem.split("=")[0]]
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 4, 8, 240])
+def test_tactile_trigger(ratio):
+    plan = make_plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
+    assert {pdo.transmission_type for pdo in plan.pdos} == {ratio}
+    assert 240 % ratio == 0
+    assert {pdo.deadline_ns for pdo in plan.pdos} == {min(2, ratio) * 2_500_000}
+
+
+def test_identifiers_and_mappings_of_the_default_cell(cylinder_plan):
+    found = {pdo.cob_id: [(e.index, e.subindex, e.bits) for e in pdo.entries] for pdo in cylinder_plan.pdos}
+    tpdo = [(0x6041, 0, 16), (0x6064, 0, 32), (0x6077, 0, 16)]
+    rpdo = [(0x6040, 0, 16), (0x607A, 0, 32)]
+    window = {0x511: [(0x2120, 0, 64)]} | {0x511 + row: [(0x2110, row, 64)] for row in range(1, 9)}
+    drives = {0x180 + i: tpdo for i in range(1, 7)} | {0x200 + i: rpdo for i in range(1, 7)}
+    assert found == drives | window
+    assert [pdo.cob_id for pdo in cylinder_plan.pdos] == sorted(found)
+    signed = {(e.index, e.signed) for pdo in cylinder_plan.pdos for e in pdo.entries if e.index >= 0x6000}
+    assert signed == {(0x6041, False), (0x6040, False), (0x6064, True), (0x607A, True), (0x6077, True)}
+
+
+@pytest.mark.parametrize(
+    ("mode", "last", "first_object"), [("image", 0x531, (0x2120, 0)), ("features", 0x512, (0x2130, 1))]
+)
+def test_identifiers_of_other_modes(mode, last, first_object):
+    pdos = make_plan(change(load_scene("listen"), sensor={"mode": mode})).pdos
+    assert [pdo.cob_id for pdo in pdos] == list(range(0x511, last + 1))
+    assert (pdos[0].entries[0].index, pdos[0].entries[0].subindex) == first_object
+
+
+def test_grouped_targets_share_an_rpdo_through_dummies():
+    plan = make_plan(change(load_scene("free"), arm={"grouped_rpdo": True}))
+    shared = {(pdo.node_id, pdo.cob_id): [e.index for e in pdo.entries] for pdo in plan.pdos if pdo.number == 2}
+    assert shared == {
+        (1, 0x301): [0x607A, 4], (2, 0x301): [4, 0x607A], (3, 0x303): [0x607A, 4],
+        (4, 0x303): [4, 0x607A], (5, 0x305): [0x607A, 4], (6, 0x305): [4, 0x607A],
+    }  # fmt: skip
+    words = [pdo for pdo in plan.pdos if pdo.direction == "rpdo" and pdo.number == 1]
+    assert {(pdo.transmission_type, pdo.event_timer_ms, pdo.rate_hz, pdo.layout.length) for pdo in words} == {
+        (255, 250, 10, 2)
+    }
+
+
+def test_every_message_meets_its_deadline_and_tactile_waits_for_all_drives(cylinder_plan):
+    assert all(pdo.response_ns <= pdo.deadline_ns for pdo in cylinder_plan.pdos)
+    tactile = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id == 16]
+    drives = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id != 16]
+    assert min(tactile) > max(drives)
+    assert max(pdo.response_ns for pdo in cylinder_plan.pdos) == (4345 + 65) * 1000  # and one heartbeat that was first
+
+
+def test_nodes_with_identity_and_what_is_switched_off(cylinder_plan):
+    assert cylinder_plan.node_ids == (1, 2, 3, 4, 5, 6, 16)
+    joint, sensor = cylinder_plan.nodes[0], cylinder_plan.nodes[-1]
+    assert (joint.kind, joint.role, joint.emulated) == ("drive", "joint 1", True)
+    assert (joint.identity.vendor_id, joint.identity.product_code) == (0xCA5E, 0x260)
+    assert (sensor.kind, sensor.identity.product_code) == ("tactile", 0x1616)
+    assert ("rpdo", 2) in joint.switched_off
+    assert ("tpdo", 1) not in joint.switched_off
+    assert [number for direction, number in sensor.switched_off if direction == "tpdo"] == list(range(10, 34))
+
+
+def test_frames_that_may_be_on_the_bus(cylinder_plan):
+    ids = cylinder_plan.frame_ids
+    assert {0x000, 0x080, 0x081, 0x090, 0x181, 0x206, 0x519, 0x590, 0x610, 0x701, 0x710, 0x77F} <= ids
+    assert not {0x100, 0x187, 0x190, 0x301, 0x510, 0x51A, 0x711} & ids
+
+
+def test_order_of_node_ids_is_the_order_of_joints():
+    plan = make_plan(change(load_scene("free"), arm={"node_ids": (16, 5, 4, 3, 2, 1)}))
+    assert {node.node_id: node.role for node in plan.nodes}[16] == "joint 1"
+    assert plan.node_ids == (1, 2, 3, 4, 5, 16)
+
+
+def _pdo(cob_id, node_id, direction):
+    layout = PdoLayout(cob_id, (PdoEntry(0x6041, 0, 16),))
+    return PlannedPdo(node_id, direction, 1, layout, 400.0, 75, 2_500_000)
+
+
+@pytest.mark.parametrize(
+    ("pdos", "count"),
+    [
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x182, 2, "tpdo")], 0),
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x181, 2, "tpdo")], 1),
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x181, 2, "rpdo")], 1),
+        ([_pdo(0x301, 1, "rpdo"), _pdo(0x301, 2, "rpdo")], 0),
+        ([_pdo(0x180, 1, "tpdo")], 1),
+        ([_pdo(0x701, 1, "tpdo"), _pdo(0x6E0, 1, "tpdo"), _pdo(0x101, 1, "rpdo")], 3),
+    ],
+)
+def test_restricted_and_duplicate_identifiers(pdos, count):
+    assert len(identifier_problems(pdos)) == count
+
+
+class TestOtherDevices:
+    """The plan works from what an EDS really offers."""
+
+    @pytest.fixture
+    def edit(self, tmp_path):
+        def edit(*replacements):
+            text = (importlib.resources.files("canprobe.eds") / "puma260_joint.eds").read_text()
+            for pattern, new in replacements:
+                text, count = re.subn(pattern, new, text, flags=re.DOTALL)
+                assert count, pattern
+            path = tmp_path / "other.eds"
+            path.write_text(text)
+            return change(load_scene("free"), arm={"eds": str(path)})
+
+        return edit
+
+    def test_unknown_eds(self):
+        assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
+
+    def test_without_dummies_targets_stay_single_and_it_says_so(self, edit):
+        scene = change(edit((r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
+        plan = make_plan(scene)
+        assert {pdo.number for pdo in plan.pdos} == {1}
+        ((what, why),) = plan.not_available
+        assert what == "two targets in one RPDO"
+        assert "0004h" in why
+
+    def test_torque_that_cannot_be_mapped_is_left_away(self, edit):
+        plan = make_plan(edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0")))
+        assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
+        assert len(plan.not_available) == 6
+
+    def test_target_that_cannot_be_mapped_is_refused(self, edit):
+        problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
+        assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
+
+    def test_fixed_mapping_is_used_where_it_is_the_right_one(self, edit):
+        assert make_plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
+
+    def test_fixed_mapping_that_is_another_is_refused(self, edit):
+        problems = reasons(
+            edit(
+                (r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro"),
+                (r"(\[1600sub2\][^\[]*DefaultValue=)\w+", r"\g<1>0x60FF0020"),
+            )
+        )
+        assert len(problems) == 6
+        assert all("fixed mapping 60400010h, 60FF0020h" in problem for problem in problems)
+
+    def test_missing_objects_are_named(self, edit):
+        problems = reasons(edit((r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")))
+        assert any("60C2h (interpolation time period) is missing" in problem for problem in problems)
+
+    def test_abilities_read_from_the_packaged_eds(self):
+        device = Abilities.of("puma260_joint.eds", 1)
+        assert device.entry(0x6064, 0, "tpdo").signed
+        assert device.entry(0x6064, 0, "rpdo") is None, "a read-only object cannot be received"
+        assert device.entry(0x607A, 0, "rpdo").bits == 32
+        assert device.dummy(4, 32).is_dummy
+        assert device.dummy(1, 8) is None
+        assert device.pdo_numbers("rpdo") == (1, 2, 3, 4)
+        assert device.fixed_mapping("tpdo", 1)[0] == 0x60410010
+        assert device.active_by_default("rpdo", 1)
+
+
+def test_plan_is_finite_everywhere(cylinder_plan):
+    def check(value):
+        if isinstance(value, float):
+            assert math.isfinite(value)
+        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            check(item)
+
+    check(cylinder_plan.as_dict())

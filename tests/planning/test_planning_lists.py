@@ -1,0 +1,105 @@
+"""What a plan uses and leaves out, as data, JSON and text."""
+
+import dataclasses
+import json
+import subprocess
+import sys
+
+import pytest
+
+import canprobe
+from canprobe.planning import make_plan, plan_text
+from canprobe.scene_loader import load_scene, packaged_scenes
+
+
+@pytest.mark.parametrize(
+    ("name", "kinds", "estimator", "strategy", "absent"),
+    [
+        ("cylinder", {"drive", "tactile"}, "recursive", "weave", {"full image (32 PDOs)"}),
+        ("press", {"drive", "tactile"}, None, None, {"surface estimator", "exploration strategy"}),
+        (
+            "listen",
+            {"tactile"},
+            None,
+            None,
+            {"six drives, their PDOs, joint limits", "surface estimator", "tactile servo"},
+        ),
+        ("free", {"drive"}, None, None, {"tactile node and its PDOs", "surface estimator", "tactile servo"}),
+    ],
+)
+def test_what_each_scene_uses_and_leaves_out(name, kinds, estimator, strategy, absent):
+    plan = make_plan(load_scene(name))
+    assert {node.kind for node in plan.nodes} == kinds
+    assert (plan.estimator, plan.strategy) == (estimator, strategy)
+    assert absent <= {what for what, _ in plan.left_out}
+    assert all(why for _, why in plan.left_out)
+
+
+def test_features_map_no_taxels():
+    scene = load_scene("listen")
+    plan = make_plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode="features")))
+    assert {entry.index for pdo in plan.pdos for entry in pdo.entries} == {0x2130}
+    left = dict(plan.left_out)
+    assert {"full image (32 PDOs)", "window (8 PDOs)", "taxels and patch features in the master"} <= set(left)
+
+
+def test_switches_of_the_plant_are_listed():
+    cylinder = load_scene("cylinder")
+    quiet = dataclasses.replace(cylinder, plant=dataclasses.replace(cylinder.plant, noise=False, creep=False))
+    left = dict(make_plan(quiet).left_out)
+    assert left["taxel noise"] == "plant.noise = false"
+    assert "taxel creep" in left
+    assert "cover blur" not in left
+
+
+def test_outputs_without_truth():
+    scene = load_scene("free")
+    real = dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, emulated=False))
+    assert "truth.npz" in make_plan(scene).outputs
+    assert "truth.npz" not in make_plan(real).outputs
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_json_says_what_the_plan_says(name):
+    plan = make_plan(load_scene(name))
+    document = json.loads(json.dumps(plan.as_dict(), allow_nan=False))
+    assert document["scene"] == name
+    assert [node["node_id"] for node in document["nodes"]] == list(plan.node_ids)
+    assert [pdo["cob_id"] for pdo in document["pdos"]] == [pdo.cob_id for pdo in plan.pdos]
+    assert document["bus_load"]["can0"]["planned_worst"] == plan.traffic.load
+    assert len(document["left_out"]) == len(plan.left_out)
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_text_shows_every_node_pdo_and_omission(name):
+    plan = make_plan(load_scene(name))
+    text = plan_text(plan)
+    assert all(f"{pdo.cob_id:03X}h" in text for pdo in plan.pdos)
+    assert all(node.role in text for node in plan.nodes)
+    assert all(what in text and why in text for what, why in plan.left_out)
+    assert f"{100 * plan.traffic.load:.1f} %" in text
+
+
+def test_public_name_is_the_function():
+    assert canprobe.plan is make_plan
+    assert canprobe.plan(canprobe.load_scene("free")).scene.name == "free"
+
+
+@pytest.mark.parametrize("argv", [["--help"], ["plan", "cylinder"], ["scenes"], ["run", "--help"]])
+def test_light_commands_import_neither_scipy_nor_matplotlib(argv):
+    code = (
+        "import sys; from canprobe.cli import main; status = main(sys.argv[1:]); "
+        "heavy = {'scipy', 'matplotlib', 'canprobe.cell', 'canprobe.emulator', 'canprobe.api'} & set(sys.modules); "
+        "sys.exit(f'imported {heavy}' if heavy else status)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *argv], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
+
+
+def test_help_imports_not_even_numpy():
+    code = (
+        "import sys; from canprobe.cli import main; main(['--help']); "
+        "sys.exit(len({'numpy', 'can'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0

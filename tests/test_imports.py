@@ -1,0 +1,161 @@
+"""The layers of the package: who may import whom, read from the source.
+
+errors < protocol, eds < robot, touch (pure) < scene, planning < bus < cell | emulator < api < studies < cli
+"""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+import canprobe
+
+PACKAGE = Path(canprobe.__file__).parent
+MODULES = {path: path.relative_to(PACKAGE) for path in sorted(PACKAGE.rglob("*.py"))}
+
+# layer → layers of this package that it may import, besides itself and errors
+LOW = {"protocol", "eds"}
+PURE = LOW | {"robot", "touch"}
+SCENE = PURE | {"scene", "planning"}
+EDGE = SCENE | {"bus"}
+ALLOWED = {
+    "errors": set(),
+    "protocol": set(),
+    "eds": set(),
+    "robot": {"protocol"},
+    "touch": {"protocol", "robot"},
+    "plant": {"protocol", "robot", "touch"},
+    "scene": PURE,
+    "planning": PURE | {"scene"},
+    "bus": SCENE,
+    "cell": EDGE,
+    "emulator": EDGE | {"plant"},
+    "api": EDGE | {"cell", "emulator", "plant", "studies"},
+    "studies": EDGE | {"cell", "emulator", "plant", "api"},
+    "cli": EDGE | {"cell", "emulator", "plant", "api", "studies"},
+    "bridge": EDGE | {"cell", "emulator", "plant", "api", "studies"},
+    "package": {*EDGE, "api", "cli"},
+}
+COMPOSITION = {"api", "results", "session", "child"}  # top-level modules that join cell and emulator
+
+EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
+NEVER_IN_PURE = EDGE_ONLY | {
+    "canopen",
+    "os",
+    "subprocess",
+    "logging",
+    "multiprocessing",
+    "signal",
+    "ctypes",
+    "datetime",
+}
+PURE_LAYERS = {"protocol", "robot", "touch", "plant"}
+
+
+def layer_of(parts):
+    """The layer of a module, from the parts of its path or dotted name below the package."""
+    top = parts[0] if parts else "package"
+    if top in ("emulator",) and len(parts) > 1 and parts[1] == "plant":
+        return "plant"
+    if top in COMPOSITION:
+        return "api"
+    if top.startswith("scene"):
+        return "scene"
+    return "package" if top in ("__init__", "__main__") else top
+
+
+def type_checking_nodes(tree):
+    """Statements under `if TYPE_CHECKING:`, which no program runs."""
+    guarded = [n for n in ast.walk(tree) if isinstance(n, ast.If) and "TYPE_CHECKING" in ast.dump(n.test)]
+    return {inner for node in guarded for statement in node.body for inner in ast.walk(statement)}
+
+
+def imports_of(path, relative):
+    """Dotted names that a module imports, absolute, with the line."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    skipped = type_checking_nodes(tree)
+    package = ["canprobe", *relative.parent.parts]
+    for node in ast.walk(tree):
+        if node in skipped:
+            continue
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *([node.module] if node.module else [])])
+            yield from ((_resolved(module, alias.name), node.lineno, alias.name) for alias in node.names)
+
+
+def _resolved(module, name):
+    """`from canprobe import api` names a module, `from canprobe.api import run` a thing in one."""
+    below = module.split(".")[1:]
+    folder = PACKAGE.joinpath(*below)
+    is_module = module.startswith("canprobe") and ((folder / f"{name}.py").is_file() or (folder / name).is_dir())
+    return f"{module}.{name}" if is_module else module
+
+
+@pytest.mark.parametrize("path", MODULES, ids=[str(relative) for relative in MODULES.values()])
+def test_imports_point_downward(path):
+    relative = MODULES[path]
+    layer = layer_of(relative.with_suffix("").parts)
+    wrong = []
+    for name, line, what in imports_of(path, relative):
+        top, *below = name.split(".")
+        if top == "canprobe":
+            target = layer_of(below)
+            if target == "package":
+                fine = layer in ("cli", "studies", "bridge", "api", "package") or what == "__version__"
+            else:
+                fine = target in {layer, "errors"} | ALLOWED[layer]
+        elif layer in PURE_LAYERS:
+            fine = top not in NEVER_IN_PURE
+        elif layer == "studies" and top == "time":
+            fine = what == "perf_counter"
+        else:
+            fine = layer == "bus" or top not in EDGE_ONLY
+        if not fine:
+            wrong.append(f"{relative}:{line} imports {name}")
+    assert not wrong, "; ".join(wrong)
+
+
+def test_nothing_imports_the_bridges():
+    assert all("bridge" not in allowed for allowed in ALLOWED.values())
+
+
+def test_cell_and_emulator_never_see_each_other():
+    assert not {"cell"} & ALLOWED["emulator"]
+    assert not {"emulator", "plant"} & ALLOWED["cell"]
+
+
+def test_every_module_belongs_to_a_layer():
+    assert {layer_of(relative.with_suffix("").parts) for relative in MODULES.values()} <= set(ALLOWED)
+
+
+def test_only_declared_packages_are_imported():
+    """Base dependencies everywhere; an extra's package only in studies."""
+    base = {"can", "canopen", "numpy", "scipy"}
+    for path, relative in MODULES.items():
+        extras = {"matplotlib"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
+        for name, line, _ in imports_of(path, relative):
+            top = name.split(".")[0]
+            known = top in sys.stdlib_module_names or top in base | extras | {"canprobe"}
+            assert known, f"{relative}:{line} imports {name}"
+
+
+@pytest.mark.parametrize(
+    ("source", "names"),
+    [
+        ("from . import port", ["canprobe.bus.port"]),
+        ("from .port import Port", ["canprobe.bus.port"]),
+        ("from ..protocol.frames import Frame", ["canprobe.protocol.frames"]),
+        ("from canprobe import scene", ["canprobe.scene"]),
+        ("import canprobe.cell.cell", ["canprobe.cell.cell"]),
+        ("def f():\n    import time", ["time"]),
+        ("from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import can", ["typing"]),
+    ],
+)
+def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
+    path = tmp_path / "module.py"
+    path.write_text(source)
+    assert [name for name, _, _ in imports_of(path, Path("bus/module.py"))] == names
