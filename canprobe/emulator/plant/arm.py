@@ -1,0 +1,228 @@
+"""Ideal arm: six decoupled second-order position loops, one per motor, solved exactly.
+
+Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 z w q'``. References are ramps, for
+which the solution is closed: behind a steady ramp by the lag 2z/w, plus a decaying transient. The state is a function
+of time alone: calling ``advance`` more or less often changes nothing. Not modelled: gravity, coupling of the links,
+friction, contact force on the joints, saturation.
+"""
+
+from __future__ import annotations
+
+from math import cos, exp, pi, sin, sqrt, tanh
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
+
+Transition = tuple[float, float, float, float]
+_NEVER = 1 << 62
+
+REFLECTED_INERTIA = (0.030, 0.088, 0.022, 0.0072, 0.0064, 0.0073)
+"""Motor inertia at the joint, kg m^2: PUMA 560 (Corke & Armstrong-Helouvry 1994) scaled by size."""
+COULOMB_NM = (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
+VISCOUS_NMS = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012)
+CONTINUOUS_TORQUE_NM = (6.4, 6.4, 6.4, 1.4, 0.7, 0.7)
+_PEAK_PERMILLE = 2000
+_STICTION_RATE = 0.01  # rad/s over which the Coulomb torque turns its sign
+
+
+def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
+    """Undamped frequency w in rad/s of the loop whose response falls by 3 dB at ``bandwidth_hz``.
+
+    Args:
+        bandwidth_hz: -3 dB frequency.
+        damping_ratio: z; 1 is critical.
+    """
+    c = 1.0 - 2.0 * damping_ratio**2
+    return 2 * pi * bandwidth_hz / sqrt(c + sqrt(c * c + 1.0))
+
+
+def transition(w: float, z: float, t: float) -> Transition:
+    """Transition matrix (rows of position and rate) of ``e'' = -w^2 e - 2 z w e'`` over t seconds.
+
+    Args:
+        w: undamped frequency, rad/s.
+        z: damping ratio.
+        t: s.
+    """
+    s = z * w
+    if abs(z - 1.0) < 1e-9:
+        decay = exp(-w * t)
+        even, odd = decay, decay * t
+    elif z < 1.0:
+        v, decay = w * sqrt(1.0 - z * z), exp(-s * t)
+        even, odd = decay * cos(v * t), decay * sin(v * t) / v
+    else:
+        v = w * sqrt(z * z - 1.0)
+        slow, fast = exp((v - s) * t), exp(-(v + s) * t)
+        even, odd = 0.5 * (slow + fast), 0.5 * (slow - fast) / v
+    return even + s * odd, odd, -w * w * odd, even - s * odd
+
+
+class _Axis:
+    """One loop: its state at an anchor time, the ramp that acts from there, and ramps to come."""
+
+    __slots__ = ("coming", "end", "end_ns", "event_ns", "lag", "q", "r", "slope", "t_ns", "v")
+
+    def __init__(self, q: float, lag: float) -> None:
+        self.t_ns, self.q, self.v, self.r, self.slope = 0, q, 0.0, q, 0.0
+        self.end, self.end_ns, self.event_ns, self.lag = q, _NEVER, _NEVER, lag
+        self.coming: list[tuple[int, int, float, float]] = []
+
+    def at(self, phi: Transition, tau: float) -> tuple[float, float, float]:
+        """Position, rate and reference at a time before the next event."""
+        p11, p12, p21, p22 = phi
+        e, de = self.q - self.r + self.lag * self.slope, self.v - self.slope
+        r = self.r + self.slope * tau
+        return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
+
+    def anchor(self, t_ns: int, state: tuple[float, float, float]) -> None:
+        self.t_ns, (self.q, self.v, self.r) = t_ns, state
+
+    def begin(self, ramp: tuple[int, int, float, float]) -> None:
+        """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
+        t0, t1, start, end = ramp
+        if self.t_ns >= t1:
+            self.r, self.slope, self.end_ns = end, 0.0, _NEVER
+        else:
+            self.slope = (end - start) / (1e-9 * (t1 - t0))
+            self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
+        self.plan_event()
+
+    def plan_event(self) -> None:
+        self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
+
+    def pass_event(self) -> None:
+        """The anchor stands at the next event: end of the ramp or start of a coming one."""
+        if self.coming and self.coming[0][0] <= self.t_ns:
+            self.begin(self.coming.pop(0))
+        else:
+            self.r, self.slope, self.end_ns = self.end, 0.0, _NEVER
+            self.plan_event()
+
+
+class IdealArm:
+    """Six motors that track ramps of counts with equal bandwidth.
+
+    Args:
+        model: the arm.
+        q0: (6,) joint angles at time 0, at rest, rad.
+        bandwidth_hz: -3 dB frequency of every loop.
+        damping_ratio: 1 is critical.
+    """
+
+    def __init__(
+        self, model: PumaModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0, damping_ratio: float = 1.0
+    ) -> None:
+        self.model = model
+        self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
+        self.lag_s = 2.0 * damping_ratio / self.w
+        """How far the motors stay behind a steady ramp, s."""
+        self.t_ns = 0
+        self._axes = [_Axis(c, self.lag_s) for c in joints_to_counts(model, q0).tolist()]
+        self._phi: dict[int, Transition] = {}
+        self._evaluated: list[tuple[float, float, float]] | None = None
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
+
+        A ramp that began in the past acts from the present time on.
+
+        Args:
+            axis: 0 to 5.
+            start_counts: reference at t0.
+            end_counts: reference at t1 and after.
+            t0_ns: start.
+            t1_ns: end; not after t0 for a step.
+        """
+        a = self._axes[axis]
+        ramp = (t0_ns, t1_ns, start_counts, end_counts)
+        a.coming = [r for r in a.coming if r[0] < t0_ns]
+        if t0_ns > self.t_ns:
+            a.coming.append(ramp)
+            a.plan_event()
+            return
+        a.anchor(self.t_ns, self._state(a, self.t_ns))
+        a.coming.clear()
+        a.begin(ramp)
+        self._evaluated = None
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        if t_ns > self.t_ns:
+            self.t_ns = t_ns
+            self._evaluated = None
+
+    @property
+    def counts(self) -> Array:
+        """(6,) motor positions now, counts."""
+        return np.array([s[0] for s in self._states()])
+
+    @property
+    def count_rates(self) -> Array:
+        """(6,) motor rates now, counts/s."""
+        return np.array([s[1] for s in self._states()])
+
+    @property
+    def q(self) -> Array:
+        """(6,) joint angles now, rad."""
+        return counts_to_joints(self.model, self.counts)
+
+    @property
+    def qd(self) -> Array:
+        """(6,) joint rates now, rad/s."""
+        return counts_to_joints(self.model, self.count_rates)
+
+    def motor_counts(self, axis: int) -> float:
+        """Position of one motor now, counts, continuous.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return self._states()[axis][0]
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one joint over its continuous limit, as a drive reports it (6077h).
+
+        Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
+
+        Args:
+            axis: 0 to 5.
+
+        Returns:
+            Permille, within the peak of +-2000.
+        """
+        w, z = self.w, self.z
+        states = self._states()
+        row = self.model.joints_per_count[axis].tolist()
+        rate = sum(g * s[1] for g, s in zip(row, states, strict=True))
+        acceleration = sum(g * (w * w * (s[2] - s[0]) - 2 * z * w * s[1]) for g, s in zip(row, states, strict=True))
+        torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
+        torque += COULOMB_NM[axis] * tanh(rate / _STICTION_RATE)
+        permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
+        return max(-_PEAK_PERMILLE, min(_PEAK_PERMILLE, permille))
+
+    def _states(self) -> list[tuple[float, float, float]]:
+        if self._evaluated is None:
+            self._evaluated = [self._state(a, self.t_ns) for a in self._axes]
+        return self._evaluated
+
+    def _state(self, a: _Axis, t_ns: int) -> tuple[float, float, float]:
+        while t_ns >= a.event_ns:
+            when = a.event_ns
+            a.anchor(when, a.at(self._transition(when - a.t_ns), 1e-9 * (when - a.t_ns)))
+            a.pass_event()
+        return a.at(self._transition(t_ns - a.t_ns), 1e-9 * (t_ns - a.t_ns))
+
+    def _transition(self, dt_ns: int) -> Transition:
+        phi = self._phi.get(dt_ns)
+        if phi is None:
+            if len(self._phi) > 256:
+                self._phi.clear()
+            phi = self._phi[dt_ns] = transition(self.w, self.z, 1e-9 * dt_ns)
+        return phi

@@ -1,0 +1,168 @@
+"""Pressure on the pad: fine sampling on the exact sphere, averaged over each taxel and blurred by the cover.
+
+Finer than the estimators' paraboloid on purpose: the probe's height is the sphere's, taxels lie on the wrapped sphere
+with their true area, and nine samples make one taxel.
+
+Pad frame: x = u = columns, y = v = rows, z = pole of the probe, origin at the centre of the sphere. Taxel (i, j) is
+centred at u = (j - 7.5) pitch, v = (i - 7.5) pitch; (u, v) lies in the direction of the exponential map of
+(u, v) / R at the pole.
+"""
+
+from __future__ import annotations
+
+from math import atan2, ceil, cos, floor, hypot, sin, sqrt
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+Vec = tuple[float, float, float]
+
+SIDE = 16
+PITCH_M = 0.0254 / SIDE
+_MARGIN = 2
+"""Taxels of pressure beyond the array's edge that still blur into it."""
+
+
+def pad_direction(u: float, v: float, radius: float) -> Vec:
+    """Unit direction of a pad point from the sphere's centre (exponential map), pad frame.
+
+    Args:
+        u: m along the pad's x.
+        v: m along the pad's y.
+        radius: m.
+    """
+    arc = hypot(u, v)
+    scale = sin(arc / radius) / arc if arc > 0.0 else 1.0 / radius
+    return scale * u, scale * v, cos(arc / radius)
+
+
+def pad_coordinates(direction: Vec, radius: float) -> tuple[float, float]:
+    """Pad point of a direction (logarithmic map), the inverse of ``pad_direction``.
+
+    Args:
+        direction: unit vector, pad frame.
+        radius: m.
+
+    Returns:
+        (u, v), m.
+    """
+    x, y, z = direction
+    side = hypot(x, y)
+    scale = radius * atan2(side, z) / side if side > 0.0 else radius
+    return scale * x, scale * y
+
+
+def pad_basis(direction: Vec) -> tuple[Vec, Vec]:
+    """Tangent vectors at a direction: the pad's x and y axes turned there the shortest way (parallel transport).
+
+    Args:
+        direction: unit vector, pad frame, not opposite the pole.
+
+    Returns:
+        Unit vectors e_u, e_v.
+    """
+    x, y, z = direction
+    c = 1.0 / (1.0 + z)
+    return (1.0 - c * x * x, -c * x * y, -x), (-c * x * y, 1.0 - c * y * y, -y)
+
+
+def _averaging_matrix(samples: int, blur_pitch: float) -> Array:
+    """(16, n) weights along one axis: mean over each taxel of the blurred samples."""
+    count = (SIDE + 2 * _MARGIN) * samples
+    mean = np.zeros((SIDE, count))
+    for i in range(SIDE):
+        start = (i + _MARGIN) * samples
+        mean[i, start : start + samples] = 1.0 / samples
+    if blur_pitch <= 0.0:
+        return mean
+    offsets = np.subtract.outer(np.arange(count), np.arange(count)) / samples
+    kernel = np.exp(-0.5 * (offsets / blur_pitch) ** 2)
+    reach = np.arange(-10 * samples, 10 * samples + 1) / samples
+    weights: Array = mean @ kernel / np.exp(-0.5 * (reach / blur_pitch) ** 2).sum()
+    weights[weights < 1e-12] = 0.0  # products of far tails would be denormal numbers, and slow
+    return weights
+
+
+def _half_axis(depth: float, kappa: float, radius: float) -> float:
+    """Half-axis of the patch along a principal direction, m; large where the hollow fits the probe."""
+    relative = 0.5 * (1.0 / radius + kappa)
+    return sqrt(depth / relative) if relative > depth else 1.0
+
+
+class PressureField:
+    """Mean pressure of every taxel under one contact.
+
+    Args:
+        radius_m: probe radius.
+        blur_pitch: standard deviation of the cover's Gaussian blur, in taxel pitches; 0 for none.
+        samples: samples per taxel and axis.
+    """
+
+    def __init__(self, radius_m: float, *, blur_pitch: float = 0.65, samples: int = 3) -> None:
+        self.radius = radius_m
+        self._step = PITCH_M / samples
+        self._count = (SIDE + 2 * _MARGIN) * samples
+        axis = (np.arange(self._count) + 0.5) * self._step - (SIDE / 2 + _MARGIN) * PITCH_M
+        u, v = np.meshgrid(axis, axis)
+        arc = np.hypot(u, v) / radius_m
+        sinc = np.sinc(arc / np.pi)
+        self._directions = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc)))
+        self._area = sinc  # area of a pad cell on the sphere over du dv
+        self._rows = _averaging_matrix(samples, blur_pitch)
+        self._columns = np.ascontiguousarray(self._rows.T)
+
+    def _span(self, centre: float, half: float) -> tuple[int, int]:
+        """Sample indices that cover centre +- half, clipped to the grid."""
+        middle = centre / self._step + 0.5 * self._count - 0.5
+        reach = 1.08 * half / self._step + 1.0  # the flat pad stretches arcs across the pole by up to 4 %
+        low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, self._count - 1.0)) + 1
+        return low, high
+
+    def mean_pressure(
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Array
+    ) -> Array:
+        """Taxel means of ``depth - probe height - object height`` where positive.
+
+        Args:
+            uv: contact point on the pad, m.
+            depth: indentation, m.
+            kappa: principal curvatures of the object, 1/m, larger first.
+            directions_pad: (2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction.
+
+        Returns:
+            (16, 16) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
+        """
+        if depth <= 0.0:
+            return np.zeros((SIDE, SIDE))
+        radius = self.radius
+        (m11, m12), (m21, m22) = directions_pad.tolist()
+        a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
+        r0, r1 = self._span(uv[1], hypot(a * m12, b * m22))
+        c0, c1 = self._span(uv[0], hypot(a * m11, b * m21))
+        if r0 >= r1 or c0 >= c1:
+            return np.zeros((SIDE, SIDE))
+        d = pad_direction(uv[0], uv[1], radius)
+        (x0, x1, x2), (y0, y1, y2) = pad_basis(d)
+        frame = np.array(
+            (
+                d,
+                (m11 * x0 + m12 * y0, m11 * x1 + m12 * y1, m11 * x2 + m12 * y2),
+                (m21 * x0 + m22 * y0, m21 * x1 + m22 * y1, m21 * x2 + m22 * y2),
+            )
+        )
+        block = self._directions[:, r0:r1, c0:c1]
+        along, first, second = (frame @ block.reshape(3, -1)).reshape(block.shape)
+        # Probe height above its lowest point: R (1 - s.d), exact; object height from its principal curvatures.
+        squeeze = radius * along
+        first *= first
+        second *= second
+        first *= 0.5 * kappa[0] * radius * radius
+        second *= 0.5 * kappa[1] * radius * radius
+        squeeze -= first
+        squeeze -= second
+        squeeze += depth - radius
+        np.maximum(squeeze, 0.0, out=squeeze)
+        squeeze *= self._area[r0:r1, c0:c1]
+        means: Array = self._rows[:, r0:r1] @ squeeze @ self._columns[c0:c1]
+        return means

@@ -1,0 +1,318 @@
+"""The plant: arm, probe, object and array as one thing that the emulated nodes share.
+
+Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
+and only when somebody asks. Contact does not push the ideal arm back: the drives are taken as stiff.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from math import cos, pi, sin
+
+import numpy as np
+
+from canprobe.emulator.plant.arm import IdealArm
+from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
+from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
+from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
+from canprobe.errors import PlanError
+from canprobe.robot.kinematics import chain, point_velocity, tool_z_offset
+from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel
+from canprobe.touch.objects import ClosestPoint, ObjectShape
+
+Axes = tuple[Vec, Vec, Vec]
+Truth = dict[str, float | bool | Array]
+
+
+@dataclass(frozen=True, slots=True)
+class PressMotion:
+    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
+
+    Args:
+        force_n: force at the mean depth.
+        swing: amplitude of the depth over its mean.
+        frequency_hz: of the swing.
+    """
+
+    force_n: float = 2.0
+    swing: float = 0.4
+    frequency_hz: float = 0.5
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlantConfig:
+    """What the plant is made of.
+
+    Args:
+        model: the arm; None for a sensor alone, pressed on the object by ``press``.
+        q0: (6,) joint angles at time 0, rad.
+        T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
+        radius_m: probe radius.
+        stiffness_n_m3: of the elastic layer (K/h).
+        damping_s_m: Hunt-Crossley alpha (assumed).
+        object: what can be touched; None for nothing.
+        taxels: the array's imperfections; None where there is no array.
+        bandwidth_hz: -3 dB frequency of every drive.
+        damping_ratio: of every drive.
+        press: motion of a probe without an arm.
+        seed: of taxel gains and noise.
+    """
+
+    model: PumaModel | None
+    q0: Array = field(default_factory=lambda: ELBOW_FORM)
+    T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
+    radius_m: float = 0.040
+    stiffness_n_m3: float = 1.27e8
+    damping_s_m: float = 0.3
+    object: ObjectShape | None = None
+    taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
+    bandwidth_hz: float = 30.0
+    damping_ratio: float = 1.0
+    press: PressMotion = PressMotion()
+    seed: int = 0
+
+
+@dataclass(slots=True, eq=False)
+class _Probe:
+    """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, base frame."""
+
+    centre: Vec
+    axes: Axes
+    velocity: Vec
+
+
+class _PressedProbe:
+    """Probe without an arm, pole against the object's normal at its origin."""
+
+    def __init__(self, config: PlantConfig) -> None:
+        assert config.object is not None
+        pose = config.object.T_base_object
+        x, n = pose[:3, 0], pose[:3, 2]
+        self._origin, self._normal = pose[:3, 3], n
+        self._axes = (tuple(x.tolist()), tuple(np.cross(-n, x).tolist()), tuple((-n).tolist()))
+        c = config.object.closest(self._origin)
+        self._mean = depth_for_force(
+            config.press.force_n, (float(c.kappa[0]), float(c.kappa[1])), config.radius_m, config.stiffness_n_m3
+        )
+        self._radius, self._press = config.radius_m, config.press
+
+    def at(self, t_s: float) -> _Probe:
+        rate = 2 * pi * self._press.frequency_hz
+        depth = self._mean * (1.0 + self._press.swing * sin(rate * t_s))
+        speed = -self._mean * self._press.swing * rate * cos(rate * t_s)
+        centre, velocity = self._origin + (self._radius - depth) * self._normal, speed * self._normal
+        return _Probe(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
+
+
+class Plant:
+    """Arm, probe, object and array.
+
+    Args:
+        config: what the plant is made of.
+
+    Raises:
+        PlanError: for an object with a hollow as tight as the probe.
+    """
+
+    def __init__(self, config: PlantConfig) -> None:
+        self.config = config
+        self.t_ns = 0
+        self.arm: IdealArm | None = None
+        self._pressed: _PressedProbe | None = None
+        if config.model is not None:
+            self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+        if config.object is not None:
+            _refuse_tight_hollow(config)
+            if config.model is None:
+                self._pressed = _PressedProbe(config)
+        self.array: TaxelArray | None = None
+        if config.taxels is not None:
+            rng = np.random.default_rng(config.seed)
+            self.array = TaxelArray(config.taxels, rng, radius_m=config.radius_m, stiffness_n_m3=config.stiffness_n_m3)
+        T_tool = config.T_flange_probe_centre
+        self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
+        # None where the probe's axes are the flange's, the usual case.
+        self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
+        self._solved: _Solution | None = None
+        self._image: tuple[int, Image] | None = None
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        if t_ns > self.t_ns:
+            self.t_ns = t_ns
+            self._solved = None
+            if self.arm is not None:
+                self.arm.advance(t_ns)
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Reference of one drive, see ``IdealArm.set_ramp``.
+
+        Args:
+            axis: 0 to 5.
+            start_counts: at t0.
+            end_counts: at t1 and after.
+            t0_ns: start.
+            t1_ns: end.
+
+        Raises:
+            RuntimeError: without an arm.
+        """
+        self._need_arm().set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
+
+    def motor_counts(self, axis: int) -> float:
+        """Motor position now, counts, continuous; 0 without an arm.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return self.arm.motor_counts(axis) if self.arm is not None else 0.0
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return self.arm.torque_permille(axis) if self.arm is not None else 0
+
+    def _need_arm(self) -> IdealArm:
+        if self.arm is None:
+            raise RuntimeError("this plant has no arm")
+        return self.arm
+
+    def sample_image(self, t_ns: int) -> Image:
+        """Advance and sample the array; a second call at one instant gives the same image.
+
+        Args:
+            t_ns: time of the sample, ns.
+
+        Returns:
+            (16, 16) counts; zeros without an array.
+        """
+        self.advance(t_ns)
+        if self.array is None:
+            return np.zeros((SIDE, SIDE), dtype=np.uint8)
+        if self._image is None or self._image[0] != self.t_ns:
+            s = self._solution()
+            image = self.array.image(
+                s.pad_uv,
+                s.depth,
+                s.kappa,
+                _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
+                1e-9 * self.t_ns,
+                pressure_factor=s.contact.damping_factor,
+            )
+            self._image = (self.t_ns, image)
+        return self._image[1].copy()
+
+    def truth(self) -> Truth:
+        """True values now, SI, base frame.
+
+        Without contact ``force`` is 0 and the contact fields are those of the closest surface point; without an object
+        they are zeros.
+
+        Returns:
+            q (6), probe_centre (3), pole (3), force, depth (negative: gap), depth_rate, contact_point (3) on the
+            object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
+            in_contact.
+        """
+        s = self._solution()
+        return {
+            "q": self.arm.q if self.arm is not None else np.zeros(6),
+            "probe_centre": np.array(s.probe.centre),
+            "pole": np.array(s.probe.axes[2]),
+            "force": s.contact.force,
+            "depth": s.depth,
+            "depth_rate": s.depth_rate,
+            "contact_point": s.foot.point,
+            "contact_normal": s.foot.normal,
+            "kappa": s.foot.kappa,
+            "direction1": s.foot.directions[0],
+            "direction2": s.foot.directions[1],
+            "pad_uv": np.array(s.pad_uv),
+            "in_contact": s.depth > 0.0,
+        }
+
+    def _solution(self) -> _Solution:
+        if self._solved is None:
+            self._solved = self._solve()
+        return self._solved
+
+    def _probe(self) -> _Probe:
+        if self._pressed is not None:
+            return self._pressed.at(1e-9 * self.t_ns)
+        if self.arm is None:
+            return _Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+        c = chain(self.arm.model, self.arm.q)
+        a, b, d = self._tool_origin
+        (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = c.x, c.y, c.z, c.flange
+        centre = (
+            p0 + x0 * a + y0 * b + z0 * d,
+            p1 + x1 * a + y1 * b + z1 * d,
+            p2 + x2 * a + y2 * b + z2 * d,
+        )
+        axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
+        return _Probe(centre, axes, point_velocity(c, centre, self.arm.qd))
+
+    def _solve(self) -> _Solution:
+        probe, config = self._probe(), self.config
+        if config.object is None:
+            return _Solution(probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
+        foot = config.object.closest(probe.centre)
+        nx, ny, nz = foot.normal.tolist()
+        vx, vy, vz = probe.velocity
+        depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
+        k1, k2 = foot.kappa.tolist()
+        contact = elastic_contact(
+            depth, (k1, k2), config.radius_m, config.stiffness_n_m3, depth_rate=rate, damping=config.damping_s_m
+        )
+        # Contact direction on the probe: from its centre against the object's outward normal.
+        (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
+        d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
+        return _Solution(probe, foot, depth, rate, contact, (k1, k2), pad_coordinates(d, config.radius_m), d)
+
+
+def _turned(axes: Axes, R: Array) -> Axes:
+    """Columns of ``[axes] R``."""
+    x, y, z = (R.T @ np.array(axes)).tolist()
+    return tuple(x), tuple(y), tuple(z)
+
+
+def _in_pad(foot: ClosestPoint, probe: _Probe, d: Vec) -> Array:
+    """(2, 2) principal directions in the transported pad basis at the contact direction."""
+    rows: Array = foot.directions @ np.array(probe.axes).T @ np.array(pad_basis(d)).T
+    return rows
+
+
+@dataclass(slots=True, eq=False)
+class _Solution:
+    """Contact at one instant."""
+
+    probe: _Probe
+    foot: ClosestPoint
+    depth: float
+    depth_rate: float
+    contact: Contact
+    kappa: tuple[float, float]
+    pad_uv: tuple[float, float]
+    direction: Vec  # of the contact from the probe's centre, pad frame
+
+
+_POLE = (0.0, 0.0, 1.0)
+_NOWHERE = ClosestPoint(np.zeros(3), np.zeros(3), 0.0, np.zeros(2), np.zeros((2, 3)))
+
+
+def _refuse_tight_hollow(config: PlantConfig) -> None:
+    assert config.object is not None
+    tightest = config.object.tightest_concave_radius()
+    if tightest <= config.radius_m:
+        raise PlanError(
+            [
+                f"the object has a hollow of radius {1e3 * tightest:.1f} mm, the probe's radius is "
+                f"{1e3 * config.radius_m:.1f} mm: it cannot touch there in one point; take a smaller probe"
+            ]
+        )

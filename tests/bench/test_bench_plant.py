@@ -1,0 +1,78 @@
+"""Costs of the plant's inner calls. Run with --benchmark-only; skipped by default.
+
+Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150.
+"""
+
+import numpy as np
+import pytest
+
+from canprobe.emulator.plant.contact import depth_for_force
+from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.robot.damped import damped_step
+from canprobe.robot.inverse import inverse_near
+from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
+from canprobe.robot.puma260 import ELBOW_FORM, UPENN
+from canprobe.robot.touching import start_posture
+from canprobe.touch.objects import make_object
+
+POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
+POSE = np.eye(4)
+POSE[:3, 3] = POINT
+SHAPES = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y": -0.08}}
+
+
+@pytest.fixture
+def plant():
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
+    return Plant(PlantConfig(UPENN, q0, object=make_object("cylinder", T_base_object=POSE, radius=0.036)))
+
+
+def test_bench_forward(benchmark):
+    benchmark(forward, UPENN, ELBOW_FORM)
+
+
+def test_bench_forward_jacobian(benchmark):
+    benchmark(forward_jacobian, UPENN, ELBOW_FORM, TOOL)
+
+
+def test_bench_inverse_near(benchmark):
+    benchmark(inverse_near, UPENN, forward(UPENN, ELBOW_FORM), ELBOW_FORM)
+
+
+def test_bench_damped_step(benchmark):
+    benchmark(damped_step, forward_jacobian(UPENN, ELBOW_FORM, TOOL)[1], np.ones(6))
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_bench_closest(benchmark, kind):
+    shape = make_object(kind, T_base_object=POSE, **SHAPES[kind])
+    benchmark(shape.closest, POINT + np.array((0.003, 0.004, 0.04)))
+
+
+def test_bench_advance_one_cycle(benchmark, plant):
+    def cycle():
+        plant.advance(plant.t_ns + 2_500_000)
+        return plant.motor_counts(0)
+
+    benchmark(cycle)
+
+
+def test_bench_truth_one_cycle(benchmark, plant):
+    def cycle():
+        plant.advance(plant.t_ns + 2_500_000)
+        return plant.truth()
+
+    benchmark(cycle)
+
+
+def test_bench_sample_image(benchmark, plant):
+    benchmark(lambda: plant.sample_image(plant.t_ns + 5_000_000))
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_bench_taxel_image(benchmark, kind):
+    kappa = tuple(make_object(kind, T_base_object=POSE, **SHAPES[kind]).closest(POINT).kappa.tolist())
+    array = TaxelArray(TaxelConfig(), np.random.default_rng(0))
+    depth = depth_for_force(2.0, kappa, 0.04, 1.27e8)
+    benchmark(array.image, (1e-3, 0.5e-3), depth, kappa, np.eye(2), 0.0)

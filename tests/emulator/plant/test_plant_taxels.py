@@ -1,0 +1,263 @@
+"""Taxel image: geometry against the exact bodies, each imperfection alone, the figures expected of the whole."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from canprobe.emulator.plant.contact import depth_for_force
+from canprobe.emulator.plant.field import PITCH_M, PressureField, pad_basis, pad_coordinates, pad_direction
+from canprobe.emulator.plant.taxels import IDEAL_TAXELS, TaxelArray, TaxelConfig
+
+K, R = 1.27e8, 0.040
+PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)
+AXIS = (np.arange(16) - 7.5) * PITCH_M
+ALONG_U = np.eye(2)
+LINEAR_TAXELS = IDEAL_TAXELS.without("threshold")
+
+
+def turned(angle):
+    return np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+
+
+def array(config=IDEAL_TAXELS, seed=0):
+    return TaxelArray(config, np.random.default_rng(seed), radius_m=R, stiffness_n_m3=K)
+
+
+def touch(a, force, *, uv=(0.0, 0.0), kappa=CYLINDER, directions=ALONG_U, t_s=0.0):
+    depth = depth_for_force(force, kappa, R, K) if force > 0 else -1e-3
+    return a.image(uv, depth, kappa, directions, t_s)
+
+
+def moments(image):
+    """Sum, centroid (u, v) and second central moments (uu, uv, vv)."""
+    w = image.astype(float)
+    u, v = np.meshgrid(AXIS, AXIS)
+    total = w.sum()
+    cu, cv = (w * u).sum() / total, (w * v).sum() / total
+    return total, (cu, cv), [(w * (p - m) * (q - n)).sum() / total for p, m, q, n in
+                             ((u, cu, u, cu), (u, cu, v, cv), (v, cv, v, cv))]  # fmt: skip
+
+
+@given(u=st.floats(-0.0127, 0.0127), v=st.floats(-0.0127, 0.0127))
+def test_pad_map_is_equidistant_and_inverts(u, v):
+    d = pad_direction(u, v, R)
+    assert np.linalg.norm(d) == pytest.approx(1.0)
+    assert math.acos(min(1.0, d[2])) * R == pytest.approx(math.hypot(u, v), abs=1e-9)
+    assert pad_coordinates(d, R) == pytest.approx((u, v), abs=1e-15)
+    e_u, e_v = np.array(pad_basis(d))
+    assert np.array((e_u, e_v, d)) @ np.array((e_u, e_v, d)).T == pytest.approx(np.eye(3), abs=1e-12)
+    assert np.cross(e_u, e_v) == pytest.approx(d, abs=1e-12)
+
+
+def test_transported_basis_turns_in_the_plane_of_the_arc_only():
+    e_u, e_v = pad_basis(pad_direction(0.01, 0.0, R))
+    assert e_v == pytest.approx((0.0, 1.0, 0.0))
+    assert e_u == pytest.approx((math.cos(0.25), 0.0, -math.sin(0.25)))
+
+
+@pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
+@pytest.mark.parametrize("force", [0.5, 2.0, 4.0])
+@pytest.mark.parametrize("uv", [(0.0, 0.0), (2.1e-3, -1.3e-3)])
+def test_pressure_sum_is_the_force(kappa, force, uv):
+    field = PressureField(R)
+    depth = depth_for_force(force, kappa, R, K)
+    total = K * PITCH_M**2 * field.mean_pressure(uv, depth, kappa, turned(0.4)).sum()
+    assert total == pytest.approx(force, rel=0.015)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, 1.2, 2.5])
+@pytest.mark.parametrize("uv", [(0.0, 0.0), (3e-3, 1e-3), (-2e-3, 4e-3)])
+def test_pressure_is_the_overlap_of_the_exact_bodies(uv, angle):
+    """Probe sphere against a round cylinder in the pad frame, taxel by taxel, without blur."""
+    radius, depth = 0.036, 0.4e-3
+    d = np.array(pad_direction(*uv, R))
+    basis = np.array(pad_basis(d))
+    across, axis = turned(angle) @ basis  # kappa1 lies across the axis
+    centre = (R - depth + radius) * d
+    samples = (np.arange(16 * 15) + 0.5) / 15 - 8.0
+    expected = np.zeros((240, 240))
+    for i, v in enumerate(samples * PITCH_M):
+        for j, u in enumerate(samples * PITCH_M):
+            arc = math.hypot(u, v)
+            if math.hypot(u - uv[0], v - uv[1]) > 9e-3:
+                continue
+            s = R * np.array((*(np.array((u, v)) * math.sin(arc / R) / arc), math.cos(arc / R)))
+            rest = s - centre
+            rest = rest - (rest @ axis) * axis
+            expected[i, j] = max(0.0, radius - math.sqrt(rest @ rest))
+    expected = expected.reshape(16, 15, 16, 15).mean(axis=(1, 3))
+    got = PressureField(R, blur_pitch=0.0, samples=5).mean_pressure(uv, depth, (1 / radius, 0.0), turned(angle))
+    assert got == pytest.approx(expected, abs=0.02 * depth)
+    assert abs(across @ d) < 1e-12
+
+
+def test_rows_are_v_and_columns_are_u():
+    _, (u, v), _ = moments(touch(array(), 2.0, uv=(3e-3, -2e-3)))
+    assert (u, v) == pytest.approx((3e-3, -2e-3), abs=5e-5)
+    image = touch(array(), 2.0, uv=(4 * PITCH_M, 0.0))
+    row, column = np.unravel_index(image.argmax(), image.shape)
+    assert column >= 11
+    assert row in (7, 8)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.4, 1.1])
+def test_the_patch_is_long_across_the_first_direction(angle):
+    _, _, (uu, uv, vv) = moments(touch(array(), 2.0, directions=turned(angle)))
+    first, second = turned(angle)
+    spread = np.array([[uu, uv], [uv, vv]])
+    assert second @ spread @ second > 1.5 * (first @ spread @ first)
+    assert abs(first @ spread @ second) < 0.03 * np.trace(spread)
+
+
+def test_second_moments_are_the_winkler_ones():
+    c = depth_for_force(2.0, CYLINDER, R, K)
+    a2, b2 = c / (0.5 * (1 / R + CYLINDER[0])), c / (0.5 / R)
+    _, _, (uu, _, vv) = moments(touch(array(LINEAR_TAXELS), 2.0))
+    assert uu - PITCH_M**2 / 12 == pytest.approx(a2 / 6, rel=0.03)
+    assert vv - PITCH_M**2 / 12 == pytest.approx(b2 / 6, rel=0.03)
+
+
+def test_blur_widens_by_its_variance_and_keeps_the_sum():
+    sharp, soft = (PressureField(R, blur_pitch=b).mean_pressure((1e-3, 0.0), 4e-4, PLANE, ALONG_U) for b in (0.0, 0.65))
+    (s0, c0, m0), (s1, c1, m1) = moments(sharp), moments(soft)
+    assert s1 == pytest.approx(s0, rel=1e-6)
+    assert c1 == pytest.approx(c0, abs=3e-6)
+    assert (m1[0] - m0[0]) / PITCH_M**2 == pytest.approx(0.65**2, rel=0.01)
+
+
+def test_contact_beside_the_array_blurs_in_from_the_edge_only():
+    field = PressureField(R)
+    outside = field.mean_pressure((17.5 * PITCH_M / 2, 0.0), 1e-5, PLANE, ALONG_U)
+    assert outside[:, 15].sum() > 0.0
+    assert outside[:, :11].sum() == 0.0
+    assert outside[:, :13].sum() < 1e-3 * outside.sum()
+    assert not field.mean_pressure((0.025, 0.0), 4e-4, PLANE, ALONG_U).any()
+
+
+@pytest.mark.parametrize("force", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize("kappa", [PLANE, CYLINDER], ids=["plane", "cylinder"])
+def test_expected_figures_with_everything_on(force, kappa):
+    rng = np.random.default_rng(5)
+    errors, active = [], []
+    for seed in range(40):
+        uv = rng.uniform(-1.5e-3, 1.5e-3, 2)
+        image = touch(array(TaxelConfig(), seed), force, uv=tuple(uv), kappa=kappa, directions=turned(seed))
+        errors.append(math.dist(moments(image)[1], uv))
+        active.append(np.count_nonzero(image))
+    assert 0.020e-3 < np.mean(errors) < 0.060e-3
+    assert 25 <= np.median(active) <= 59
+
+
+def test_hysteresis_makes_a_loop_of_a_tenth_of_the_signal_at_any_rate():
+    config = replace(LINEAR_TAXELS, hysteresis=0.10)
+    sums = {}
+    for name, forces in {"up": (1.0,), "down": (3.0, 1.0), "again": (3.0, 1.0, 1.0, 3.0, 1.0)}.items():
+        a = array(config)
+        for k, force in enumerate(forces):
+            image = touch(a, force, t_s=100.0 * k)
+        sums[name] = image.astype(float).sum()
+    ideal = touch(array(LINEAR_TAXELS), 1.0).astype(float).sum()
+    assert (sums["down"] - sums["up"]) / ideal == pytest.approx(0.10, abs=0.015)
+    assert sums["up"] < ideal < sums["down"]
+    assert sums["again"] == sums["down"]
+
+
+def test_hysteresis_forgets_when_the_contact_is_lost():
+    a = array(TaxelConfig().without("noise", "creep"))
+    touch(a, 3.0)
+    assert not touch(a, 0.0, t_s=0.005).any()
+
+
+def test_creep_is_five_percent_per_decade():
+    a = array(replace(LINEAR_TAXELS, creep_per_decade=0.05))
+    start = touch(a, 1.5, t_s=0.0).astype(float).sum()
+    grown = [touch(a, 1.5, t_s=t).astype(float).sum() / start - 1.0 for t in (1.0, 10.0, 100.0)]
+    assert np.diff(grown) == pytest.approx((0.05, 0.05), abs=0.006)
+
+
+def test_creep_depends_on_time_not_on_the_number_of_samples():
+    often, once = (array(TaxelConfig().without("noise", "hysteresis")) for _ in range(2))
+    touch(often, 2.0)
+    touch(once, 2.0)
+    for k in range(1, 200):
+        touch(often, 2.0, t_s=0.01 * k)
+    assert np.array_equal(touch(often, 2.0, t_s=2.0), touch(once, 2.0, t_s=2.0))
+
+
+def test_crosstalk_moves_signal_along_rows_and_columns_and_keeps_the_sum():
+    a = array(TaxelConfig(crosstalk=0.05).without("noise", "gain_error", "hysteresis", "creep", "saturation"))
+    y = np.zeros((16, 16))
+    y[4, 9] = 1.0
+    mixed = a._mix @ y @ a._mix
+    assert mixed.sum() == pytest.approx(1.0)
+    assert mixed[4, 0] == pytest.approx(0.05 * 0.95 / 15)
+    assert mixed[0, 9] == pytest.approx(0.05 * 0.95 / 15)
+    assert mixed[4, 9] == pytest.approx(0.95**2)
+
+
+def test_gains_are_fixed_by_the_seed_and_within_their_spread():
+    first, same, other = array(TaxelConfig(), 1), array(TaxelConfig(), 1), array(TaxelConfig(), 2)
+    assert np.array_equal(first.gains, same.gains)
+    assert not np.array_equal(first.gains, other.gains)
+    assert np.abs(first.gains - 1.0).max() <= 0.05
+    assert first.gains.std() == pytest.approx(0.05 / math.sqrt(3), rel=0.1)
+    for t in (0.0, 0.005, 0.010):
+        assert np.array_equal(touch(first, 2.0, t_s=t), touch(same, 2.0, t_s=t))
+
+
+def test_noise_is_half_a_percent_of_full_scale():
+    a = array(TaxelConfig().without("creep", "hysteresis"))
+    images = np.array([touch(a, 2.0, t_s=0.005 * k) for k in range(400)], dtype=float)
+    middle = images[:, 6:10, 6:10].std(axis=0).mean()
+    assert middle == pytest.approx(math.hypot(0.005 * 255, 1 / math.sqrt(12)), rel=0.05)
+
+
+def test_idle_array_reads_zero_through_the_threshold():
+    a = array(TaxelConfig())
+    assert not any(touch(a, 0.0, t_s=0.005 * k).any() for k in range(50))
+
+
+def test_nothing_between_zero_and_the_threshold():
+    config = TaxelConfig()
+    image = touch(array(config), 1.0)
+    assert config.threshold_counts == 6  # 2 % of 255 is 5.1
+    assert image[image > 0].min() >= 6
+
+
+def test_saturation_bends_then_clips():
+    bent = replace(LINEAR_TAXELS, saturation=True)
+    for force, low, high in ((0.5, 0.0, 0.002), (3.0, 0.002, 0.05)):
+        straight, curved = (touch(array(c), force).astype(float).max() for c in (LINEAR_TAXELS, bent))
+        assert low <= 1 - curved / straight + 1 / 255 <= high + 2 / 255
+    assert touch(array(bent), 20.0).max() == 255
+
+
+def test_full_scale_sets_the_counts():
+    counts = [touch(array(TaxelConfig(full_scale_pa=fs).without("noise")), 2.0).max() for fs in (100e3, 300e3)]
+    assert counts[0] / counts[1] == pytest.approx(3.0, rel=0.06)
+
+
+def test_dead_taxels_read_zero_whatever_happens():
+    dead = ((7, 7), (8, 9), (0, 15))
+    a = array(TaxelConfig(dead=dead))
+    for k in range(10):
+        image = touch(a, 3.0, t_s=0.005 * k)
+        assert all(image[i, j] == 0 for i, j in dead)
+        assert image[7, 8] > 0
+
+
+def test_damping_factor_scales_the_pressure():
+    plain, pressed = (
+        array(IDEAL_TAXELS).image((0.0, 0.0), 3e-4, PLANE, ALONG_U, 0.0, pressure_factor=f) for f in (1.0, 1.2)
+    )
+    assert pressed.astype(float).sum() / plain.astype(float).sum() == pytest.approx(1.2, rel=0.02)
+
+
+def test_effects_can_be_switched_off_by_name():
+    assert TaxelConfig().without("creep", "blur") == TaxelConfig(creep_per_decade=0.0, blur_pitch=0.0)
+    with pytest.raises(ValueError, match="unknown effects wobble; one of noise"):
+        TaxelConfig().without("wobble")
