@@ -90,9 +90,10 @@ class Session:
         self._bus_time_ns = 0
         self.traffic: TrafficCounter | None = None
         self.truth: dict[str, Array] = {}
+        self.lockstep: LockstepBus | None = None
+        self.world: World | None = None
         self._say = say
         self._stack = ExitStack()
-        self._world: World | None = None
         self._cell: Cell | None = None
 
     @property
@@ -168,20 +169,20 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = LockstepBus(VirtualClock(), self.scene.bus.channel)
-        self._world = make_world(self.plan, self.scene.emulated_node_ids)
+        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
         bus.recorder = self._writer(0)
-        for participant in self._world.participants:
+        for participant in self.world.participants:
             bus.attach(participant)
         return bus.port()
 
     def _keep_truth(self) -> None:
-        assert self._world is not None
-        if self._world.recorder is not None:
-            self.truth = self._world.recorder.arrays()
+        assert self.world is not None
+        if self.world.recorder is not None:
+            self.truth = self.world.recorder.arrays()
             if self.out is not None:
-                self._world.recorder.save(self.out / "truth.npz")
+                self.world.recorder.save(self.out / "truth.npz")
 
     def _open_real(self) -> Port:
         from canprobe.bus.open import open_port

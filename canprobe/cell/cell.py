@@ -217,7 +217,7 @@ class Cell:
         self._say("stop and disable the drives")
         off = tuple(state for state in DriveState if state not in POWERED_STATES)
         self.drives.goal = DriveState.QUICK_STOP_ACTIVE
-        self._cycle_until(*off, DriveState.QUICK_STOP_ACTIVE, STOP_TIMEOUT_S)
+        self._cycle_until(*off, STOP_TIMEOUT_S)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
         if not self._cycle_until(*disabled, STOP_TIMEOUT_S):

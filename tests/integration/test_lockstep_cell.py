@@ -1,0 +1,248 @@
+"""The whole cell on the lockstep bus: bring-up, run, and every way out leaves the drives disabled."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.bus.candump import read_candump
+from canprobe.cell.build import make_task
+from canprobe.cell.measurement import Command
+from canprobe.errors import BusError, NodeError, SafetyStop
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.protocol.frames import NmtState
+from canprobe.session import Session, resolve_scene
+
+SHORT = {"free": 1.0, "listen": 0.5, "press": 0.5}
+
+
+def session_of(name, duration_s=1.0, **changes):
+    scene = resolve_scene(canprobe.load_scene(name), duration_s=duration_s)
+    return Session(replace(scene, **changes))
+
+
+def node(session, node_id):
+    return next(n for n in session.world.nodes if n.node_id == node_id)
+
+
+def assert_safe(session, but=()):
+    """Every node is pre-operational and every drive without power; ``but`` were lost."""
+    for slave in session.world.nodes:
+        if slave.node_id in but:
+            continue
+        assert slave.state is NmtState.PRE_OPERATIONAL, slave.name
+        if slave.node_id <= 6:
+            statusword = slave.dictionary.values[(0x6041, 0)] if (0x6041, 0) in slave.dictionary.values else None
+            statusword = statusword if statusword is not None else statusword_of(slave)
+            assert state_of(statusword) not in POWERED_STATES, slave.name
+
+
+def statusword_of(slave):
+    """6041h as the node answers an SDO upload."""
+    slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
+    answer = slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
+    return int.from_bytes(dict(answer)[0x580 + slave.node_id][4:6], "little")
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_scene_runs_to_its_end_and_leaves_the_cell_safe(name):
+    session = session_of(name, SHORT[name])
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    assert session.cell.faults == []
+    assert session.cell.cycle.statistics.overruns == 0
+    assert_safe(session)
+
+
+@pytest.mark.parametrize("name", SHORT)
+def test_frames_on_the_bus_are_exactly_those_planned(name, tmp_path):
+    result = canprobe.run(canprobe.load_scene(name), out=tmp_path, duration_s=SHORT[name])
+    seen = {can_id for _, _, can_id, _ in read_candump(tmp_path / "bus.log")}
+    assert seen <= result.plan.frame_ids
+    assert {pdo.cob_id for pdo in result.plan.pdos} <= seen
+
+
+def test_same_seed_same_log_other_seed_other_log(tmp_path):
+    scene = canprobe.load_scene("press")
+    logs = []
+    for i, seed in enumerate((3, 3, 4)):
+        canprobe.run(scene, out=tmp_path / str(i), seed=seed, duration_s=0.3)
+        logs.append((tmp_path / str(i) / "bus.log").read_bytes())
+    assert logs[0] == logs[1]
+    assert logs[0] != logs[2]
+    assert logs[0].startswith(b"(0000000000.000000) can0 ")
+
+
+def test_press_reaches_and_holds_the_force(tmp_path):
+    result = canprobe.run(canprobe.load_scene("press"), out=tmp_path, duration_s=1.0)
+    contact = result.summary["contact"]
+    assert contact["contact_fraction"] == 1.0
+    assert contact["force_rms_error_n"] < 0.2
+    assert contact["force_max_n"] < 3.0
+    assert result.summary["shape"]["method"] is None
+
+
+def test_a_lost_drive_stops_the_cell():
+    session = session_of("free")
+
+    def cut(_):
+        session.lockstep.detach(node(session, 3))
+        return Command()
+
+    with pytest.raises(NodeError, match="node 3: lost"), session:
+        session.run(_once(cut))
+    assert_safe(session, but=(3,))
+
+
+def _once(action, at=60):
+    done = []
+
+    def step(measurement):
+        if measurement.cycle >= at and not done:
+            done.append(True)
+            return action(measurement)
+        return Command()
+
+    return step
+
+
+def test_a_lost_sensor_stops_the_scan_with_a_retreat():
+    session = session_of("press", 3.0)
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        if measurement.cycle == 900:
+            session.lockstep.detach(node(session, 16))
+        return controller.step(measurement)
+
+    with pytest.raises((SafetyStop, NodeError), match=r"no tactile frame|node 16: lost"), session:
+        session.run(step)
+    assert_safe(session, but=(16,))
+
+
+def test_a_drive_fault_stops_the_cell_and_names_it():
+    session = session_of("free")
+
+    def fault(_):
+        node(session, 2).application.inject_fault(0x4210)
+        return Command()
+
+    with pytest.raises(NodeError, match=r"node 2: .*(4210|temperature)"), session:
+        session.run(_once(fault))
+    assert any("4210h" in fault for fault in session.cell.faults)
+    assert_safe(session)
+
+
+def test_an_exception_in_the_controller_leaves_the_cell_safe():
+    session = session_of("free")
+
+    def fail(_):
+        raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError), session:
+        session.run(_once(fail))
+    assert_safe(session)
+
+
+def test_an_interrupt_leaves_the_cell_safe():
+    session = session_of("free")
+
+    def interrupt(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt), session:
+        session.run(_once(interrupt))
+    assert_safe(session)
+
+
+def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
+    session = session_of("free", 4.0)
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        if measurement.cycle == 800:
+            raise KeyboardInterrupt
+        return controller.step(measurement)
+
+    with pytest.raises(KeyboardInterrupt), session:
+        session.run(step)
+    q = session.truth["q"]
+    assert np.abs(q[795] - q[790]).max() > 1e-4  # it was moving
+    assert np.abs(q[-1] - q[-2]).max() < 1e-9
+    assert_safe(session)
+
+
+def test_another_master_stops_bring_up():
+    session = session_of("free")
+    session.plan  # noqa: B018
+    original = session._open_lockstep
+
+    def opened():
+        port = original()
+
+        class Foreign:
+            next_deadline_ns = 100_000_000
+
+            def start(self, t_ns):
+                return []
+
+            def receive(self, can_id, data, t_ns):
+                return []
+
+            def advance(self, t_ns):
+                self.next_deadline_ns = t_ns + 100_000_000
+                return [(0x77F, b"\x05")]
+
+        session.lockstep.attach(Foreign())
+        return port
+
+    session._open_lockstep = opened
+    with pytest.raises(BusError, match="another master"), session:
+        pass
+
+
+@pytest.mark.parametrize("name", ["free", "press"])
+def test_a_missing_node_is_named(name):
+    session = session_of(name)
+    original = session._open_lockstep
+
+    def opened():
+        port = original()
+        session.lockstep.detach(node(session, 4))
+        return port
+
+    session._open_lockstep = opened
+    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) sent no boot-up"), session:
+        pass
+
+
+def test_a_node_of_another_make_is_named():
+    session = session_of("free")
+    original = session._open_lockstep
+
+    def opened():
+        port = original()
+        node(session, 5).dictionary.values[(0x1018, 2)] = 0x999
+        return port
+
+    session._open_lockstep = opened
+    with pytest.raises(NodeError, match=r"node 5: .*product code expected 0x260, got 0x999"), session:
+        pass
+
+
+def test_own_controller_in_ten_lines():
+    with canprobe.open_cell(canprobe.load_scene("free")) as cell:
+        q0 = None
+
+        def nod(measurement):
+            nonlocal q0
+            q0 = measurement.q if q0 is None else q0
+            target = q0.copy()
+            target[5] += 0.1 * np.sin(measurement.cycle / 100)
+            return Command(q_target=target, done=measurement.cycle > 600)
+
+        cell.run(nod)
+    assert np.ptp(cell.truth["q"][:, 5]) == pytest.approx(0.2, abs=0.01)
+    assert np.ptp(cell.truth["q"][:, 0]) < 1e-3
