@@ -63,7 +63,8 @@ class ArmSettings:
     node_ids: Annotated[NodeIds, Distinct()] = (1, 2, 3, 4, 5, 6)
     eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
     emulated: bool = True
-    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)  # selects the branch; an emulated arm stands here in `free`, above the start in others
+    # selects the branch of the inverse kinematics; an emulated arm stands here in `free`, above the start in others
+    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
 
 

@@ -19,7 +19,6 @@ from canprobe.eds import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
 from canprobe.scene_loader import packaged_scenes
 
-
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
 
