@@ -169,13 +169,19 @@ class OuterRun:
         """Return the item's reports from the inner session; whatever is missing there is a failure here."""
         mine = self._reports.setdefault(item.nodeid, [])
         for line in self._lines:
-            report = self._config.hook.pytest_report_from_serializable(config=self._config, data=json.loads(line))
+            report = self._read(line)
             self._reports.setdefault(report.nodeid, []).append(report)
             if report.nodeid == item.nodeid and report.when == "teardown":
                 break
         if mine and mine[-1].when == "teardown":
             return mine
         return [*mine, self._missing(item)]
+
+    def _read(self, line: str) -> pytest.TestReport:
+        report = self._config.hook.pytest_report_from_serializable(config=self._config, data=json.loads(line))
+        if isinstance(report.longrepr, list):  # a skip's (file, line, reason), which JSON keeps as a list
+            report.longrepr = tuple(report.longrepr)
+        return report
 
     def _missing(self, item: pytest.Item) -> pytest.TestReport:
         assert self._process is not None and self._folder is not None

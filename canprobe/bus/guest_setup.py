@@ -14,7 +14,7 @@ from pathlib import Path
 
 _MODULES = ("can", "can-raw", "can-bcm", "can-gw", "can-dev", "vcan", "vxcan", "slcan")
 _FINIT_MODULE = {"x86_64": 313, "i686": 350, "i586": 350, "i486": 350, "i386": 350}
-_RTM_NEWLINK = 16
+_NEW_LINK, _DELETE_LINK = 16, 17
 _NLM_REQUEST_ACK_CREATE = 0x1 | 0x4 | 0x400
 _IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_KIND = 3, 18, 1
 _IFF_UP = 1
@@ -34,12 +34,17 @@ def load_modules(folder: Path) -> None:
 def make_link(name: str, kind: str) -> None:
     """Create a link of this kind; OSError if the kernel refuses."""
     info = _attribute(_IFLA_LINKINFO, _attribute(_IFLA_INFO_KIND, kind.encode()))
-    _request(struct.pack("=BxHiII", 0, 0, 0, 0, 0) + _attribute(_IFLA_IFNAME, name.encode() + b"\0") + info)
+    _request(_NEW_LINK, struct.pack("=BxHiII", 0, 0, 0, 0, 0) + _attribute(_IFLA_IFNAME, name.encode() + b"\0") + info)
 
 
-def raise_link(name: str) -> None:
-    """Bring a link up; OSError if the kernel refuses."""
-    _request(struct.pack("=BxHiII", 0, 0, socket.if_nametoindex(name), _IFF_UP, _IFF_UP))
+def set_link(name: str, up: bool) -> None:
+    """Bring a link up or down; OSError if the kernel refuses."""
+    _request(_NEW_LINK, struct.pack("=BxHiII", 0, 0, socket.if_nametoindex(name), _IFF_UP if up else 0, _IFF_UP))
+
+
+def remove_link(name: str) -> None:
+    """Delete a link; OSError if the kernel refuses."""
+    _request(_DELETE_LINK, struct.pack("=BxHiII", 0, 0, socket.if_nametoindex(name), 0, 0))
 
 
 def _attribute(kind: int, payload: bytes) -> bytes:
@@ -47,9 +52,9 @@ def _attribute(kind: int, payload: bytes) -> bytes:
     return struct.pack("=HH", length, kind) + payload + bytes(-length % 4)
 
 
-def _request(payload: bytes) -> None:
-    """Send one RTM_NEWLINK and read the kernel's verdict."""
-    header = struct.pack("=IHHII", 16 + len(payload), _RTM_NEWLINK, _NLM_REQUEST_ACK_CREATE, 1, 0)
+def _request(kind: int, payload: bytes) -> None:
+    """Send one rtnetlink request and read the kernel's verdict."""
+    header = struct.pack("=IHHII", 16 + len(payload), kind, _NLM_REQUEST_ACK_CREATE, 1, 0)
     with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as netlink:
         netlink.send(header + payload)
         (negative_errno,) = struct.unpack_from("=i", netlink.recv(4096), 16)
@@ -60,5 +65,5 @@ def _request(payload: bytes) -> None:
 if __name__ == "__main__":
     load_modules(Path(sys.argv[1]))
     make_link("vcan0", "vcan")
-    raise_link("vcan0")
-    raise_link("lo")
+    set_link("vcan0", up=True)
+    set_link("lo", up=True)

@@ -106,7 +106,7 @@ class LocalJob:
 
     def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
         self._process = subprocess.Popen(
-            ["sh", "-c", 'exec "$@"', "sh", *command],
+            ["/bin/sh", "-c", 'exec "$@"', "sh", *command],
             stdin=subprocess.DEVNULL,
             env=dict(environment),
             start_new_session=True,

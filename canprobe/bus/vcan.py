@@ -146,7 +146,9 @@ def _install(line: str) -> bool:
     update = line.partition("install")[0] + "update"
     for attempt in (line, f"{update} && {line}"):
         _say(attempt)
-        done = subprocess.run(["sh", "-c", attempt], stdin=subprocess.DEVNULL, stdout=2, env=environment, check=False)
+        done = subprocess.run(
+            ["/bin/sh", "-c", attempt], stdin=subprocess.DEVNULL, stdout=2, env=environment, check=False
+        )
         if done.returncode == 0:
             return is_installed()
     return False

@@ -1,0 +1,174 @@
+"""What only a real SocketCAN interface shows: filters, overruns, error frames, a full queue, a link that goes down."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import socket
+import struct
+import subprocess
+from collections.abc import Iterator, Sequence
+
+import pytest
+
+from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.guest_setup import make_link, remove_link, set_link
+from canprobe.bus.mmsg import Row
+from canprobe.bus.port import ERR_FLAG, ControllerState, Frame, TimedFrame
+from canprobe.bus.pythoncan import PythonCanPort
+from canprobe.bus.socketcan import SocketCanPort
+from canprobe.errors import InterfaceError
+
+pytestmark = pytest.mark.vcan
+
+HOUR_NS = 3600 * 10**9
+
+
+@pytest.fixture(params=[True, False], ids=["batched", "plain"])
+def batched(request: pytest.FixtureRequest) -> bool:
+    return bool(request.param)
+
+
+@pytest.fixture
+def link() -> Iterator[str]:
+    """A second interface that a test may break; needs the rights of root, which a guest always has."""
+    try:
+        make_link("vcan7", "vcan")
+    except PermissionError:
+        pytest.skip("making a link needs CAP_NET_ADMIN")
+    set_link("vcan7", up=True)
+    yield "vcan7"
+    remove_link("vcan7")
+
+
+def receive(port: SocketCanPort | PythonCanPort, count: int) -> list[TimedFrame]:
+    frames: list[TimedFrame] = []
+    while len(frames) < count:
+        port.wait(port.clock.now_ns() + HOUR_NS)
+        frames += port.drain()
+    return frames
+
+
+def test_the_kernel_filters(vcan0: str) -> None:
+    clock = MonotonicClock()
+    filters = [(0x180, 0x7F0), (0x700, 0x780)]
+    sender, ours = SocketCanPort(vcan0, clock), SocketCanPort(vcan0, clock, filters=filters)
+    theirs = PythonCanPort("socketcan", vcan0, 1_000_000, clock, filters=filters)
+    sender.send_batch([(can_id, b"") for can_id in (0x080, 0x181, 0x191, 0x18F, 0x77F, 0x7FF, 0x701)])
+    expected = [0x181, 0x18F, 0x77F, 0x701]
+    assert [i for i, _, _ in receive(ours, 4)] == expected
+    assert [i for i, _, _ in receive(theirs, 4)] == expected
+    for port in (sender, ours, theirs):
+        port.close()
+
+
+def test_dropped_frames_are_counted(vcan0: str, batched: bool) -> None:
+    clock = MonotonicClock()
+    sender, late = SocketCanPort(vcan0, clock), SocketCanPort(vcan0, clock, batched=batched)
+    late._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 20_000)
+    batch = [(0x100 + k, b"") for k in range(200)]
+    sender.send_batch(batch)
+    first = late.drain()
+    assert 0 < len(first) < 200, "the buffer is smaller than the batch"
+    sender.send_batch([(0x7FF, b"")])  # the count travels with the next frame
+    assert [i for i, _, _ in receive(late, 1)] == [0x7FF]
+    assert late.counters.overruns == 200 - len(first)
+    sender.close()
+    late.close()
+
+
+@pytest.mark.parametrize(
+    ("can_id", "data", "state"),
+    [
+        (0x040, bytes(8), ControllerState.BUS_OFF),
+        (0x004, bytes([0, 0x20, 0, 0, 0, 0, 0, 0]), ControllerState.PASSIVE),
+        (0x004, bytes([0, 0x08, 0, 0, 0, 0, 0, 0]), ControllerState.WARNING),
+        (0x002, bytes(8), ControllerState.ACTIVE),
+    ],
+)
+def test_error_frames_are_counted_not_passed_on(
+    vcan0: str, batched: bool, can_id: int, data: bytes, state: ControllerState
+) -> None:
+    port = SocketCanPort(vcan0, MonotonicClock(), batched=batched)
+    portable = PythonCanPort("socketcan", vcan0, 1_000_000, MonotonicClock())
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
+        raw.bind((vcan0,))
+        raw.send(struct.pack("=IB3x8s", can_id | ERR_FLAG, 8, data))
+        raw.send(struct.pack("=IB3x8s", 0x123, 0, b""))
+    assert [i for i, _, _ in receive(port, 1)] == [0x123]
+    assert [i for i, _, _ in receive(portable, 1)] == [0x123]
+    assert (port.counters.error_frames, port.state) == (1, state)
+    assert portable.counters.error_frames == 1
+    port.close()
+    portable.close()
+
+
+class FullQueue:
+    """Says ENOBUFS a number of times, then takes two frames a call."""
+
+    def __init__(self, full: int) -> None:
+        self.full, self.taken = full, list[Frame]()
+
+    def receive(self) -> list[Row]:
+        return []
+
+    def send(self, frames: Sequence[Frame]) -> int:
+        if self.full:
+            self.full -= 1
+            raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+        self.taken += frames[:2]
+        return len(frames[:2])
+
+
+def test_a_full_queue_is_waited_for_then_an_error(vcan0: str) -> None:
+    port = SocketCanPort(vcan0, MonotonicClock())
+    batch = [(0x100 + k, b"") for k in range(5)]
+    port._frames = queue = FullQueue(3)
+    port.send_batch(batch)
+    assert (queue.taken, port.counters.transmit_full, port.counters.sent) == (batch, 3, 5)
+    port._frames = FullQueue(10**6)
+    with pytest.raises(InterfaceError, match=r"vcan0: the transmit queue stays full, 5 frames.*txqueuelen 1000"):
+        port.send_batch(batch)
+    port.close()
+
+
+def test_a_link_that_goes_down_is_named(link: str, batched: bool) -> None:
+    clock = MonotonicClock()
+    port = SocketCanPort(link, clock, batched=batched)
+    set_link(link, up=False)
+    port.wait(clock.now_ns() + HOUR_NS)  # ends at once: there is something to be told
+    with pytest.raises(InterfaceError, match=r"vcan7: interface is down; type: .*ip link set vcan7 up"):
+        port.drain()
+    with pytest.raises(InterfaceError, match="vcan7: interface is down"):
+        port.send_batch([(0x123, b"")])
+    port.close()
+    with pytest.raises(InterfaceError, match="vcan7: interface is down"):
+        SocketCanPort(link, clock)
+
+
+def test_can_utils_see_the_same(vcan0: str) -> None:
+    candump, cansend = shutil.which("candump"), shutil.which("cansend")
+    if candump is None or cansend is None:
+        pytest.skip("type: apt-get install -y can-utils")
+    port = SocketCanPort(vcan0, MonotonicClock())
+    command = [candump, "-L", "-n", "3", vcan0]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as listener:
+        while _raw_sockets() < 2:
+            pass
+        port.send_batch([(0x181, b"\x37\x06\0\0"), (0x9FFFFFFF, b"")])
+        subprocess.run([cansend, vcan0, "705#7F"], check=True)
+        lines, _ = listener.communicate()
+    assert [line.split(" ", 1)[1] for line in lines.splitlines()] == [
+        "vcan0 181#37060000",
+        "vcan0 1FFFFFFF#",
+        "vcan0 705#7F",
+    ]
+    assert [(i, d) for i, d, _ in receive(port, 1)] == [(0x705, b"\x7f")]
+    port.close()
+
+
+def _raw_sockets() -> int:
+    """How many sockets listen to everything on vcan0, from the kernel's own list."""
+    with open("/proc/net/can/rcvlist_all") as table:
+        return sum(line.split()[0] == "vcan0" for line in table if line.split())

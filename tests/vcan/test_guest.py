@@ -1,0 +1,108 @@
+"""`canprobe vcan` for real: each test boots a user-mode Linux guest, or uses the machine's own vcan if it has one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from canprobe.bus.guest import PROGRAM, GuestError, GuestJob, is_installed
+from canprobe.bus.socketcan import has_socketcan
+from canprobe.bus.supervise import Signals, supervise
+
+CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
+ROOT = Path(__file__).parents[2]
+
+pytestmark = pytest.mark.slow
+needs_guest = pytest.mark.skipif(not is_installed(), reason=f"{PROGRAM}: type: apt-get install -y user-mode-linux")
+needs_vcan = pytest.mark.skipif(not has_socketcan() and not is_installed(), reason="type: canprobe vcan --install")
+
+
+def start(folder: Path, *arguments: str, **environment: str) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [*CANPROBE, "vcan", *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT), **environment},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
+
+
+@needs_vcan
+def test_streams_are_byte_exact_and_surroundings_are_the_same(tmp_path: Path) -> None:
+    folder = tmp_path / "with space and 'quote'"
+    folder.mkdir()
+    (folder / "out").write_bytes(bytes(range(256)) * 5000 + b"\r\n" + b"x" * 1_000_000)
+    (folder / "err").write_bytes(os.urandom(100_000))
+    script = (
+        'cat out; cat err >&2; pwd > where; printf "%s" "$ODD" > odd; printf "%s|" "$@" > words; sleep 99 & exit 42'
+    )
+    words = ["-c", "a b", "*", "$HOME", "'", '"', "\\", "", "ä\n", "--"]
+    odd = "line\nbreak 'quote' $x \udcff"
+    process = start(folder, "--", "sh", "-c", script, "sh", *words, ODD=odd)
+    out, err = process.communicate()
+    assert process.returncode == 42
+    assert out == (folder / "out").read_bytes()
+    assert err == (folder / "err").read_bytes()
+    assert (folder / "where").read_text() == f"{folder}\n"
+    assert (folder / "odd").read_bytes() == os.fsencode(odd)
+    assert (folder / "words").read_text() == "".join(f"{word}|" for word in words)
+
+
+@needs_vcan
+def test_a_signal_reaches_a_python_command_as_an_interrupt(tmp_path: Path) -> None:
+    script = """if True:
+        import time, socket
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).bind(("vcan0",))
+        try:
+            print("ready", flush=True)
+            time.sleep(600)
+        except KeyboardInterrupt:
+            print("interrupted")
+            raise SystemExit(6)"""
+    process = start(tmp_path, "--", os.path.realpath(sys.executable), "-c", script)
+    assert process.stdout is not None
+    assert process.stdout.read(6) == b"ready\n"
+    process.send_signal(signal.SIGINT)
+    assert process.communicate() == (b"interrupted\n", b"")
+    assert process.returncode == 6
+
+
+@needs_vcan
+def test_time_out_ends_command_and_guest(tmp_path: Path) -> None:
+    process = start(tmp_path, "--timeout", "0.5", "--", "sh", "-c", "echo $$; sleep 600")
+    _, err = process.communicate()
+    assert process.returncode == 124
+    assert b"canprobe: vcan: the command was stopped after 0.5 s" in err
+
+
+@needs_guest
+def test_a_guest_that_panics_is_told_from_a_command_that_fails(tmp_path: Path) -> None:
+    with (
+        GuestJob(["sh", "-c", "echo c > /proc/sysrq-trigger; sleep 600"], os.environ) as job,
+        pytest.raises(GuestError, match="the guest ended before the command did: Kernel panic - not syncing") as caught,
+    ):
+        supervise(job, Signals(), None)
+    assert caught.value.started
+
+
+@needs_guest
+def test_leaving_early_ends_the_guest_and_removes_its_files() -> None:
+    with GuestJob(["sleep", "600"], os.environ) as job:
+        assert job.poll() is None
+        folder, process = job._job, job._process
+        assert folder.is_dir()
+    assert process.returncode is not None
+    assert not folder.exists()
+
+
+@needs_guest
+def test_a_folder_that_the_guest_cannot_see_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir("/dev")
+    with pytest.raises(GuestError, match="the working folder /dev does not exist in the guest"):
+        GuestJob(["true"], os.environ)

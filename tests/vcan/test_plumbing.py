@@ -1,0 +1,126 @@
+"""How vcan tests get from this session to the one in the guest and back, with a stand-in for the guest."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CONFTEST = Path(__file__).parents[1] / "conftest.py"
+
+ADDED = """
+_has_interface = lambda: False
+_require_interface = lambda: None
+_CANPROBE = (sys.executable, {stand_in!r})
+"""
+
+STAND_IN = """
+import os, subprocess, sys
+kind = os.environ["STAND_IN"]
+if kind == "none":
+    print("canprobe: vcan: type:  apt-get install -y something")
+    sys.exit(125)
+print("arguments", sys.argv[1:])
+sys.exit(subprocess.call(sys.argv[sys.argv.index("--") + 1 :], env={**os.environ, "INSIDE": "1"}))
+"""
+
+TESTS = """
+import os
+import pytest
+
+pytestmark = pytest.mark.vcan
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_inside(vcan0, n):
+    assert (vcan0, os.environ["INSIDE"]) == ("vcan0", "1")
+
+def test_bad(vcan0):
+    print("said before")
+    assert vcan0 == "vcan1"
+
+def test_skipped():
+    pytest.skip("for its own reason")
+
+@pytest.mark.xfail
+def test_expected():
+    assert False
+
+@pytest.fixture
+def broken():
+    raise RuntimeError("broken fixture")
+
+def test_error(broken):
+    pass
+
+def test_exits():
+    if os.environ["STAND_IN"] == "dies":
+        os._exit(3)
+
+def test_after():
+    pass
+"""
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    stand_in = tmp_path / "stand_in.py"
+    stand_in.write_text(STAND_IN)
+    (tmp_path / "conftest.py").write_text(CONFTEST.read_text() + ADDED.format(stand_in=str(stand_in)))
+    (tmp_path / "test_it.py").write_text(TESTS)
+    (tmp_path / "test_native.py").write_text("import os\ndef test_outside():\n    assert 'INSIDE' not in os.environ\n")
+    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n    vcan: stand-in\naddopts = -p no:cacheprovider\n")
+    return tmp_path
+
+
+def run(project: Path, *arguments: str, **environment: str) -> tuple[int, str]:
+    root = str(CONFTEST.parents[1])
+    clean = {name: value for name, value in os.environ.items() if not name.startswith("CANPROBE_")}
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-rA", *arguments],
+        cwd=project,
+        env={**clean, "PYTHONPATH": root, **environment},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def counts(output: str) -> dict[str, int]:
+    last = output.strip().splitlines()[-1]
+    return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
+
+
+def test_outcomes_and_texts_come_back(project: Path) -> None:
+    status, output = run(project, STAND_IN="runs", CANPROBE_INSTALL="1")
+    assert status == 1
+    assert counts(output) == {"passed": 5, "failed": 1, "skipped": 1, "xfailed": 1, "error": 1}
+    for text in ("assert 'vcan0' == 'vcan1'", "said before", "for its own reason", "RuntimeError: broken fixture"):
+        assert text in output
+
+
+def test_selection_goes_in(project: Path) -> None:
+    status, output = run(project, "test_it.py::test_inside[2]", "test_it.py::test_after", STAND_IN="runs")
+    assert (status, counts(output)) == (0, {"passed": 2})
+    status, output = run(project, "-m", "not vcan", STAND_IN="dies")
+    assert (status, counts(output)) == (0, {"passed": 1, "deselected": 8})
+
+
+def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> None:
+    status, output = run(project, "-k", "inside or exits or after", STAND_IN="dies")
+    assert (status, counts(output)) == (1, {"passed": 2, "error": 2, "deselected": 5})
+    assert "not reported where the vcan is; that session ended with 3" in output
+
+
+@pytest.mark.parametrize(
+    ("required", "expected"), [("", {"passed": 1, "skipped": 8}), ("1", {"passed": 1, "error": 8})]
+)
+def test_without_a_vcan_they_are_skipped_loudly_or_fail(project: Path, required: str, expected: dict[str, int]) -> None:
+    status, output = run(project, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
+    assert (status, counts(output)) == (1 if required else 0, expected)
+    assert "apt-get install -y something" in output
+    assert ("8 tests were NOT RUN" in output) == (not required)
