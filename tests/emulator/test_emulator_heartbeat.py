@@ -1,0 +1,95 @@
+"""Error control, CiA 301: heartbeat producer and consumer, error behaviour 1029h; points 8, 44, 45. Store: 46."""
+
+from __future__ import annotations
+
+import pytest
+
+from canprobe.protocol.frames import NmtState
+
+MS = 1_000_000
+MASTER_250 = 127 << 16 | 250
+SAVE, LOAD = 0x65766173, 0x64616F6C
+
+
+def test_cia301_heartbeat_08_write_acts_at_once_and_repeats(bench):
+    bench.t_ns = 3 * MS
+    assert bench.send(0x605, "2b17100064000000") == [(0x705, "7f"), (0x585, "6017100000000000")]
+    assert bench.node.next_deadline_ns == 103 * MS
+    assert bench.advance(103 * MS) == [(0x705, "7f")]
+    assert bench.advance(203 * MS) == [(0x705, "7f")]
+    bench.write(0x1017, 0, 0, 2)
+    assert bench.node.next_deadline_ns is None
+
+
+def test_cia301_heartbeat_boot_up_is_the_first_with_a_stored_time(bench):
+    bench.write(0x1017, 0, 50, 2)
+    bench.write(0x1010, 1, SAVE, 4)
+    bench.t_ns = 7 * MS
+    assert bench.nmt(0x81) == [(0x705, "00")]
+    assert bench.node.next_deadline_ns == 57 * MS
+
+
+def test_cia301_heartbeat_44_watched_from_the_first_on_and_loss_reported(bench):
+    assert bench.write(0x1016, 1, MASTER_250, 4) == 0
+    assert bench.node.next_deadline_ns is None
+    bench.nmt(0x01)
+    bench.send(0x77F, "05", 1000 * MS)
+    bench.send(0x77F, "05", 1100 * MS)
+    assert bench.node.next_deadline_ns == 1350 * MS
+    assert bench.advance(1350 * MS) == [(0x85, "3081117f00000000")]
+    assert bench.node.state is NmtState.PRE_OPERATIONAL  # 1029h:01 = 0
+    assert bench.send(0x77F, "05", 1400 * MS) == [(0x85, "0000000000000000")]
+
+
+@pytest.mark.parametrize(
+    ("behaviour", "before", "after"),
+    [
+        (0, NmtState.OPERATIONAL, NmtState.PRE_OPERATIONAL),
+        (0, NmtState.STOPPED, NmtState.STOPPED),
+        (1, NmtState.OPERATIONAL, NmtState.OPERATIONAL),
+        (2, NmtState.OPERATIONAL, NmtState.STOPPED),
+        (2, NmtState.PRE_OPERATIONAL, NmtState.STOPPED),
+    ],
+)
+def test_cia301_error_behaviour_45(bench, behaviour, before, after):
+    bench.write(0x1029, 1, behaviour, 1)
+    bench.write(0x1016, 1, MASTER_250, 4)
+    bench.nmt({NmtState.OPERATIONAL: 1, NmtState.STOPPED: 2, NmtState.PRE_OPERATIONAL: 0x80}[before], 0)
+    bench.send(0x77F, "05", 0)
+    bench.advance(250 * MS)
+    assert bench.node.state is after
+
+
+def test_cia301_heartbeat_44_duplicate_producer(bench):
+    assert bench.write(0x1016, 1, MASTER_250, 4) == 0
+    assert bench.write(0x1016, 2, 127 << 16 | 500, 4) == 0x06040043
+    assert bench.write(0x1016, 1, 127 << 16 | 500, 4) == 0
+    assert bench.write(0x1016, 2, 127 << 16, 4) == 0  # no time: not in use
+    assert bench.write(0x1016, 2, 126 << 16 | 500, 4) == 0
+
+
+def test_cia301_heartbeat_44_removed_producer_is_forgotten(bench):
+    bench.write(0x1016, 1, MASTER_250, 4)
+    bench.send(0x77F, "05", 0)
+    bench.write(0x1016, 1, 0, 4)
+    assert bench.node.next_deadline_ns is None
+
+
+def test_cia301_store_46_needs_its_signature(bench):
+    assert bench.write(0x1010, 1, 1, 4) == 0x08000020
+    assert bench.write(0x1011, 1, SAVE, 4) == 0x08000020
+    assert (bench.read(0x1010, 1), bench.read(0x1011, 1)) == (1, 1)
+
+
+@pytest.mark.parametrize(("group", "heartbeat", "value"), [(1, 50, 77), (2, 50, 50), (3, 0, 77)])
+def test_cia301_store_46_values_survive_a_restart(bench, group, heartbeat, value):
+    bench.write(0x1017, 0, 50, 2)
+    bench.write(0x2000, 0, 77, 1)
+    assert bench.write(0x1010, group, SAVE, 4) == 0
+    bench.write(0x2000, 0, 33, 1)
+    bench.nmt(0x81)
+    assert (bench.read(0x1017), bench.read(0x2000)) == (heartbeat, value)
+    assert bench.write(0x1011, 1, LOAD, 4) == 0
+    assert bench.read(0x2000) == value  # from the next reset on
+    bench.nmt(0x81)
+    assert (bench.read(0x1017), bench.read(0x2000)) == (0, 50)

@@ -1,0 +1,114 @@
+"""SYNC and EMCY, CiA 301: objects 1001h, 1003h, 1005h, 1006h, 1014h, 1015h, 1019h; points 39–43 and 47."""
+
+from __future__ import annotations
+
+import pytest
+
+MS = 1_000_000
+
+
+@pytest.mark.parametrize("value", range(256))
+def test_cia301_sync_39_counter_overflow_values(bench, value):
+    assert bench.write(0x1019, 0, value, 1) == (0x06090030 if value == 1 or value > 240 else 0)
+
+
+def test_cia301_sync_39_overflow_is_refused_while_a_period_is_set(bench):
+    bench.write(0x1006, 0, 2500, 4)
+    assert bench.write(0x1019, 0, 240, 1) == 0x08000022
+    bench.write(0x1006, 0, 0, 4)
+    assert bench.write(0x1019, 0, 240, 1) == 0
+
+
+@pytest.mark.parametrize(
+    ("value", "code"),
+    [(0x81 - 1, 0), (0x40000080, 0x06090030), (0x20000080, 0x06090030), (0x601, 0x06090030), (0x90, 0)],
+)
+def test_cia301_sync_cob_id(bench, value, code):
+    assert bench.write(0x1005, 0, value, 4) == code
+    if not code:
+        bench.nmt(0x01)
+        assert bench.send(value, "") == [(0x185, "04030201feff")]
+
+
+@pytest.mark.parametrize(("overflow", "good", "bad"), [(0, "", "01"), (240, "01", ""), (240, "02", "0102")])
+def test_cia301_sync_40_wrong_length_is_reported_and_not_acted_on(bench, overflow, good, bad):
+    bench.write(0x1019, 0, overflow, 1)
+    bench.nmt(0x01)
+    assert bench.send(0x80, bad) == [(0x85, "4082110000000000")]
+    assert bench.send(0x80, good) == [(0x85, "0000000000000000"), (0x185, "04030201feff")]
+
+
+def test_cia301_sync_41_no_sync_for_one_and_a_half_periods(bench):
+    bench.write(0x1006, 0, 2000, 4)
+    bench.nmt(0x01, 0)
+    assert bench.node.next_deadline_ns is None  # from the first SYNC on
+    bench.send(0x80, "", 10 * MS)
+    bench.send(0x80, "", 12 * MS)
+    assert bench.advance(15 * MS - 1) == []
+    assert bench.advance(15 * MS) == [(0x85, "0081110000000000")]
+    assert bench.send(0x80, "", 20 * MS)[0] == (0x85, "0000000000000000")
+
+
+def test_cia301_emcy_47_error_register_follows(bench):
+    assert bench.read(0x1001) == 0
+    bench.node.emcy.report(0x2310)
+    bench.node.emcy.report(0x8130)
+    assert bench.read(0x1001) == 0x13
+    bench.node.emcy.clear(0x8130)
+    assert bench.read(0x1001) == 0x03
+    bench.node.emcy.clear(0x2310)
+    assert bench.read(0x1001) == 0x00
+
+
+@pytest.mark.parametrize(
+    ("code", "register"),
+    [
+        (0x2310, 3),
+        (0x3210, 5),
+        (0x4310, 9),
+        (0x8130, 0x11),
+        (0x8210, 0x11),
+        (0x8611, 0x21),
+        (0x7121, 0x81),
+        (0xFF01, 0x81),
+        (0x5000, 1),
+    ],
+)
+def test_cia301_emcy_register_bits(bench, code, register):
+    bench.node.emcy.report(code, b"\x01\x02")
+    assert bench.advance(0) == [(0x85, code.to_bytes(2, "little").hex() + f"{register:02x}" + "0102000000")]
+
+
+def test_cia301_emcy_42_history(bench):
+    assert (bench.read(0x1003), bench.refusal(0x1003, 1)) == (0, 0x08000024)
+    for code in (0x1000, 0x2310, 0x3210, 0x4310):
+        bench.node.emcy.report(code, b"\x07")
+    assert bench.read(0x1003) == 3  # three entries in this EDS
+    assert [bench.read(0x1003, sub) for sub in (1, 2, 3)] == [0x00074310, 0x00073210, 0x00072310]
+    assert bench.write(0x1003, 0, 1, 1) == 0x06090030
+    assert bench.write(0x1003, 0, 0, 1) == 0
+    assert (bench.read(0x1003), bench.refusal(0x1003, 1)) == (0, 0x08000024)
+
+
+def test_cia301_emcy_43_inhibit_time(bench):
+    bench.write(0x1015, 0, 100, 2)  # 10 ms
+    bench.node.emcy.report(0x1000)
+    bench.node.emcy.report(0x2310)
+    assert bench.advance(0) == [(0x85, "0010010000000000")]
+    assert bench.node.next_deadline_ns == 10 * MS
+    assert bench.advance(10 * MS) == [(0x85, "1023030000000000")]
+
+
+@pytest.mark.parametrize(("value", "code"), [(0x80000085, 0), (0x86, 0x06090030), (0x85, 0), (0x20000085, 0x06090030)])
+def test_cia301_emcy_43_cob_id(bench, value, code):
+    assert bench.write(0x1014, 0, value, 4) == code
+    bench.node.emcy.report(0x1000)
+    assert bench.advance(0) == ([] if value == 0x80000085 else [(0x85, "0010010000000000")])
+
+
+def test_cia301_emcy_is_not_sent_when_stopped_but_remembered(bench):
+    bench.nmt(0x02)
+    bench.node.emcy.report(0x1000)
+    assert bench.advance(0) == []
+    bench.nmt(0x80)
+    assert bench.read(0x1003, 1) == 0x1000
