@@ -12,6 +12,7 @@ import configparser
 import difflib
 import io
 import os
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -70,6 +71,9 @@ def _check_values(path: Path, od: canopen.ObjectDictionary) -> None:
 def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
     """Load an EDS file into canopen's object dictionary for one node.
 
+    Planner, master and emulator each ask for the same file, and parsing costs 60 ms: they get one object. Treat it as
+    read-only; a node's values live elsewhere.
+
     Args:
         name_or_path: a packaged name (see `eds_names`) or the path of any EDS file.
         node_id: 1..127, put in for $NODEID.
@@ -77,11 +81,16 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
     Raises:
         EdsError: missing, unreadable or not an EDS file; names the file and what is wrong in it.
     """
-    from canopen.objectdictionary import eds  # late: the command line's --help must not pay for it
-
     if not 1 <= node_id <= 127:
         raise EdsError(f"EDS {str(name_or_path)!r}: node id {node_id} is not 1..127")
     path = _resolve(name_or_path)
+    return _parse(path, path.stat().st_mtime_ns, node_id)
+
+
+@lru_cache(maxsize=64)
+def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
+    from canopen.objectdictionary import eds  # late: the command line's --help must not pay for it
+
     try:
         text = path.read_text(encoding="utf-8")
         if "[DeviceInfo]" not in text:  # mandatory; canopen would warn through a method that Python 3.13 dropped

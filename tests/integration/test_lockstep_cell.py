@@ -220,15 +220,10 @@ def test_a_missing_node_is_named(name):
 
 def test_a_node_of_another_make_is_named():
     session = session_of("free")
-    original = session._open_lockstep
-
-    def opened():
-        port = original()
-        node(session, 5).dictionary.values[(0x1018, 2)] = 0x999
-        return port
-
-    session._open_lockstep = opened
-    with pytest.raises(NodeError, match=r"node 5: .*product code expected 0x260, got 0x999"), session:
+    nodes = list(session.plan.nodes)
+    nodes[4] = replace(nodes[4], identity=replace(nodes[4].identity, product_code=0x999))
+    session.plan = replace(session.plan, nodes=tuple(nodes))
+    with pytest.raises(NodeError, match=r"node 5: .*product code expected 0x999, got 0x260"), session:
         pass
 
 
