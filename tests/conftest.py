@@ -33,7 +33,6 @@ _CHANNEL = "vcan0"
 _INNER = "CANPROBE_TEST_VCAN_FOLDER"
 _NO_VCAN = 125
 _CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
-_OUTER_KEY = pytest.StashKey["OuterRun"]()
 
 
 @pytest.fixture
@@ -47,8 +46,10 @@ def pytest_configure(config: pytest.Config) -> None:
     if folder := os.environ.get(_INNER):
         config.pluginmanager.register(InnerRun(config, Path(folder)))
     elif not _has_interface():
-        config.stash[_OUTER_KEY] = OuterRun(config)
-        config.pluginmanager.register(config.stash[_OUTER_KEY])
+        if os.environ.get("CANPROBE_INSTALL") == "1":
+            install = [*_CANPROBE, "vcan", "--install", "--", "true"]
+            subprocess.run(install, cwd=config.rootpath, stdin=subprocess.DEVNULL, check=False)
+        config.pluginmanager.register(OuterRun(config))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -150,12 +151,11 @@ class OuterRun:
         nodeids = [item.nodeid for item in items]
         (folder / "items.json").write_text(json.dumps(nodeids))
         (folder / "reports.jsonl").touch()
-        install = ["--install"] if os.environ.get("CANPROBE_INSTALL") == "1" else []
         files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
         options = ["-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
         with (folder / "output").open("wb") as output:
             self._process = subprocess.Popen(
-                [*_CANPROBE, "vcan", *install, "--", sys.executable, "-m", "pytest", *options, *files],
+                [*_CANPROBE, "vcan", "--", sys.executable, "-m", "pytest", *options, *files],
                 cwd=self._config.rootpath,
                 env={**os.environ, _INNER: str(folder)},
                 stdin=subprocess.DEVNULL,

@@ -99,6 +99,7 @@ def test_outcomes_and_texts_come_back(project: Path) -> None:
     status, output = run(project, STAND_IN="runs", CANPROBE_INSTALL="1")
     assert status == 1
     assert counts(output) == {"passed": 5, "failed": 1, "skipped": 1, "xfailed": 1, "error": 1}
+    assert "arguments ['vcan', '--install', '--', 'true']" in output, "CANPROBE_INSTALL=1 installs before anything runs"
     for text in ("assert 'vcan0' == 'vcan1'", "said before", "for its own reason", "RuntimeError: broken fixture"):
         assert text in output
 
