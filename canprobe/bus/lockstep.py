@@ -11,7 +11,7 @@ A deadline that a reception moves to the present is served when the frames alrea
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
@@ -26,7 +26,11 @@ _MAX_LENGTH = 8
 
 
 class Participant(Protocol):
-    """A node that is a pure function of frames and time; what it returns is sent in that order."""
+    """A node that is a pure function of frames and time; what it returns is sent in that order.
+
+    It may have an attribute `listens`, a container that always holds the identifiers it takes at present; the bus then
+    spares it the others.
+    """
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -46,6 +50,10 @@ class Participant(Protocol):
         ...
 
 
+_Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node", Container[int] | None]
+"""How to call a participant, its queue, and the identifiers it listens to (None: all)."""
+
+
 class _Node:
     """The bus's view of one sender: its queue, and where its frames go."""
 
@@ -55,7 +63,7 @@ class _Node:
         self.owner = owner
         self.order = order
         self.outbox: deque[Frame] = deque()
-        self.receivers: tuple[tuple[Callable[[int, bytes, int], Sequence[Frame]], _Node], ...] = ()
+        self.receivers: tuple[_Receiver, ...] = ()
         self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
 
 
@@ -156,7 +164,9 @@ class LockstepBus:
                 raise self._endless(t_ns, what)
             if recorder is not None:
                 recorder(can_id, data, t_ns)
-            for receive, receiver in sender.receivers:
+            for receive, receiver, listens in sender.receivers:
+                if listens is not None and can_id not in listens:
+                    continue
                 answers = receive(can_id, data, t_ns)
                 if answers:
                     self._queue(receiver, answers)
@@ -196,7 +206,11 @@ class LockstepBus:
         """Work out once who hears whom."""
         self._participants = tuple((n, n.owner) for n in self._nodes if not isinstance(n.owner, LockstepPort))
         for node in self._nodes:
-            node.receivers = tuple((owner.receive, other) for other, owner in self._participants if other is not node)
+            node.receivers = tuple(
+                (owner.receive, other, getattr(owner, "listens", None))
+                for other, owner in self._participants
+                if other is not node
+            )
             ports = (other.owner for other in self._nodes if other is not node)
             node.inboxes = tuple(port.inbox.append for port in ports if isinstance(port, LockstepPort))
 

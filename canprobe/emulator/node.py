@@ -11,6 +11,8 @@ Source: CiA 301 (the clauses are cited in the services).
 
 from __future__ import annotations
 
+from collections.abc import Container
+
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.emulator.application import Application
@@ -180,13 +182,18 @@ class SlaveNode:
         if goal is NmtState.STOPPED or (goal is not None and self.core.state is NmtState.OPERATIONAL):
             self._enter(goal, t_ns)
 
+    @property
+    def listens(self) -> Container[int]:
+        """Identifiers that this node takes now; the same object for ever, so that a bus may keep it."""
+        return self._routes
+
     def _reroute(self) -> None:
-        routes: dict[int, Route] = {}
+        routes = self._routes
+        routes.clear()
         if self.core.state is not NmtState.INITIALISING:
             for service in self._services:
                 routes.update(service.routes())
             routes[NMT_ID] = self._nmt
-        self._routes = routes
 
 
 def _sdo_servers(core: NodeCore) -> list[int]:

@@ -26,6 +26,7 @@ class TruthRecorder:
     """A silent participant of the bus that writes down the plant's truth at every SYNC."""
 
     name = "truth recorder"
+    listens = frozenset((SYNC_ID,))
 
     def __init__(self, plant: TruePlant) -> None:
         self._plant = plant
