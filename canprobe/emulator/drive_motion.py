@@ -61,8 +61,8 @@ class Motion:
         return self._start + (self._end - self._start) * max(0, t_ns - self._t0) / (self._t1 - self._t0)
 
     def speed(self, t_ns: int) -> float:
-        """Speed of the reference, counts/s."""
-        moving = self._t0 <= t_ns < self._t1
+        """Speed of the reference, counts/s; a ramp that has just ended still counts, as SYNC comes when it ends."""
+        moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
         return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
 
     def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None]) -> None:

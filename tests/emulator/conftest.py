@@ -18,8 +18,9 @@ from canprobe.emulator.node import SlaveNode
 U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5
 
+Row = tuple[int, int | None, int, str, str, int, str, str]
 # index, sub (None: plain variable), data type, access, default, mappable, low, high
-_ROWS: list[tuple[int, int | None, int, str, str, int, str, str]] = [
+_ROWS: list[Row] = [
     (0x1000, None, U32, "ro", "0x12345678", 0, "", ""),
     (0x1001, None, U8, "ro", "0", 1, "", ""),
     *[(0x1003, sub, U32 if sub else U8, "ro" if sub else "rw", "0", 0, "", "") for sub in range(4)],
@@ -51,8 +52,8 @@ _ROWS: list[tuple[int, int | None, int, str, str, int, str, str]] = [
 ]
 
 
-def _pdo_rows() -> list[tuple[int, int | None, int, str, str, int, str, str]]:
-    rows: list[tuple[int, int | None, int, str, str, int, str, str]] = []
+def _pdo_rows() -> list[Row]:
+    rows: list[Row] = []
     cob_ids = {0x1400: "$NODEID+0x200", 0x1401: "$NODEID+0x80000300", 0x1800: "$NODEID+0x180", 0x1801: "0x80000285"}
     mapped = {0x1600: ["0x20010020", "0x20020010"], 0x1A00: ["0x20010020", "0x20020010"], 0x1A01: ["0x20050040"]}
     for index, cob_id in cob_ids.items():
@@ -69,9 +70,8 @@ def _pdo_rows() -> list[tuple[int, int | None, int, str, str, int, str, str]]:
     return rows
 
 
-def _section(
-    index: int, sub: int | None, data_type: int, access: str, default: str, pdo: int, low: str, high: str
-) -> str:
+def _section(row: Row) -> str:
+    index, sub, data_type, access, default, pdo, low, high = row
     name = f"{index:04X}" if sub is None else f"{index:04X}sub{sub:X}"
     lines = [f"[{name}]", f"ParameterName=object {name}", "ObjectType=0x7", f"DataType=0x{data_type:04X}"]
     lines += [f"AccessType={access}", f"PDOMapping={pdo}"]
@@ -89,7 +89,7 @@ def _eds_text() -> str:
         if row[1] is not None and row[0] not in seen:
             parts.append(f"[{row[0]:04X}]\nParameterName=record {row[0]:04X}\nObjectType=0x9\nSubNumber=2\n")
         seen.add(row[0])
-        parts.append(_section(*row))
+        parts.append(_section(row))
     return "\n".join(parts)
 
 

@@ -1,0 +1,167 @@
+"""Serving nodes on a port, nodes that hear each other, and the truth recorder."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.eds import load_eds
+from canprobe.emulator.drive import make_drive_node
+from canprobe.emulator.serve import Exchange, serve
+from canprobe.emulator.tactile import make_tactile_node
+from canprobe.emulator.truth import TruthRecorder
+from canprobe.errors import BusError
+
+MS = 1_000_000
+CYCLE = 2_500_000
+
+
+class Scripted:
+    """A participant that answers by table and remembers what it heard."""
+
+    def __init__(self, boot, answers=(), deadline=None):
+        self.boot, self.answers, self.heard = boot, dict(answers), []
+        self.next_deadline_ns = deadline
+
+    def start(self, t_ns):
+        return list(self.boot)
+
+    def receive(self, can_id, data, t_ns):
+        self.heard.append(can_id)
+        return self.answers.get(can_id, [])
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return [(0x3, b"")]
+
+
+def test_lowest_identifier_first_fifo_per_node_no_self_reception():
+    a = Scripted([(0x300, b""), (0x100, b"")])
+    b = Scripted([(0x200, b""), (0x400, b"")], {0x300: [(0x250, b"")]})
+    sent = [can_id for can_id, _ in Exchange([a, b]).start(0)]
+    assert sent == [0x200, 0x300, 0x100, 0x400, 0x250]
+    assert a.heard == [0x200, 0x400, 0x250]
+    assert b.heard == [0x300, 0x100]
+
+
+def test_due_nodes_are_advanced_after_the_frames():
+    a, b = Scripted([], {0x80: [(0x181, b"")]}), Scripted([], deadline=10)
+    exchange = Exchange([a, b])
+    assert exchange.next_deadline_ns == 10
+    assert exchange.step([(0x80, b"", 5)], 9) == [(0x181, b"")]
+    assert exchange.step([], 10) == [(0x3, b"")]
+    assert exchange.next_deadline_ns is None
+
+
+def test_nodes_that_answer_each_other_for_ever_are_caught():
+    a, b = Scripted([(1, b"")], {2: [(1, b"")]}), Scripted([], {1: [(2, b"")]})
+    with pytest.raises(BusError, match="without an end"):
+        Exchange([a, b]).start(0)
+
+
+def test_serve_on_a_port_answers_a_master(plant):
+    bus = LockstepBus(VirtualClock(), "test")
+    master, port = bus.port(), bus.port()
+    nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in (1, 2)]
+    turn = itertools.count()
+
+    def stop():
+        number = next(turn)
+        if number == 0:
+            master.send_batch([(0x602, bytes.fromhex("4000100000000000"))])
+        return number == 2
+
+    serve(nodes, port, stop, max_wait_ns=10 * MS)
+    assert [(can_id, data.hex()) for can_id, data, _ in master.drain()] == [
+        (0x701, "00"),
+        (0x702, "00"),
+        (0x582, "4300100092010200"),
+    ]
+
+
+def test_serve_keeps_the_deadlines_of_its_nodes(plant):
+    bus = LockstepBus(VirtualClock(), "test")
+    master, port = bus.port(), bus.port()
+    node = make_drive_node(load_eds("puma260_joint", 1), 1, 0, plant)
+    turn = itertools.count()
+
+    def stop():
+        if next(turn) == 0:
+            master.send_batch([(0x601, bytes.fromhex("2b17100064000000"))])  # heartbeat every 100 ms
+        return bus.clock.now_ns() >= 300 * MS
+
+    serve([node], port, stop, max_wait_ns=1000 * MS)
+    beats = [t_ns for can_id, data, t_ns in master.drain() if (can_id, data) == (0x701, b"\x7f")]
+    assert beats == [0, 100 * MS, 200 * MS, 300 * MS]
+
+
+def test_a_node_hears_the_heartbeat_of_its_neighbour(plant):
+    nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in (1, 2)]
+    exchange = Exchange(nodes)
+    exchange.start(0)
+    exchange.step([(0x601, bytes.fromhex("23161001fa000200"), 0), (0x602, bytes.fromhex("2b17100064000000"), 0)], 0)
+    for k in range(1, 4):
+        exchange.step([], k * 100 * MS)
+    exchange.step([(0x602, bytes.fromhex("2b17100000000000"), 300 * MS)], 300 * MS)
+    assert exchange.step([], 549 * MS) == []
+    assert exchange.step([], 550 * MS) == [(0x81, bytes.fromhex("3081110200000000"))]
+
+
+def test_truth_recorder_columns(plant, tmp_path):
+    recorder = TruthRecorder(plant)
+    assert recorder.arrays()["t_s"].shape == (0,)
+    for k in range(3):
+        assert recorder.receive(0x80, bytes((k + 7,)), k * CYCLE) == []
+        assert recorder.receive(0x181, bytes(8), k * CYCLE + 1) == []
+    recorder.save(tmp_path / "truth.npz")
+    with np.load(tmp_path / "truth.npz") as saved:
+        assert saved["t_s"].tolist() == [0.0, 0.0025, 0.005]
+        assert saved["sync_count"].tolist() == [0, 1, 2]
+        assert saved["sync_counter"].tolist() == [7, 8, 9]
+        assert saved["q"].shape == (3, 6)
+        assert saved["q"][2, 0] == pytest.approx(0.005)
+        assert saved["force"].tolist() == [2.0] * 3
+
+
+def make_world(plant):
+    nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in range(1, 7)]
+    nodes.append(make_tactile_node(load_eds("tactile_array", 16), 16, plant))
+    exchange = Exchange(nodes)
+    exchange.start(0)
+    for node_id in (1, 2, 3, 4, 5, 6, 16):
+        for text in ("2f191000f0000000", "23061000c4090000", "2f60600008000000"):
+            exchange.step([(0x600 + node_id, bytes.fromhex(text), 0)], 0)
+    exchange.step([(0, b"\x01\x00", 0)], 0)
+    return exchange
+
+
+def run_cycle(exchange, k, word=0x0F, target=0):
+    t_ns = k * CYCLE
+    sent = exchange.step([(0x80, bytes(((k - 1) % 240 + 1,)), t_ns)], t_ns)
+    data = word.to_bytes(2, "little") + target.to_bytes(4, "little", signed=True)
+    return sent + exchange.step([(0x200 + i, data, t_ns + 300_000) for i in range(1, 7)], t_ns + 300_000)
+
+
+def test_seven_nodes_at_work(plant):
+    exchange = make_world(plant)
+    for k, word in enumerate((6, 7, 15, 15, 15, 15), start=1):
+        frames = run_cycle(exchange, k, word, 10 * k)
+    drives = [0x181, 0x182, 0x183, 0x184, 0x185, 0x186]
+    assert [can_id for can_id, _ in frames] == [*drives, *range(0x511, 0x51A)]
+    assert [can_id for can_id, _ in run_cycle(exchange, 7)] == drives
+    assert plant.counts == [50.0] * 6
+
+
+@pytest.mark.benchmark
+def test_speed_of_seven_nodes(benchmark, plant):
+    """SYNC + 6 RPDO → 6 TPDO + 9 tactile every second SYNC, plant not counted. Aim: 300 µs a cycle."""
+    exchange = make_world(plant)
+    plant.advance = lambda t_ns: None
+    for k, word in enumerate((6, 7, 15), start=1):
+        run_cycle(exchange, k, word)
+    counter = itertools.count(4)
+    benchmark(lambda: run_cycle(exchange, next(counter)))
