@@ -1,0 +1,1 @@
+"""Pure mathematics of touch: surfaces, contact, the tactile patch and local shape from it."""

@@ -1,0 +1,105 @@
+"""Batch estimates from points and normals: the checked arrays and the `ml` method."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array, checked
+from canprobe.touch.anchor import anchor, solution
+from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.noise import Noise
+from canprobe.touch.nonlinear import fit
+from canprobe.touch.prior import Prior, path_extent
+from canprobe.touch.quadric import design
+
+
+_FLOOR = 20.0
+"""Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
+
+
+class Touches(NamedTuple):
+    """Checked input of a batch fit.
+
+    Attributes:
+        points, normals: (n, 3); the last row is now.
+        noise: of the n samples.
+        extent: length of the path (`path_extent`), m.
+        distance: length along the path, m.
+    """
+
+    points: Array
+    normals: Array
+    noise: Noise
+    extent: float
+    distance: float
+
+
+def make_touches(points: Array, normals: Array, noise: Noise) -> Touches:
+    """Extent and length of arrays that are already checked."""
+    floor = _FLOOR * math.sqrt(float(np.mean(noise.point_variance)))
+    steps = np.diff(points, axis=0)
+    distance = float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
+    return Touches(points, normals, noise, path_extent(points, floor), distance)
+
+
+def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
+    """Points and unit normals (n, 3), n ≥ least.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+    """
+    p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
+    if len(p) < least:
+        raise UsageError(f"points: expected at least {least} samples, got {len(p)}")
+    if len(n) != len(p):
+        raise UsageError(f"normals: expected one per point, shape ({len(p)}, 3), got {n.shape}")
+    size = np.sqrt(np.einsum("ij,ij->i", n, n))
+    worst = int(np.argmax(np.abs(size - 1.0)))
+    if abs(size[worst] - 1.0) > 1e-6:
+        raise UsageError(f"normals: expected unit vectors, got length {size[worst]:.6g} at index {worst}")
+    if float((n @ n[-1]).min()) <= 0.0:
+        raise UsageError("normals: expected all within 90° of the last (one side of a surface), got some beyond")
+    return p, n
+
+
+def working_frame(touches: Touches) -> Array:
+    """T (4, 4) from the frame at the last measured point, z against its measured normal, to the frame of the points."""
+    return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
+
+
+def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
+    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point.
+
+    Args:
+        touches: checked input.
+        prior: None for `Prior.weak` over the extent of the path.
+    """
+    length = touches.extent
+    stated = Prior.weak(length) if prior is None else prior
+    T = working_frame(touches)
+    R = T[:3, :3]
+    d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
+    result = fit(d, stated.rows(length))
+    a = anchor(result.c, T, np.zeros(3), length)
+    singular = np.linalg.svd(result.root, compute_uv=False)
+    notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
+    if result.outliers:
+        notes += (f"{result.outliers} samples with reduced weight",)
+    return build_estimate(
+        solution(a, result.root, result.decision, math.isfinite(stated.sigma_curvature)),
+        length=length,
+        T_frame_contact=a.T_frame_contact,
+        condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf,
+        innovation=result.innovation,
+        distance=touches.distance,
+        samples=float(len(touches.points)),
+        method="ml",
+        prior=stated.name,
+        notes=notes,
+    )

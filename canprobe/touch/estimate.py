@@ -1,0 +1,256 @@
+"""The answer of an estimator: local shape at the last contact, with what is known about it and what is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, read_only
+from canprobe.touch.quadric import matrix_of
+from canprobe.touch.rank import Decision, outside, tensor
+from canprobe.touch.surface import SurfaceMatrix
+
+_ROOT2 = math.sqrt(2.0)
+_TO_Q = np.array([1.0, _ROOT2, 1.0])
+_ENTRY_LIMIT = 0.02
+_DIRECTION_LIMIT = 0.05
+_UMBILIC_CHI2 = 5.99
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class SurfaceEstimate:
+    """Local shape in the estimated contact frame of the last sample (z = inward normal); lengths in m.
+
+    What the data did not observe is NaN in `K`, `kappa`, infinite in `covariance`, and False in `observed`. `S` alone
+    is always finite: it holds unobserved combinations at the value nearest to flat, good for predicting along the
+    path that was travelled and for nothing else.
+
+    Attributes:
+        S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½.
+        T_frame_contact: (4, 4) contact frame to the frame of the points; its origin is on the estimated surface.
+        K: (2, 2) shape operator in the contact frame, 1/m.
+        kappa: (2,) principal curvatures, κ1 ≥ κ2, 1/m. With one observed it stands first, whatever its size, and is the
+            normal curvature along `directions[0]`.
+        directions: (2, 3) rows: unit vectors of `kappa` in the frame of the points.
+        covariance: (3, 3) of (K11, K12, K22), 1/m².
+        observed: (2,) bool, for each of `kappa`.
+        rank: how many independent combinations of (K11, K12, K22) were observed, 0–3 (thresholds: `rank`).
+        combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
+        information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
+        umbilic: κ1 and κ2 cannot be told apart at 95 %: the directions mean nothing.
+        condition_number: of the whitened dimensionless least-squares problem.
+        innovation: mean squared whitened residual per degree of freedom; about 1 when the model and the σ's are right.
+        distance: path that the estimate rests on, m.
+        samples: number of samples it rests on (effective, with forgetting).
+        method: name of the estimator.
+        prior: name of what was assumed.
+        notes: what a reader should know.
+    """
+
+    S: Array
+    T_frame_contact: Array
+    K: Array
+    kappa: Array
+    directions: Array
+    covariance: Array
+    observed: Array
+    rank: int
+    combinations: Array
+    information: Array
+    umbilic: bool
+    condition_number: float
+    innovation: float
+    distance: float
+    samples: float
+    method: str
+    prior: str
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+
+    @property
+    def T_base_contact(self) -> Array:
+        """`T_frame_contact` where the frame of the points is the base, as online."""
+        return self.T_frame_contact
+
+    @property
+    def surface(self) -> SurfaceMatrix:
+        """`S` with its operations."""
+        return SurfaceMatrix(self.S)
+
+    @property
+    def point(self) -> Array:
+        """(3,) the contact point on the estimated surface, m."""
+        return self.T_frame_contact[:3, 3]
+
+    @property
+    def normal(self) -> Array:
+        """(3,) the outward unit normal there."""
+        return -self.T_frame_contact[:3, 2]
+
+    def curvature_tensor_base(self) -> Array:
+        """(3, 3) shape operator as a tensor in the frame of the points, `P K Pᵀ`, 1/m.
+
+        From `S`, so always finite; it says nothing where `observed` is False.
+        """
+        P = self.T_frame_contact[:3, :2]
+        result: Array = P @ (2.0 * self.S[:2, :2]) @ P.T
+        return result
+
+    def predict(self, point: Array) -> tuple[Array, Array]:
+        """Surface point and outward unit normal over (along the contact normal) a place near the contact.
+
+        Args:
+            point: (3,) in the frame of the points.
+
+        Returns:
+            (3,), (3,) in the frame of the points; NaN where the quadric has no point there.
+        """
+        R, origin = self.T_frame_contact[:3, :3], self.T_frame_contact[:3, 3]
+        local = R.T @ (point - origin)
+        surface = self.surface
+        local[2] = float(surface.height(local[0], local[1]))
+        return origin + R @ local, R @ surface.normal(local)
+
+
+class Solution(NamedTuple):
+    """A solved local model, dimensionless, before it becomes an estimate.
+
+    Attributes:
+        c: (9,) in the contact frame (c14 = c24 = c44 = 0).
+        covariance: (3, 3) of (K11, K12, K22); used as it is where all is observed.
+        decision: on the data's information.
+        has_prior: a prior makes every combination finite.
+    """
+
+    c: Array
+    covariance: Array
+    decision: Decision
+    has_prior: bool
+
+
+def build_estimate(
+    solution: Solution,
+    *,
+    length: float,
+    T_frame_contact: Array,
+    condition_number: float,
+    innovation: float,
+    distance: float,
+    samples: float,
+    method: str,
+    prior: str,
+    notes: tuple[str, ...] = (),
+) -> SurfaceEstimate:
+    """An estimate from a solution in units of `length` (m)."""
+    S = matrix_of(solution.c)
+    S[:3, :3] /= length
+    k = 2.0 * S[:2, :2]
+    decision = solution.decision
+    covariance = solution.covariance / length**2
+    T = read_only(T_frame_contact)
+    if decision.rank == 3:
+        kappa, local = _principal(k)
+        observed = np.array([True, True])
+        umbilic = _is_umbilic(k, covariance)
+    else:
+        k, covariance, kappa, local, observed = _partly(k, covariance, decision, solution.has_prior, length)
+        umbilic = False
+    V = decision.vectors
+    return SurfaceEstimate(
+        S=S,
+        T_frame_contact=T,
+        K=k,
+        kappa=kappa,
+        directions=local @ T[:3, :2].T,
+        covariance=covariance,
+        observed=observed,
+        rank=decision.rank,
+        combinations=V[:, decision.passed].T.copy(),
+        information=(V * decision.information) @ V.T * length**2,
+        umbilic=umbilic,
+        condition_number=condition_number,
+        innovation=innovation,
+        distance=distance,
+        samples=samples,
+        method=method,
+        prior=prior,
+        notes=notes,
+    )
+
+
+def _principal(K: Array) -> tuple[Array, Array]:
+    """κ1 ≥ κ2 and their directions as rows (2, 2)."""
+    a, b, d = float(K[0, 0]), float(K[0, 1]), float(K[1, 1])
+    mean, half = 0.5 * (a + d), 0.5 * (a - d)
+    radius = math.hypot(half, b)
+    angle = 0.5 * math.atan2(b, half)
+    c, s = math.cos(angle), math.sin(angle)
+    return np.array([mean + radius, mean - radius]), np.array([[c, s], [-s, c]])
+
+
+def _is_umbilic(K: Array, covariance: Array) -> bool:
+    """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
+    pick = np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0]])
+    x, y = float(K[0, 0] - K[1, 1]), 2.0 * float(K[0, 1])
+    C = pick @ covariance @ pick.T
+    a, b, d = float(C[0, 0]), float(C[0, 1]), float(C[1, 1])
+    determinant = a * d - b * b
+    return determinant > 0.0 and (d * x * x - 2.0 * b * x * y + a * y * y) < _UMBILIC_CHI2 * determinant
+
+
+def _partly(
+    K: Array, covariance: Array, decision: Decision, has_prior: bool, length: float
+) -> tuple[Array, Array, Array, Array, Array]:
+    """K, covariance, kappa, directions and flags where the data left something open."""
+    if has_prior:
+        kappa, local = _principal(K)
+        flags = [outside(decision, _projector(d)) < _DIRECTION_LIMIT for d in local]
+        return K, covariance, kappa, local, np.array(flags)
+    t = _observed_direction(decision)
+    local = np.array([t, [-t[1], t[0]]])
+    seen = decision.rank > 0 and outside(decision, _projector(t)) < _DIRECTION_LIMIT
+    kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
+    hidden = [outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)]
+    K = np.where(np.array([[hidden[0], hidden[1]], [hidden[1], hidden[2]]]), math.nan, K)
+    return K, _partial_covariance(decision, hidden, length), kappa, local, np.array([seen, False])
+
+
+def _partial_covariance(decision: Decision, hidden: list[bool], length: float) -> Array:
+    V = decision.vectors[:, decision.passed]
+    C: Array = (V / decision.information[decision.passed]) @ V.T / np.outer(_TO_Q, _TO_Q) / length**2
+    for i, is_hidden in enumerate(hidden):
+        if is_hidden:
+            C[i, :] = C[:, i] = math.nan
+            C[i, i] = math.inf
+    return C
+
+
+def _projector(t: Array) -> Array:
+    """q of t tᵀ, the normal curvature along the tangent direction t (2,)."""
+    x, y = float(t[0]), float(t[1])
+    return np.array([x * x, _ROOT2 * x * y, y * y])
+
+
+def _observed_direction(decision: Decision) -> Array:
+    """The tangent direction whose normal curvature the data know best.
+
+    With one combination open it is the null direction of that combination; with two, the main direction of the
+    observed one.
+    """
+    if decision.rank == 0:
+        return np.array([1.0, 0.0])
+    open_one = decision.rank == 2
+    wanted = np.logical_not(decision.passed) if open_one else decision.passed
+    q = decision.vectors[:, int(np.argmax(wanted))]
+    values, vectors = np.linalg.eigh(tensor(q))
+    order = np.argsort(np.abs(values))
+    result: Array = vectors[:, order[0 if open_one else 1]]
+    return result if result[np.argmax(np.abs(result))] > 0.0 else -result

@@ -1,0 +1,161 @@
+"""What an online estimator is, and the gate that every sample passes."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array, positive
+from canprobe.touch.batch import Touches, make_touches
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.estimate import SurfaceEstimate
+from canprobe.touch.noise import make_noise
+
+
+@dataclass(slots=True)
+class Dropped:
+    """Samples that were not used, by reason.
+
+    Attributes:
+        not_finite: a NaN or infinite time, place or normal.
+        repeated: the time of the sample before.
+        backwards: a time before that of the sample before.
+        zero_sigma: a standard deviation of 0 or less, or not finite.
+        not_unit: a normal that is not a unit vector.
+    """
+
+    not_finite: int = 0
+    repeated: int = 0
+    backwards: int = 0
+    zero_sigma: int = 0
+    not_unit: int = 0
+
+    @property
+    def total(self) -> int:
+        """All of them."""
+        return self.not_finite + self.repeated + self.backwards + self.zero_sigma + self.not_unit
+
+
+class Estimator(Protocol):
+    """Local shape from a stream of contacts.
+
+    Attributes:
+        dropped: samples that were not used.
+    """
+
+    dropped: Dropped
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the last contact, or None before there is any."""
+
+    def reset(self) -> None:
+        """Forget everything but the settings: contact was lost, or the array was reset."""
+
+
+class Gate:
+    """Lets through what an estimator can use and counts the rest.
+
+    Args:
+        sigma_point: effective standard deviation of a point per axis, m.
+        sigma_normal: of a normal per tangent axis, rad.
+
+    Raises:
+        UsageError: when either is not above 0.
+    """
+
+    def __init__(self, sigma_point: float, sigma_normal: float) -> None:
+        self.sigma_point = positive("sigma_point", sigma_point)
+        self.sigma_normal = positive("sigma_normal", sigma_normal)
+        self._last_t = -math.inf
+
+    def reset(self) -> None:
+        """Accept any time again."""
+        self._last_t = -math.inf
+
+    def passes(self, sample: ContactSample, dropped: Dropped) -> bool:
+        """Whether to use a sample; counts it where not."""
+        p, n, t = sample.p_base, sample.n_base, sample.t_s
+        square = float(n @ n)
+        if not math.isfinite(float(p @ p) + square + t):
+            dropped.not_finite += 1
+        elif abs(square - 1.0) > 1e-6:
+            dropped.not_unit += 1
+        elif not (_usable(sample.sigma_point) and _usable(sample.sigma_normal)):
+            dropped.zero_sigma += 1
+        elif t <= self._last_t:
+            if t == self._last_t:
+                dropped.repeated += 1
+            else:
+                dropped.backwards += 1
+        else:
+            self._last_t = t
+            return True
+        return False
+
+    def sigmas(self, sample: ContactSample) -> tuple[float, float]:
+        """Standard deviations of a sample's point (m) and normal (rad)."""
+        return (
+            self.sigma_point if sample.sigma_point is None else sample.sigma_point,
+            self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal,
+        )
+
+
+def _usable(sigma: float | None) -> bool:
+    return sigma is None or (math.isfinite(sigma) and sigma > 0.0)
+
+
+class WindowEstimator:
+    """Base of the estimators that keep their last samples and solve them as a batch when asked.
+
+    Args:
+        sigma_point, sigma_normal: see `Gate`.
+        window: samples that are kept.
+    """
+
+    least = 2
+    """Fewer samples give no answer."""
+
+    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int) -> None:
+        if window < self.least:
+            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
+        self.dropped = Dropped()
+        self._gate = Gate(sigma_point, sigma_normal)
+        self._samples: deque[ContactSample] = deque(maxlen=window)
+        self._answer: SurfaceEstimate | None = None
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        if self._gate.passes(sample, self.dropped):
+            self._samples.append(sample)
+            self._answer = None
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
+        if self._answer is None and len(self._samples) >= self.least:
+            touches = self._touches()
+            if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
+                self._answer = self._solve(touches)
+        return self._answer
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._samples.clear()
+        self._gate.reset()
+        self._answer = None
+
+    def _solve(self, touches: Touches) -> SurfaceEstimate:
+        raise NotImplementedError
+
+    def _touches(self) -> Touches:
+        points: Array = np.array([s.p_base for s in self._samples])
+        normals: Array = np.array([s.n_base for s in self._samples])
+        sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
+        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1]))

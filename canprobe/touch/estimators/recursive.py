@@ -1,0 +1,189 @@
+"""`recursive`: the nine-parameter model as a square-root information filter; what runs in the 200 Hz loop.
+
+Constant work per sample whatever the memory. Samples are collected until the contact has moved on by a step, then
+taken in together: one QR of the forgotten root, the new whitened rows and what the prior has lost. Forgetting is per
+millimetre travelled, never per second; a contact that does not move adds nothing and forgets nothing. The information
+is carried along from contact frame to contact frame by `S' = Tᵀ S T`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, positive, upper_root
+from canprobe.touch.anchor import anchor, foot, solution
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.estimators.base import Dropped, Gate
+from canprobe.touch.estimators.travel import Spread, Travel
+from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
+from canprobe.touch.nonlinear import CHI2_999
+from canprobe.touch.prior import Prior
+from canprobe.touch.quadric import UNIT, transport
+from canprobe.touch.quadric_row import sample_rows
+from canprobe.touch.rank import decide
+
+DIFFUSE = 1e-2
+"""Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
+STEP = 0.025
+"""Travel between two updates over the memory."""
+ANCHOR = 0.05
+"""Travel between two changes of the working frame over the memory."""
+CROWD = 2.0
+"""Most samples per metre that count in full, over the nominal `window / memory`."""
+FADE = 0.1
+ALARM = 3.0
+
+
+class _Pending(NamedTuple):
+    point: Array
+    normal: Array
+    sigma_point: float
+    sigma_normal: float
+
+
+class RecursiveEstimator:
+    """Square-root information filter over the contact's path.
+
+    Args:
+        sigma_point, sigma_normal: effective noise, m and rad.
+        memory_m: path after which a sample's information has fallen to 1/e, m.
+        window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
+        prior: None for `Prior.weak` over the memory. A prior on curvature itself is not taken here.
+    """
+
+    def __init__(
+        self,
+        *,
+        sigma_point: float,
+        sigma_normal: float,
+        memory_m: float = 0.02,
+        window: int = 160,
+        prior: Prior | None = None,
+    ) -> None:
+        self.dropped = Dropped()
+        self._gate = Gate(sigma_point, sigma_normal)
+        self._memory = positive("memory_m", memory_m)
+        self._crowd = CROWD * positive("window", window) / memory_m
+        self._prior = Prior.weak(memory_m) if prior is None else prior
+        self._prior_rows = self._make_prior_rows()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self._gate.reset()
+        self._last: ContactSample | None = None
+        self._pending: deque[_Pending] = deque(maxlen=16)
+        self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
+        self._spread = Spread()
+        self._T = np.eye(4)
+        self._c = np.zeros(9)
+        self._root = np.zeros((9, 9))
+        self._innovation = 1.0
+        self._faded = 0
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        if not self._gate.passes(sample, self.dropped):
+            return
+        if self._last is None:
+            self._begin(sample)
+        self._last = sample
+        self._pending.append(_Pending(sample.p_base, sample.n_base, *self._gate.sigmas(sample)))
+        moved = self._travel.add(sample.p_base)
+        if moved > 0.0:
+            self._absorb(moved)
+            self._pending.clear()
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the last contact; None before the contact has moved."""
+        if self._last is None or self._spread.weight == 0.0:
+            return None
+        L, R = self._memory, self._T[:3, :3]
+        a = anchor(self._c, self._T, R.T @ (self._last.p_base - self._T[:3, 3]) / L, L)
+        tangent = a.T_frame_contact[:3, :2]
+        spread = tangent.T @ self._spread.covariance @ tangent / self._gate.sigma_point**2
+        size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
+        root = upper_root(np.linalg.solve(a.M.T, self._root.T).T)
+        decision = decide(root[6:, 6:] * UNIT, spread, size)
+        here = a._replace(M=np.eye(9), turn=0.0)
+        singular = np.linalg.svd(self._root, compute_uv=False)
+        return build_estimate(
+            solution(here, root, decision, has_prior=False),
+            length=L,
+            T_frame_contact=a.T_frame_contact,
+            condition_number=float(singular[0] / singular[-1]),
+            innovation=self._innovation,
+            distance=min(self._travel.total, L),
+            samples=self._spread.weight,
+            method="recursive",
+            prior=self._prior.name,
+            notes=(f"memory shortened {self._faded} times",) if self._faded else (),
+        )
+
+    def _make_prior_rows(self) -> Array:
+        A, _ = self._prior.rows(self._memory)
+        rows = DIFFUSE * np.eye(9)
+        rows[3:6] = A[:3]
+        return rows
+
+    def _begin(self, sample: ContactSample) -> None:
+        self._T = homogeneous(tangent_rotation(-sample.n_base), sample.p_base)
+        self._root = self._prior_rows.copy()
+
+    def _absorb(self, moved: float) -> None:
+        kept = math.exp(-moved / self._memory)
+        root = math.sqrt(kept) * self._root
+        block = self._rows_of_pending()
+        weight, self._innovation = self._judge(block, root)
+        crowd = min(1.0, self._crowd * moved / len(self._pending))
+        self._spread.fade(kept)
+        self._spread.add(np.array([s.point for s in self._pending]), crowd)
+        block *= np.sqrt(crowd * weight).repeat(3)[:, None]
+        lost = math.sqrt(1.0 - kept) * self._prior_rows
+        stacked = np.empty((18 + len(block), 10))
+        stacked[:9, :9], stacked[:9, 9] = root, 0.0
+        stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self._c)
+        stacked[18:] = block
+        full = upper_root(stacked)
+        self._root = full[:9, :9]
+        self._c = self._c + np.linalg.solve(self._root, full[:9, 9])
+        self._move_frame()
+
+    def _rows_of_pending(self) -> Array:
+        """(3n, 10): whitened Jacobian and minus residual."""
+        R, origin, L = self._T[:3, :3], self._T[:3, 3], self._memory
+        c = self._c.tolist()
+        block = []
+        for s in self._pending:
+            x = (s.point - origin) @ R / L
+            n = s.normal @ R
+            block += sample_rows(c, x.tolist(), n.tolist(), (s.sigma_point / L) ** 2, s.sigma_normal**2)
+        return np.array(block)
+
+    def _judge(self, block: Array, root: Array) -> tuple[Array, float]:
+        """Weights (n,) by Huber's rule on the innovations, and their running mean square per degree of freedom."""
+        spread = np.linalg.solve(root.T, block[:, :9].T)
+        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", spread, spread))
+        d2 = square.reshape(-1, 3).sum(axis=1)
+        weight = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
+        mean = float(np.minimum(d2, CHI2_999).mean()) / 3.0
+        share = min(1.0, 0.05 * len(d2))
+        return weight, self._innovation + share * (mean - self._innovation)
+
+    def _move_frame(self) -> None:
+        assert self._last is not None
+        L, R, origin = self._memory, self._T[:3, :3], self._T[:3, 3]
+        x = R.T @ (self._last.p_base - origin) / L
+        if float(x @ x) < ANCHOR**2:
+            return
+        x, z = foot(self._c, x)
+        turned = transported_rotation(np.eye(3), z)
+        self._c, M = transport(self._c, homogeneous(turned, x))
+        self._c[:3] = 0.0
+        self._root = np.linalg.solve(M.T, self._root.T).T
+        self._T = homogeneous(R @ turned, origin + R @ (L * x))

@@ -1,0 +1,83 @@
+"""How far a contact has moved, told apart from its noise, and how its places spread."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from canprobe.touch._arrays import Array
+
+_MEAN_OF = 8
+
+
+class Travel:
+    """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
+
+    A point that stands still never makes a step, however long it stands.
+
+    Args:
+        step: least distance that counts, m; some standard deviations of the point.
+
+    Attributes:
+        total: path so far, m.
+    """
+
+    def __init__(self, step: float) -> None:
+        self.total = 0.0
+        self._step2 = step * step
+        self._mean: Array | None = None
+        self._mark = np.zeros(3)
+        self._count = 0
+
+    def add(self, point: Array) -> float:
+        """Take a point (3,), m; the length of the step that it completes, or 0."""
+        if self._mean is None:
+            self._mean, self._mark = point.copy(), point.copy()
+        self._count = min(self._count + 1, _MEAN_OF)
+        self._mean = self._mean + (point - self._mean) / self._count
+        if self._count < _MEAN_OF:
+            self._mark = self._mean
+            return 0.0
+        offset = self._mean - self._mark
+        square = float(offset @ offset)
+        if square < self._step2:
+            return 0.0
+        self._mark = self._mean
+        length = math.sqrt(square)
+        self.total += length
+        return length
+
+
+class Spread:
+    """Weighted covariance of points, with forgetting.
+
+    Attributes:
+        weight: sum of weights.
+    """
+
+    def __init__(self) -> None:
+        self.weight = 0.0
+        self._mean = np.zeros(3)
+        self._sum = np.zeros((3, 3))
+
+    @property
+    def covariance(self) -> Array:
+        """(3, 3), m²."""
+        return self._sum / max(self.weight, 1e-300)
+
+    def fade(self, kept: float) -> None:
+        """Weigh everything so far by a factor."""
+        self.weight *= kept
+        self._sum = self._sum * kept
+
+    def add(self, points: Array, weight: float) -> None:
+        """Take points (n, 3) with one weight each."""
+        added = weight * len(points)
+        mean = points.mean(axis=0)
+        inner = points - mean
+        offset = mean - self._mean
+        total = self.weight + added
+        self._sum = self._sum + weight * (inner.T @ inner) + np.outer(offset, offset) * (self.weight * added / total)
+        self._mean = self._mean + offset * (added / total)
+        self.weight = total

@@ -1,0 +1,104 @@
+"""`fit_surface`: local shape from points and normals of one stretch of contact."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array
+from canprobe.touch.batch import Touches, checked_arrays, fit_ml, make_touches
+from canprobe.touch.chen import solve_paper, usable_lag
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.differences import chord_pairs, lag_pairs, solve_pairs
+from canprobe.touch.estimate import SurfaceEstimate
+from canprobe.touch.estimators import unknown_method
+from canprobe.touch.estimators.recursive import RecursiveEstimator
+from canprobe.touch.noise import make_noise
+from canprobe.touch.prior import Prior
+
+
+def fit_surface(
+    points: ArrayLike,
+    normals: ArrayLike,
+    *,
+    sigma_point: ArrayLike,
+    sigma_normal: ArrayLike,
+    method: str = "ml",
+    prior: Prior | None = None,
+    lag: int = 10,
+) -> SurfaceEstimate:
+    """Local shape at the last of a series of contact points.
+
+    Lengths may be in any unit as long as it is one: the answer scales with it.
+
+    Args:
+        points: (n, 3) contact points on the object in one frame, in the order of time; the last row is now.
+        normals: (n, 3) outward unit normals of the object there.
+        sigma_point: standard deviation of a point per axis: a number, (n,), or covariances (3, 3) or (n, 3, 3).
+        sigma_normal: the same of a normal, rad (of a covariance only the tangential part counts).
+        method: "ml" (reaches the Cramér–Rao bound), "recursive" (the online filter run over the points, its memory the
+            length of the path), "chord", or "chen1996". The last has no robot here: its rates are differences of
+            points and normals `lag` apart, (16) with the object at rest.
+        prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
+        lag: for "chen1996".
+
+    Returns:
+        The estimate; what the points did not observe is marked, not guessed.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+
+    Example:
+        >>> import numpy as np
+        >>> from canprobe.touch.fit import fit_surface
+        >>> a = np.linspace(-0.2, 0.0, 40)
+        >>> n = np.stack([np.sin(a), 0.3 * np.sin(20 * a), -np.cos(a)], axis=1)
+        >>> n /= np.linalg.norm(n, axis=1, keepdims=True)
+        >>> estimate = fit_surface(0.05 * n, n, sigma_point=2e-5, sigma_normal=1e-3)
+        >>> estimate.kappa.round(1).tolist()
+        [20.0, 20.0]
+    """
+    p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal))
+    if method == "ml":
+        return fit_ml(touches, prior)
+    if method == "recursive":
+        return _run_filter(touches, prior)
+    if method == "chord":
+        return solve_pairs(touches, chord_pairs(touches), "chord")
+    if method == "chen1996":
+        if lag < 1:
+            raise UsageError(f"lag: expected at least 1 sample, got {lag}")
+        return solve_paper(touches, lag_pairs(touches, usable_lag(len(p), lag)))
+    raise unknown_method(method)
+
+
+def _run_filter(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
+    point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
+    memory = max(touches.distance, touches.extent)
+    estimator = RecursiveEstimator(
+        sigma_point=math.sqrt(float(np.mean(point**2))),
+        sigma_normal=math.sqrt(float(np.mean(normal**2))),
+        memory_m=memory,
+        window=len(point),
+        prior=prior,
+    )
+    for sample in _samples(touches, point, normal):
+        estimator.add(sample)
+    answer = estimator.estimate()
+    if answer is None:
+        raise UsageError(
+            f"points: expected a path that moves beyond its noise for method 'recursive', got {touches.distance:.3g} long"
+        )
+    return answer
+
+
+def _samples(touches: Touches, point: Array, normal: Array) -> list[ContactSample]:
+    nowhere = np.eye(4)
+    return [
+        ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i]))
+        for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True))
+    ]

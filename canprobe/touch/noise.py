@@ -1,0 +1,88 @@
+"""Standard deviations of measured points and normals: scalar, per sample, or covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Noise:
+    """Noise of n samples.
+
+    Attributes:
+        point: (n,) standard deviation per axis, m, or (n, 3, 3) covariances, m².
+        normal: (n,) standard deviation per tangent axis, rad, or (n, 3, 3) covariances.
+    """
+
+    point: Array
+    normal: Array
+
+    @property
+    def isotropic(self) -> bool:
+        """Both are plain standard deviations."""
+        return self.point.ndim == 1 and self.normal.ndim == 1
+
+    @property
+    def point_variance(self) -> Array:
+        """(n,) variance per axis, the mean one where axes differ, m²."""
+        return _mean_variance(self.point)
+
+    @property
+    def normal_variance(self) -> Array:
+        """(n,) variance per axis, the mean one where axes differ, rad²."""
+        return _mean_variance(self.normal)
+
+    def scaled(self, length: float, R: Array) -> Noise:
+        """The same noise in units of a length and in the frame whose axes are the columns of R (3, 3)."""
+        point = self.point / length if self.point.ndim == 1 else R.T @ self.point @ R / length**2
+        normal = self.normal if self.normal.ndim == 1 else R.T @ self.normal @ R
+        return Noise(point, normal)
+
+    def covariances(self) -> tuple[Array, Array]:
+        """Both as (n, 3, 3)."""
+        return _as_covariance(self.point), _as_covariance(self.normal)
+
+
+def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike) -> Noise:
+    """Checked noise of n samples.
+
+    Args:
+        n: samples.
+        sigma_point: m; a number, (n,), or covariances (3, 3) or (n, 3, 3) in m².
+        sigma_normal: rad; in the same forms.
+
+    Raises:
+        UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
+    """
+    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal))
+
+
+def _one(n: int, name: str, value: ArrayLike) -> Array:
+    sigma = np.asarray(value, dtype=np.float64)
+    wanted = f"{name}: expected a number above 0, ({n},) of them, or definite covariances (3, 3) or ({n}, 3, 3)"
+    if not np.isfinite(sigma).all():
+        raise UsageError(f"{wanted}, got a value that is not finite")
+    if sigma.shape in ((), (n,)):
+        if not (sigma > 0.0).all():
+            raise UsageError(f"{wanted}, got {sigma.min()}")
+        return np.ascontiguousarray(np.broadcast_to(sigma, (n,)))
+    if sigma.shape in ((3, 3), (n, 3, 3)):
+        if not (np.linalg.eigvalsh(sigma) > 0.0).all() or np.abs(sigma - sigma.mT).max() > 1e-9 * np.abs(sigma).max():
+            raise UsageError(f"{wanted}, got one that is not symmetric and definite")
+        return np.ascontiguousarray(np.broadcast_to(sigma, (n, 3, 3)))
+    raise UsageError(f"{wanted}, got shape {sigma.shape}")
+
+
+def _mean_variance(sigma: Array) -> Array:
+    result: Array = sigma**2 if sigma.ndim == 1 else np.trace(sigma, axis1=1, axis2=2) / 3.0
+    return result
+
+
+def _as_covariance(sigma: Array) -> Array:
+    return sigma if sigma.ndim == 3 else (sigma**2)[:, None, None] * np.eye(3)

@@ -1,0 +1,280 @@
+"""The contact patch in a tactile image: force, centroid and second moments, with what makes them doubtful.
+
+Row i of an image lies at v = (i − 7.5)·pitch, column j at u = (j − 7.5)·pitch; (u, v) are azimuthal-equidistant on the
+sphere, so a taxel's true area is `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R_p.
+
+This is the *inverse* of a sensor, kept apart from any model that makes images: its constants are calibrated ones.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array, checked, positive, read_only
+
+SIDE = 16
+"""Rows and columns of the array."""
+
+Window = tuple[int, int, int, int]
+"""First row, first column, rows, columns."""
+
+_TOO_FEW = 4
+_FULL: Window = (0, 0, SIDE, SIDE)
+
+
+class FeaturesLike(Protocol):
+    """Moments as a sensor node computes them: newtons, taxel units (row, column), counts."""
+
+    @property
+    def force_n(self) -> float: ...
+    @property
+    def row(self) -> float: ...
+    @property
+    def col(self) -> float: ...
+    @property
+    def var_rr(self) -> float: ...
+    @property
+    def var_rc(self) -> float: ...
+    @property
+    def var_cc(self) -> float: ...
+    @property
+    def peak(self) -> float: ...
+
+
+class Patch(NamedTuple):
+    """What one image says about the contact.
+
+    Attributes:
+        force: N, corrected by the calibration.
+        u, v: centroid of pressure on the pad, m; NaN without contact.
+        var_uu, var_uv, var_vv: second central moments, m², blur and taxel size taken off; NaN without contact.
+        n_active: taxels at or above the threshold; −1 where only features were sent.
+        peak_pa: highest taxel pressure, Pa.
+        saturated: a taxel is at its largest count.
+        cut_by_window: the patch reaches an edge of the window inside the pad.
+        cut_by_pad: the patch reaches the pad's edge.
+        too_few: fewer than four active taxels: no moments to speak of.
+    """
+
+    force: float
+    u: float
+    v: float
+    var_uu: float
+    var_uv: float
+    var_vv: float
+    n_active: int
+    peak_pa: float
+    saturated: bool
+    cut_by_window: bool
+    cut_by_pad: bool
+    too_few: bool
+
+    @property
+    def good(self) -> bool:
+        """Nothing makes the centroid doubtful."""
+        return not (self.saturated or self.cut_by_window or self.cut_by_pad or self.too_few)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchCalibration:
+    """From counts to pascals and from the pressure sum to force.
+
+    Pressure of a taxel is `full_scale_pa · (counts/counts_max) ** exponent`; force is
+    `force_gain · S + edge_gain · √(S · 1 N)` with S the sum of pressure times area: the second term stands for what
+    the patch loses at its rim under the threshold, `calibrate_force` fits both.
+
+    Attributes:
+        full_scale_pa: pressure at the largest count.
+        exponent: of the taxel's characteristic; 1 is linear.
+        threshold_counts: smaller counts are taken as 0.
+        counts_max: largest count.
+        pitch_m: distance of taxels.
+        radius_m: R_p of the probe that the array is wrapped on.
+        force_gain, edge_gain: see above; edge_gain in √N.
+        blur_var_m2: variance of the cover's blur per axis, m², taken off the moments together with pitch²/12.
+        bias: residual standard deviation of the force fit, N; 0 when it was never fitted.
+    """
+
+    full_scale_pa: float = 100e3
+    exponent: float = 1.0
+    threshold_counts: int = 5
+    counts_max: int = 255
+    pitch_m: float = 1.5875e-3
+    radius_m: float = 0.040
+    force_gain: float = 1.0
+    edge_gain: float = 0.0
+    blur_var_m2: float = 0.0
+    bias: float = 0.0
+    pascals: Array = field(init=False, repr=False)
+    weights: Array = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        for name in ("full_scale_pa", "exponent", "counts_max", "pitch_m", "radius_m", "force_gain"):
+            positive(name, getattr(self, name))
+        counts = np.arange(256.0)
+        pascals = self.full_scale_pa * (counts / self.counts_max) ** self.exponent
+        pascals[counts < self.threshold_counts] = 0.0
+        object.__setattr__(self, "pascals", read_only(pascals))
+        object.__setattr__(self, "weights", read_only(_moment_weights(self.pitch_m, self.radius_m)))
+
+
+def _moment_weights(pitch: float, radius: float) -> Array:
+    """(256, 6): columns area × (1, u, v, uu, uv, vv), lengths in pitches but the area in m²."""
+    k = np.arange(SIDE) - (SIDE - 1) / 2
+    v, u = np.meshgrid(k, k, indexing="ij")
+    angle = np.hypot(u, v) * pitch / radius
+    area = pitch**2 * np.sinc(angle / np.pi)
+    return np.stack([area * m for m in (np.ones_like(u), u, v, u * u, u * v, v * v)], axis=-1).reshape(-1, 6)
+
+
+def compute_patch(
+    taxels: NDArray[np.uint8], calibration: PatchCalibration, window: Sequence[int] | None = None
+) -> Patch:
+    """Patch of an image.
+
+    Args:
+        taxels: (16, 16) uint8 counts in pad coordinates, zeros outside the window.
+        calibration: of the array.
+        window: first row, first column, rows, columns that were sent; None for the whole pad.
+
+    Returns:
+        The patch; without an active taxel force 0 and NaN moments.
+
+    Raises:
+        UsageError: when the image is not (16, 16) uint8.
+    """
+    if taxels.shape != (SIDE, SIDE) or taxels.dtype != np.uint8:
+        raise UsageError(f"taxels: expected (16, 16) uint8, got {taxels.shape} {taxels.dtype}")
+    pressure = calibration.pascals[taxels]
+    moments = (pressure.reshape(-1) @ calibration.weights).tolist()
+    active = pressure > 0.0
+    n_active = int(np.count_nonzero(active))
+    peak = int(taxels.max())
+    cut_by_pad, cut_by_window = _cuts(active, window) if n_active else (False, False)
+    return _patch(
+        moments,
+        calibration,
+        n_active=n_active,
+        peak_pa=float(calibration.pascals[peak]),
+        saturated=peak >= calibration.counts_max,
+        cut_by_window=cut_by_window,
+        cut_by_pad=cut_by_pad,
+    )
+
+
+def _patch(
+    moments: list[float],
+    calibration: PatchCalibration,
+    *,
+    n_active: int,
+    peak_pa: float,
+    saturated: bool,
+    cut_by_window: bool,
+    cut_by_pad: bool,
+) -> Patch:
+    total = moments[0]
+    if n_active == 0 or total <= 0.0:
+        nan = math.nan
+        return Patch(0.0, nan, nan, nan, nan, nan, n_active, peak_pa, False, False, False, True)
+    pitch = calibration.pitch_m
+    u, v = moments[1] / total, moments[2] / total
+    square, off = pitch * pitch, pitch * pitch / 12.0 + calibration.blur_var_m2
+    return Patch(
+        force=calibration.force_gain * total + calibration.edge_gain * math.sqrt(total),
+        u=u * pitch,
+        v=v * pitch,
+        var_uu=(moments[3] / total - u * u) * square - off,
+        var_uv=(moments[4] / total - u * v) * square,
+        var_vv=(moments[5] / total - v * v) * square - off,
+        n_active=n_active,
+        peak_pa=peak_pa,
+        saturated=saturated,
+        cut_by_window=cut_by_window,
+        cut_by_pad=cut_by_pad,
+        too_few=n_active < _TOO_FEW,
+    )
+
+
+def _cuts(active: NDArray[np.bool_], window: Sequence[int] | None) -> tuple[bool, bool]:
+    """Whether active taxels touch the pad's edge, and an edge of the window inside the pad."""
+    rows, cols = np.any(active, axis=1), np.any(active, axis=0)
+    cut_by_pad = bool(rows[0] or rows[-1] or cols[0] or cols[-1])
+    if window is None:
+        return cut_by_pad, False
+    r0, c0, n_rows, n_cols = window
+    r1, c1 = r0 + n_rows - 1, c0 + n_cols - 1
+    inside = ((r0 > 0, rows, r0), (r1 < SIDE - 1, rows, r1), (c0 > 0, cols, c0), (c1 < SIDE - 1, cols, c1))
+    return cut_by_pad, any(bool(line[k]) for is_inside, line, k in inside if is_inside)
+
+
+def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
+    """Patch from moments that the sensor node computed itself.
+
+    The node's force is its plain sum of pressure times area; the calibration's gains are applied here. Cuts cannot be
+    seen; `cut_by_pad` is set where two standard deviations reach past the pad.
+
+    Args:
+        features: force in N, row and column in taxels, variances in taxels², peak in counts.
+        calibration: of the array.
+    """
+    row, col = features.row - (SIDE - 1) / 2, features.col - (SIDE - 1) / 2
+    total = max(features.force_n, 0.0)
+    reach = SIDE / 2
+    cut_by_pad = (
+        abs(row) + 2.0 * math.sqrt(max(features.var_rr, 0.0)) > reach
+        or abs(col) + 2.0 * math.sqrt(max(features.var_cc, 0.0)) > reach
+    )
+    moments = [1.0, col, row, features.var_cc + col * col, features.var_rc + row * col, features.var_rr + row * row]
+    peak = min(max(int(features.peak), 0), 255)
+    return _patch(
+        [total * m for m in moments],
+        calibration,
+        n_active=-1 if total > 0.0 else 0,
+        peak_pa=float(calibration.pascals[peak]),
+        saturated=peak >= calibration.counts_max,
+        cut_by_window=False,
+        cut_by_pad=cut_by_pad,
+    )._replace(too_few=total <= 0.0)
+
+
+def calibrate_force(
+    sums: ArrayLike, forces: ArrayLike, calibration: PatchCalibration | None = None
+) -> PatchCalibration:
+    """Fit `F = force_gain · S + edge_gain · √(S · 1 N)` to recorded presses, in relative error.
+
+    Args:
+        sums: (n,) plain sums S = Σ pressure · area, N: `compute_patch(...).force` with gains 1 and 0.
+        forces: (n,) true forces, N, all above 0.
+        calibration: whose other constants to keep; None for the default.
+
+    Returns:
+        A calibration with both gains and the residual `bias` (RMS, N).
+
+    Raises:
+        UsageError: on fewer than three presses, or sums or forces not above 0.
+    """
+    s, f = checked("sums", sums, (None,)), checked("forces", forces, (None,))
+    if len(s) < 3 or len(s) != len(f) or min(s.min(), f.min()) <= 0.0:
+        raise UsageError(f"sums, forces: expected at least 3 pairs above 0, got {len(s)} and {len(f)}")
+    basis = np.stack([s, np.sqrt(s)], axis=1)
+    gains, *_ = np.linalg.lstsq(basis / f[:, None], np.ones_like(f), rcond=None)
+    base = calibration if calibration is not None else PatchCalibration()
+    return PatchCalibration(
+        full_scale_pa=base.full_scale_pa,
+        exponent=base.exponent,
+        threshold_counts=base.threshold_counts,
+        counts_max=base.counts_max,
+        pitch_m=base.pitch_m,
+        radius_m=base.radius_m,
+        force_gain=float(gains[0]),
+        edge_gain=float(gains[1]),
+        blur_var_m2=base.blur_var_m2,
+        bias=float(np.sqrt(np.mean((basis @ gains - f) ** 2))),
+    )

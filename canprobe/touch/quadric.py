@@ -1,0 +1,216 @@
+"""The nine-parameter local model: a quadric near the origin of a working frame, with c34 = −½.
+
+Parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
+`c11, c12, c22`, the half of K, last, so that the trailing 3x3 block of an upper triangular information root is the
+information about K with all else unknown. Lengths are in units of some length L: a dimensionless problem.
+
+Residual rows of a sample (x, n): `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`, whitened by σ_p² and
+`σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array
+from canprobe.touch.noise import Noise
+
+UNIT = np.array([0.5, 0.5 / np.sqrt(2.0), 0.5])
+"""c11, c12, c22 per unit of q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
+
+_INDEX = ((0, 3), (1, 3), (3, 3), (0, 2), (1, 2), (2, 2), (0, 0), (0, 1), (1, 1))
+BASIS = np.zeros((9, 4, 4))
+"""(9, 4, 4): S = BASISᵀ c + constant."""
+for _k, (_i, _j) in enumerate(_INDEX):
+    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
+_FLAT = BASIS.reshape(9, 16)
+_PICK = np.array([4 * i + j for i, j in _INDEX])
+_CONSTANT = np.zeros((4, 4))
+_CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
+
+
+class Rows(NamedTuple):
+    """Whitened residuals (n, 3) and their Jacobian (n, 3, 9) at some parameters."""
+
+    r: Array
+    J: Array
+
+
+class Design(NamedTuple):
+    """What does not change from one iteration to the next.
+
+    Attributes:
+        X: (n, 3) points in the working frame.
+        T: (n, 2, 3) tangent axes of the measured normals.
+        noise: of the samples.
+        point_variance, normal_variance: (n,) the noise per axis.
+    """
+
+    X: Array
+    T: Array
+    noise: Noise
+    point_variance: Array
+    normal_variance: Array
+
+
+def matrix_of(c: Array) -> Array:
+    """S (4, 4) of parameters (9,)."""
+    return (c @ _FLAT).reshape(4, 4) + _CONSTANT
+
+
+def parameters_of(S: Array) -> Array:
+    """Parameters (9,) of S (4, 4), scaled to c34 = −½."""
+    result: Array = S.reshape(16)[_PICK] * (-0.5 / S[2, 3])
+    return result
+
+
+def design(points: Array, normals: Array, noise: Noise) -> Design:
+    """Constant parts for points and outward normals (n, 3) in the working frame."""
+    return Design(points, tangents(normals), noise, noise.point_variance, noise.normal_variance)
+
+
+def value_rows(X: Array) -> Array:
+    """df/dc (n, 9) at points (n, 3)."""
+    x, y, z = X.T
+    F = np.empty((len(X), 9))
+    F[:, 0], F[:, 1], F[:, 2] = 2 * x, 2 * y, 1.0
+    F[:, 3], F[:, 4], F[:, 5] = 2 * x * z, 2 * y * z, z * z
+    F[:, 6], F[:, 7], F[:, 8] = x * x, 2 * x * y, y * y
+    return F
+
+
+def gradient_rows(X: Array, V: Array) -> Array:
+    """d(V ∇f)/dc (n, k, 9) at points (n, 3) for vectors (n, k, 3)."""
+    x, y, z = (2.0 * X.T)[:, :, None]
+    vx, vy, vz = V[:, :, 0], V[:, :, 1], V[:, :, 2]
+    G = np.empty((*vx.shape, 9))
+    G[:, :, 0], G[:, :, 1], G[:, :, 2] = 2.0 * vx, 2.0 * vy, 0.0
+    G[:, :, 3], G[:, :, 4], G[:, :, 5] = z * vx + x * vz, z * vy + y * vz, z * vz
+    G[:, :, 6], G[:, :, 7], G[:, :, 8] = x * vx, y * vx + x * vy, y * vy
+    return G
+
+
+def tangents(normals: Array) -> Array:
+    """Two tangent axes (n, 2, 3) of unit normals (n, 3) that lie near the z axis, either way."""
+    T = np.empty((len(normals), 2, 3))
+    nx, ny, nz = normals.T
+    size = np.sqrt(nz * nz + nx * nx)
+    flat = size < 1e-6  # normal along y: cannot be in a sane working frame, but must not divide by zero
+    if flat.any():
+        nz, size = np.where(flat, 1.0, nz), np.where(flat, 1.0, size)
+    T[:, 0, 0], T[:, 0, 1], T[:, 0, 2] = nz / size, 0.0, -nx / size
+    T[:, 1, 0], T[:, 1, 1], T[:, 1, 2] = -ny * nx / size, size, -ny * nz / size
+    return T
+
+
+def linear_rows(d: Design) -> tuple[Array, Array]:
+    """Whitened linear equations (3n, 9), (3n,): f = 0 and t·∇f = 0, as if |∇f| were 1 everywhere.
+
+    The second multiplies the normals' noise into the regressor and shrinks K by some percent: a start, no answer.
+    """
+    w_p, w_n = 1.0 / np.sqrt(d.point_variance), 1.0 / np.sqrt(d.normal_variance)
+    A = np.empty((len(d.X), 3, 9))
+    A[:, 0] = value_rows(d.X) * w_p[:, None]
+    A[:, 1:] = gradient_rows(d.X, d.T) * w_n[:, None, None]
+    b = np.stack([d.X[:, 2] * w_p, d.T[:, 0, 2] * w_n, d.T[:, 1, 2] * w_n], axis=1)
+    return A.reshape(-1, 9), b.reshape(-1)
+
+
+def rows(c: Array, d: Design) -> Rows:
+    """Whitened residuals and Jacobian at parameters (9,).
+
+    The model's normal is compared at the foot of the measured point, and the Jacobian is taken where the sample most
+    likely was (foot moved by the part of the residual that the point's tangential noise explains). At the measured
+    point itself its noise would enter the regressors together with the residuals, which draws K towards 0.
+    """
+    S = matrix_of(c)
+    B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
+    g = d.X @ B + h
+    square = np.einsum("ij,ij->i", g, g)
+    f = 0.5 * np.einsum("ij,ij->i", d.X, g + h) + S[3, 3]
+    X = d.X - g * (f / square)[:, None]
+    r = np.empty((len(X), 3))
+    r[:, 0] = f / np.sqrt(square)
+    g = X @ B + h
+    inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
+    V = np.empty((len(X), 3, 3))
+    V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
+    r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
+    bend = (V @ B) @ d.T.mT * inverse[:, None, None]
+    W = _whitener(bend[:, 1:], V[:, 0], d)
+    r = (W @ r[:, :, None])[:, :, 0]
+    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], bend[:, 1:], V[:, 0])
+    g = X @ B + h
+    inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
+    V[:, 0] = g * inverse[:, None]
+    J = gradient_rows(X, V)
+    J[:, 1:] -= (d.T @ V[:, 0, :, None]) * J[:, :1]
+    J[:, 0] = value_rows(X)
+    J *= inverse[:, None, None]
+    J[:, 1:] -= bend[:, 0, :, None] * J[:, :1]  # the foot moves with the model
+    return Rows(r, W @ J)
+
+
+def _whitener(K: Array, ghat: Array, d: Design) -> Array:
+    """Lower triangular W (n, 3, 3) with Wᵀ W the inverse covariance of the residuals."""
+    W = np.zeros((len(K), 3, 3))
+    if not d.noise.isotropic:
+        point, normal = d.noise.covariances()
+        A = np.concatenate([ghat[:, None], K @ d.T], axis=1)
+        C = A @ point @ A.mT
+        C[:, 1:, 1:] += d.T @ normal @ d.T.mT
+        return np.linalg.solve(np.linalg.cholesky(C), np.broadcast_to(np.eye(3), C.shape))
+    vp, vn = d.point_variance, d.normal_variance
+    k11, k12, k22 = K[:, 0, 0], K[:, 0, 1], K[:, 1, 1]
+    l11 = np.sqrt(vn + vp * (k11 * k11 + k12 * k12))
+    l21 = vp * k12 * (k11 + k22) / l11
+    l22 = np.sqrt(vn + vp * (k12 * k12 + k22 * k22) - l21 * l21)
+    W[:, 0, 0], W[:, 1, 1], W[:, 2, 2] = 1.0 / np.sqrt(vp), 1.0 / l11, 1.0 / l22
+    W[:, 2, 1] = -l21 / (l11 * l22)
+    return W
+
+
+def _likely_places(d: Design, foot: Array, score: Array, K: Array, ghat: Array) -> Array:
+    """Most likely true places (n, 3), given residuals times their inverse covariance (n, 3)."""
+    if d.noise.isotropic:
+        tangential = (score[:, None, 1:] @ K @ d.T)[:, 0]
+        return foot - d.point_variance[:, None] * tangential
+    A = np.concatenate([ghat[:, None], K @ d.T], axis=1)
+    result: Array = d.X - ((score[:, None] @ A) @ d.noise.covariances()[0])[:, 0]
+    return result
+
+
+def transport(c: Array, T: Array) -> tuple[Array, Array]:
+    """The same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc.
+
+    Args:
+        c: (9,).
+        T: (4, 4) takes new coordinates to old, lengths in the problem's unit.
+
+    Returns:
+        c' (9,) and M (9, 9).
+    """
+    S = T.T @ matrix_of(c) @ T
+    scale = -0.5 / S[2, 3]
+    moved = (T.T @ BASIS @ T).reshape(9, 16)
+    c_new: Array = S.reshape(16)[_PICK] * scale
+    M: Array = scale * (moved[:, _PICK].T + np.outer(2.0 * c_new, moved[:, 11]))
+    return c_new, M
+
+
+def curvature_jacobian(c: Array) -> Array:
+    """d(K11, K12, K22)/dc (3, 9) in the *estimated* contact frame, where c14 = c24 = c44 = 0.
+
+    The frame tilts with c14, c24, so c13 and c23 leak in; |∇f| changes with c44 through c33.
+    """
+    c13, c23, c33, c11, c12, c22 = c[3:9].tolist()
+    D = np.zeros((3, 9))
+    D[0, 6] = D[1, 7] = D[2, 8] = 2.0
+    D[0, 0], D[1, 0] = 8.0 * c13, 4.0 * c23
+    D[1, 1], D[2, 1] = 4.0 * c13, 8.0 * c23
+    D[0, 2] = 4.0 * c33 * c11 + 8.0 * c13 * c13
+    D[1, 2] = 4.0 * c33 * c12 + 8.0 * c13 * c23
+    D[2, 2] = 4.0 * c33 * c22 + 8.0 * c23 * c23
+    return D

@@ -1,0 +1,106 @@
+"""Which combinations of curvature the data observed.
+
+The decision is made on K alone, in q = (K11, √2 K12, K22), where a turn of the frame is orthogonal, so that it does
+not depend on the choice of axes. A combination of K counts as observed when
+
+1. the points were spread: their mean square distance from their mean, along the axes that the combination weighs, is
+   at least `SPREAD · σ_p²` (noise alone would give σ_p²). Below, an answer would be drawn towards 0 with a small but
+   false σ. This is decided first, on the places alone, so that no fit can talk itself into it;
+2. its standard deviation, all other parameters unknown, is at most `SIGMA_LIMIT · max(‖K‖, 1/L)`, L the length of the
+   path;
+3. its information is at least `NUMERIC` times the largest: rounding.
+
+A straight path passes two of three: the normal curvature along it and the twist. Combinations that fail are held at
+the value nearest to flat.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array
+
+SPREAD = 10.0
+SIGMA_LIMIT = 0.3
+NUMERIC = 1e-12
+
+_ROOT2 = math.sqrt(2.0)
+
+
+class Decision(NamedTuple):
+    """What is known about q, combination by combination.
+
+    Attributes:
+        information: (3,) information 1/σ² of each; 0 for what the points were not spread for.
+        vectors: (3, 3) columns, orthonormal in q.
+        passed: (3,) bool.
+    """
+
+    information: Array
+    vectors: Array
+    passed: Array
+
+    @property
+    def rank(self) -> int:
+        """Number of observed combinations."""
+        return int(np.count_nonzero(self.passed))
+
+
+def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
+    """Rank decision.
+
+    Args:
+        root_q: (m, 3) root of the data's information about q, all else unknown, dimensionless.
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise.
+        curvature: ‖K‖, dimensionless.
+    """
+    small, large, axes = _axes(spread)
+    wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
+    seen = axes[:, wide]
+    root = root_q @ seen
+    values, turn = np.linalg.eigh(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
+    least = max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * float(values.max(initial=0.0)))
+    unseen = int(np.count_nonzero(~wide))
+    return Decision(
+        np.concatenate([np.zeros(unseen), values]),
+        np.concatenate([axes[:, ~wide], seen @ turn], axis=1),
+        np.concatenate([np.zeros(unseen, dtype=bool), values >= least]),
+    )
+
+
+def _axes(spread: Array) -> tuple[float, float, Array]:
+    """Eigenvalues of the spread and, as columns in q, the curvature along its main axis, the twist, and across."""
+    a, b, d = float(spread[0, 0]), float(spread[0, 1]), float(spread[1, 1])
+    mean, half = 0.5 * (a + d), 0.5 * (a - d)
+    radius = math.hypot(half, b)
+    angle = 0.5 * math.atan2(b, half)
+    return mean - radius, mean + radius, turned(angle).T
+
+
+def turned(angle: float) -> Array:
+    """The (3, 3) orthogonal matrix that takes q = (K11, √2 K12, K22) to axes turned by an angle in rad."""
+    c, s = math.cos(angle), math.sin(angle)
+    cs = _ROOT2 * c * s
+    return np.array([[c * c, cs, s * s], [-cs, c * c - s * s, cs], [s * s, -cs, c * c]])
+
+
+def spread_of(points: Array, variance: float) -> Array:
+    """Covariance (2, 2) of points (n, 2 or 3) in the tangent plane, over the variance of their noise per axis."""
+    offset = points[:, :2] - points[:, :2].mean(axis=0)
+    result: Array = offset.T @ offset / (len(points) * variance)
+    return result
+
+
+def outside(decision: Decision, q: Array) -> float:
+    """Length of the part of q (3,) that the data did not observe, relative to q."""
+    hidden = decision.vectors[:, ~decision.passed].T @ q
+    return math.sqrt(float(hidden @ hidden) / float(q @ q))
+
+
+def tensor(q: Array) -> Array:
+    """The symmetric (2, 2) matrix of q."""
+    off = q[1] / _ROOT2
+    return np.array([[q[0], off], [off, q[2]]])
