@@ -56,7 +56,7 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
     for _ in range(_ITERATIONS):
         r, J = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
-        weight, cost = _huber(square)
+        weight, cost = huber(square)
         if cost > best_cost * 1.001 + 1e-9 and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
@@ -74,7 +74,7 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
     return Fit(c, root, decision, float(weight @ square) / freedom, int(np.sum(weight < 1.0)), converged)
 
 
-def _huber(square: Array) -> tuple[Array, float]:
+def huber(square: Array) -> tuple[Array, float]:
     """Weights (n,) and the robust cost of squared whitened residuals (n,)."""
     limit = CHI2_999 * max(1.0, float(np.partition(square, len(square) // 2)[len(square) // 2]) / _MEDIAN_CHI2)
     ratio = np.sqrt(limit / np.maximum(square, limit))

@@ -224,9 +224,10 @@ class TouchTask:
 
     def _move(self) -> ProbePose:
         assert self._line is not None
+        pose = self._line.at(self._t)
         if self._t >= self._line.duration + self._s.lead_s + 0.1:
             self._enter(Phase.APPROACH)
-        return self._line.at(self._t)
+        return pose
 
     def _approach(self) -> ProbePose:
         distance = self._s.clearance - self._s.approach_speed * self._t
@@ -276,9 +277,10 @@ class TouchTask:
 
     def _retreat(self) -> ProbePose:
         assert self._line is not None
+        pose = self._line.at(self._t)
         if self._t >= self._line.duration + self._s.lead_s:
             self._enter(Phase.DONE)
-        return self._line.at(self._t)
+        return pose
 
     def _done(self) -> ProbePose:
         assert self._motion is not None

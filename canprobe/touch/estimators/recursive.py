@@ -21,11 +21,12 @@ from canprobe.touch.estimate import SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
-from canprobe.touch.nonlinear import CHI2_999
+from canprobe.touch.noise import Noise
+from canprobe.touch.nonlinear import CHI2_999, huber
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric import UNIT, transport
+from canprobe.touch.quadric import UNIT, Design, design, rows, transport
 from canprobe.touch.quadric_row import sample_rows
-from canprobe.touch.rank import decide
+from canprobe.touch.rank import SPREAD, decide, spread_of
 
 DIFFUSE = 1e-2
 """Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
@@ -35,6 +36,9 @@ ANCHOR = 0.05
 """Travel between two changes of the working frame over the memory."""
 CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
+START = (0.1, 0.4)
+"""Travel over the memory at the first and last batch solution of the start; it doubles from one to the next."""
+START_SAMPLES = 64
 FADE = 0.1
 ALARM = 3.0
 
@@ -85,6 +89,8 @@ class RecursiveEstimator:
         self._root = np.zeros((9, 9))
         self._innovation = 1.0
         self._faded = 0
+        self._start: list[_Pending] = []
+        self._next_start = START[0] * self._memory
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
@@ -97,6 +103,8 @@ class RecursiveEstimator:
         moved = self._travel.add(sample.p_base)
         if moved > 0.0:
             self._absorb(moved)
+            if self._next_start < math.inf:
+                self._start_up()
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -153,6 +161,44 @@ class RecursiveEstimator:
         self._root = full[:9, :9]
         self._c = self._c + np.linalg.solve(self._root, full[:9, 9])
         self._move_frame()
+
+    def _start_up(self) -> None:
+        """Solve the first samples again as a batch: the filter's first steps were linearised on a plane."""
+        self._start += self._pending
+        if len(self._start) > START_SAMPLES:
+            self._start = self._start[::2]
+        if self._travel.total < self._next_start:
+            return
+        d = self._design(self._start)
+        if float(np.linalg.eigvalsh(spread_of(d.X, float(d.point_variance.mean())))[0]) >= SPREAD:
+            self._c, self._root = self._batch(d)
+            self._next_start *= 2.0
+        if self._travel.total >= START[1] * self._memory:
+            self._next_start, self._start = math.inf, []
+
+    def _design(self, samples: list[_Pending]) -> Design:
+        L, R = self._memory, self._T[:3, :3]
+        points = (np.array([s.point for s in samples]) - self._T[:3, 3]) @ R / L
+        normals = np.array([s.normal for s in samples]) @ R
+        noise = Noise(np.array([s.sigma_point for s in samples]) / L, np.array([s.sigma_normal for s in samples]))
+        return design(points, normals, noise)
+
+    def _batch(self, d: Design) -> tuple[Array, Array]:
+        """Gauss–Newton from the present parameters; they stay where it does not get better."""
+        c, best, answer = self._c, math.inf, (self._c, self._root)
+        for _ in range(4):
+            r, J = rows(c, d)
+            weight, cost = huber(np.einsum("ij,ij->i", r, r))
+            if not cost < best:
+                break
+            w = np.sqrt(weight)[:, None]
+            stacked = np.empty((9 + r.size, 10))
+            stacked[:9, :9], stacked[:9, 9] = self._prior_rows, -(self._prior_rows @ c)
+            stacked[9:, :9], stacked[9:, 9] = (J * w[:, :, None]).reshape(-1, 9), -(r * w).reshape(-1)
+            full = upper_root(stacked)
+            best, answer = cost, (c, full[:9, :9])
+            c = c + np.linalg.solve(full[:9, :9], full[:9, 9])
+        return answer
 
     def _rows_of_pending(self) -> Array:
         """(3n, 10): whitened Jacobian and minus residual."""
