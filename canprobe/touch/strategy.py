@@ -20,24 +20,34 @@ class Strategy(Protocol):
         """Derivative of :meth:`point` by the phase (m/rad)."""
 
 
+_TRIANGLE = {1: 1, 3: -1, 5: 1}
+"""Harmonics of a triangle wave and their signs."""
+
+
 class Weave:
-    """A Lissajous figure ``(L/2 sin φ, W/2 sin mφ)``: excites the curvature in both directions.
+    """To and fro along the heading with a sine across it: excites the curvature in both directions everywhere.
+
+    Along the heading it is a triangle wave without its sharp tips (three terms of its series), so that the path does not
+    linger at the ends, where a plain sine would leave the curvature along the heading without excitation.
 
     Args:
         length_m: full size along the heading.
         width_m: full size across it.
-        wavelength_m: mean distance along the heading of one full weave; sets the odd ratio ``m``.
+        wavelength_m: mean distance along the heading of one full weave; sets the even ratio ``m``: at
+            the ends the path then turns round smoothly and comes back beside itself, where an odd one would reverse.
     """
 
     def __init__(self, length_m: float, width_m: float, wavelength_m: float) -> None:
-        self._a, self._b = length_m / 2, width_m / 2
-        self._m = max(3, 2 * round(length_m / wavelength_m) + 1)
+        self._a, self._b = length_m / 2 / sum(1 / k**2 for k in _TRIANGLE), width_m / 2
+        self._m = max(2, 2 * round(length_m / wavelength_m))
 
     def point(self, phase: float) -> tuple[float, float]:
-        return self._a * math.sin(phase), self._b * math.sin(self._m * phase)
+        along = sum(sign * math.sin(k * phase) / k**2 for k, sign in _TRIANGLE.items())
+        return self._a * along, self._b * math.sin(self._m * phase)
 
     def tangent(self, phase: float) -> tuple[float, float]:
-        return self._a * math.cos(phase), self._b * self._m * math.cos(self._m * phase)
+        along = sum(sign * math.cos(k * phase) / k for k, sign in _TRIANGLE.items())
+        return self._a * along, self._b * self._m * math.cos(self._m * phase)
 
 
 class Circle:

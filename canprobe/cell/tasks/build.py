@@ -22,8 +22,8 @@ from canprobe.touch.strategy import Strategy, make_strategy
 if TYPE_CHECKING:
     from canprobe.touch.estimators import Estimator
 
-SIGMA_POINT_M = 0.03e-3
-SIGMA_NORMAL_RAD = 1.5e-3
+SIGMA_POINT_M = 0.1e-3
+SIGMA_NORMAL_RAD = 4e-3
 CYCLES_TO_EFFECT = 2
 
 

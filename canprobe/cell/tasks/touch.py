@@ -72,7 +72,7 @@ class TouchSettings:
     search: float = 8e-3
     retreat: float = 6e-3
     settle_s: float = 0.5
-    ramp_s: float = 0.1
+    ramp_s: float = 0.05
     lost_s: float = 0.03
     tactile_timeout: int = 12
 
