@@ -57,12 +57,13 @@ _Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node", Contain
 class _Node:
     """The bus's view of one sender: its queue, and where its frames go."""
 
-    __slots__ = ("inboxes", "order", "outbox", "owner", "receivers")
+    __slots__ = ("due", "inboxes", "order", "outbox", "owner", "receivers")
 
     def __init__(self, owner: Participant | LockstepPort, order: int) -> None:
         self.owner = owner
         self.order = order
         self.outbox: deque[Frame] = deque()
+        self.due: int | None = None  # the owner's deadline, as last seen
         self.receivers: tuple[_Receiver, ...] = ()
         self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
 
@@ -92,6 +93,7 @@ class LockstepBus:
         """Put `participant` on the bus and start it; what it says is carried when time moves or a port is used."""
         node = self._add(participant)
         self._queue(node, participant.start(self.clock.now_ns()))
+        node.due = participant.next_deadline_ns
 
     def detach(self, participant: Participant) -> None:
         """Cut `participant` off; frames that it had queued are lost."""
@@ -107,8 +109,12 @@ class LockstepBus:
         """Return the earliest deadline of all participants; the present if frames are waiting."""
         if self._heads:
             return self.clock.now_ns()
-        deadlines = [due for _, owner in self._participants if (due := owner.next_deadline_ns) is not None]
-        return min(deadlines, default=None)
+        first: int | None = None
+        for node, owner in self._participants:
+            due = node.due = owner.next_deadline_ns
+            if due is not None and (first is None or due < first):
+                first = due
+        return first
 
     def settle(self) -> None:
         """Carry everything due at the present instant.
@@ -142,10 +148,10 @@ class LockstepBus:
     def _advance_due(self, t_ns: int) -> bool:
         advanced = False
         for node, owner in self._participants:
-            due = owner.next_deadline_ns
-            if due is not None and due <= t_ns:
+            if node.due is not None and node.due <= t_ns:
                 advanced = True
                 self._queue(node, owner.advance(t_ns))
+                node.due = owner.next_deadline_ns
         return advanced
 
     def _deliver(self, t_ns: int, limit: int) -> int:
@@ -168,6 +174,7 @@ class LockstepBus:
                 if listens is not None and can_id not in listens:
                     continue
                 answers = receive(can_id, data, t_ns)
+                receiver.due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
                 if answers:
                     self._queue(receiver, answers)
             frame = (can_id, data, t_ns)
@@ -215,8 +222,7 @@ class LockstepBus:
             node.inboxes = tuple(port.inbox.append for port in ports if isinstance(port, LockstepPort))
 
     def _names_due(self, t_ns: int) -> str:
-        due = (p for _, p in self._participants if p.next_deadline_ns is not None and p.next_deadline_ns <= t_ns)
-        return ", ".join(map(_name, due))
+        return ", ".join(_name(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns)
 
     def _endless(self, t_ns: int, what: str) -> BusError:
         self._heads.clear()

@@ -36,10 +36,25 @@ def damped_step(
     Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor).
     """
     scale = np.array((1 / length_m,) * 3 + (1.0,) * 3)
-    U, s, Vt = np.linalg.svd(J * scale[:, None])
-    ratio = float(s[-1]) / threshold
-    lambda2 = damping**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
-    qd: Array = Vt.T @ ((U.T @ (scale * twist)) * (s / (s * s + lambda2)))
+    scaled = J * scale[:, None]
+    qd = _regular_step(scaled, scale * twist, threshold)
+    if qd is None:
+        U, s, Vt = np.linalg.svd(scaled)
+        ratio = float(s[-1]) / threshold
+        lambda2 = damping**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+        qd = Vt.T @ ((U.T @ (scale * twist)) * (s / (s * s + lambda2)))
     if qd_max is not None:
         qd = qd / max(1.0, float(np.max(np.abs(qd) / qd_max)))
     return qd
+
+
+def _regular_step(J: Array, twist: Array, threshold: float) -> Array | None:
+    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    try:
+        inverse = np.linalg.inv(J)
+    except np.linalg.LinAlgError:
+        return None
+    if float(np.vdot(inverse, inverse)) * threshold**2 >= 1.0:
+        return None
+    step: Array = inverse @ twist
+    return step

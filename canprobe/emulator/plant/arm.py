@@ -122,6 +122,7 @@ class IdealArm:
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_counts(model, q0).tolist()]
         self._phi: dict[int, Transition] = {}
+        self._rows = [[(j, g) for j, g in enumerate(row) if g] for row in model.joints_per_count.tolist()]
         self._evaluated: list[tuple[float, float, float]] | None = None
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -146,7 +147,8 @@ class IdealArm:
         a.anchor(self.t_ns, self._state(a, self.t_ns))
         a.coming.clear()
         a.begin(ramp)
-        self._evaluated = None
+        if self._evaluated is not None:  # the other motors know nothing of this ramp
+            self._evaluated[axis] = self._state(a, self.t_ns)
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -197,11 +199,13 @@ class IdealArm:
         Returns:
             Permille, within the peak of +-2000.
         """
-        w, z = self.w, self.z
+        stiffness, damping = self.w * self.w, 2 * self.z * self.w
         states = self._states()
-        row = self.model.joints_per_count[axis].tolist()
-        rate = sum(g * s[1] for g, s in zip(row, states, strict=True))
-        acceleration = sum(g * (w * w * (s[2] - s[0]) - 2 * z * w * s[1]) for g, s in zip(row, states, strict=True))
+        rate = acceleration = 0.0
+        for motor, share in self._rows[axis]:
+            q, v, r = states[motor]
+            rate += share * v
+            acceleration += share * (stiffness * (r - q) - damping * v)
         torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
         torque += COULOMB_NM[axis] * tanh(rate / _STICTION_RATE)
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
