@@ -34,6 +34,7 @@ def reference_run(a, start, ramps, t_ns):
 
 
 @DAMPING
+@settings(max_examples=25)
 @given(t=st.floats(0.0, 0.2))
 def test_transition_is_the_matrix_exponential(z, t):
     w = 120.0
@@ -79,7 +80,7 @@ def test_a_ramp_in_progress_is_solved_exactly():
     assert a.counts[0] - start == pytest.approx(100.0, abs=25.0)
 
 
-@settings(max_examples=40)
+@settings(max_examples=25)
 @given(
     cuts=st.lists(st.integers(1, 60 * MS), max_size=12),
     targets=st.lists(st.floats(-300, 300), min_size=4, max_size=4),

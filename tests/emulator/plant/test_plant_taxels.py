@@ -188,15 +188,35 @@ def test_creep_depends_on_time_not_on_the_number_of_samples():
     assert np.array_equal(touch(often, 2.0, t_s=2.0), touch(once, 2.0, t_s=2.0))
 
 
-def test_crosstalk_moves_signal_along_rows_and_columns_and_keeps_the_sum():
-    a = array(TaxelConfig(crosstalk=0.05).without("noise", "gain_error", "hysteresis", "creep", "saturation"))
-    y = np.zeros((16, 16))
-    y[4, 9] = 1.0
-    mixed = a._mix @ y @ a._mix
-    assert mixed.sum() == pytest.approx(1.0)
-    assert mixed[4, 0] == pytest.approx(0.05 * 0.95 / 15)
-    assert mixed[0, 9] == pytest.approx(0.05 * 0.95 / 15)
-    assert mixed[4, 9] == pytest.approx(0.95**2)
+def test_crosstalk_spreads_over_rows_then_columns_and_keeps_the_sum():
+    share = 0.3
+    clean = touch(array(LINEAR_TAXELS), 2.0, uv=(2e-3, -1e-3), directions=turned(0.3)) / 255.0
+    mixed = touch(array(replace(LINEAR_TAXELS, crosstalk=share)), 2.0, uv=(2e-3, -1e-3), directions=turned(0.3)) / 255.0
+    rows = np.array([[(1 - share) * r[j] + share * (r.sum() - r[j]) / 15 for j in range(16)] for r in clean])
+    both = np.array([[(1 - share) * c[i] + share * (c.sum() - c[i]) / 15 for i in range(16)] for c in rows.T]).T
+    assert mixed == pytest.approx(both, abs=1.5 / 255)
+    assert mixed.sum() == pytest.approx(clean.sum(), rel=0.02)
+    assert mixed[0].sum() > 0.0
+    assert mixed[:, 0].sum() > 0.0
+
+
+@pytest.mark.parametrize("kappa", [PLANE, CYLINDER, SADDLE], ids=["plane", "cylinder", "saddle"])
+def test_leaving_out_samples_beside_the_patch_changes_nothing(kappa):
+    part, whole = PressureField(R), PressureField(R)
+    whole._span = lambda centre, half: (0, whole._count)
+    rng = np.random.default_rng(16)
+    for _ in range(30):
+        uv, angle, depth = rng.uniform(-0.011, 0.011, 2), rng.uniform(0, math.pi), rng.uniform(1e-5, 9e-4)
+        images = [f.mean_pressure(tuple(uv), depth, kappa, turned(angle)) for f in (part, whole)]
+        assert images[0] == pytest.approx(images[1], abs=1e-12 * depth)
+
+
+def test_taxel_area_is_the_one_on_the_sphere():
+    """Toward the corner the wrapped array's cells shrink: the same force must still come out."""
+    field = PressureField(R, blur_pitch=0.0, samples=5)
+    depth = depth_for_force(0.4, PLANE, R, K)
+    middle, corner = (field.mean_pressure(uv, depth, PLANE, ALONG_U).sum() for uv in ((0.0, 0.0), (7.3e-3, 7.3e-3)))
+    assert corner == pytest.approx(middle, rel=3e-3)
 
 
 def test_gains_are_fixed_by_the_seed_and_within_their_spread():

@@ -263,6 +263,17 @@ def test_sensor_alone_is_pressed_slowly_around_the_force(kind):
         p.set_ramp(0, 0.0, 1.0, 0, 1)
 
 
+def test_sensor_alone_faces_the_object_with_right_handed_axes():
+    """Curvature is low along object (1, -1); pad x is object x and pad y is -object y: long along pad (1, 1)."""
+    matrix = np.zeros((4, 4))
+    matrix[:2, :2] = ((5.0, 4.0), (4.0, 5.0))
+    matrix[2, 3] = matrix[3, 2] = 0.5
+    twisted = make_object("quadric", T_base_object=placed("plane").T_base_object, matrix=matrix)
+    image = Plant(PlantConfig(None, object=twisted, taxels=IDEAL_TAXELS)).sample_image(0).astype(float)
+    k = np.arange(16) - 7.5
+    assert k @ image @ k > 0.1 * image.sum()
+
+
 def test_sensor_alone_rates_are_the_derivative():
     p = Plant(PlantConfig(None, object=placed("cylinder"), press=PressMotion(1.0, 0.3, 2.0)))
     depths = []
