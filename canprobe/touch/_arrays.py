@@ -18,6 +18,11 @@ def upper_root(A: Array) -> Array:
     return np.asarray(np.linalg.qr(A, mode="r"), dtype=np.float64)
 
 
+def solved(A: Array, B: Array) -> Array:
+    """A⁻¹ B."""
+    return np.asarray(np.linalg.solve(A, B), dtype=np.float64)
+
+
 def read_only(values: ArrayLike) -> Array:
     """A private copy that nobody can write to."""
     array = np.array(values, dtype=np.float64)

@@ -10,7 +10,7 @@ import numpy as np
 from canprobe.touch._arrays import Array
 from canprobe.touch.estimate import Solution
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.quadric import curvature_jacobian, matrix_of, transport
+from canprobe.touch.quadric import curvature_jacobian, transport
 from canprobe.touch.rank import Decision, turned
 
 
@@ -32,20 +32,22 @@ class Anchor(NamedTuple):
 
 def foot(c: Array, start: Array) -> tuple[Array, Array]:
     """Foot of a nearby point (3,) on the model's surface and the inward unit normal there, dimensionless."""
-    S = matrix_of(c)
-    x = start
-    for _ in range(4):
-        half = S[:3, :3] @ x + S[:3, 3]
-        f = float(x @ (half + S[:3, 3]) + S[3, 3])
-        g = 2.0 * half
-        square = float(g @ g)
-        # along the gradient to the surface, and back over the start along the tangent plane
-        offset = x - start
-        x = x - g * (f / square) - (offset - g * (float(offset @ g) / square))
-        if abs(f) < 1e-15:
+    c14, c24, c44, c13, c23, c33, c11, c12, c22 = c.tolist()
+    sx, sy, sz = x, y, z = start.tolist()
+    for last in (False, False, False, False, True):
+        gx = 2.0 * (c11 * x + c12 * y + c13 * z + c14)
+        gy = 2.0 * (c12 * x + c22 * y + c23 * z + c24)
+        gz = 2.0 * (c13 * x + c23 * y + c33 * z) - 1.0
+        square = gx * gx + gy * gy + gz * gz
+        if last:
             break
-    g = 2.0 * (S[:3, :3] @ x + S[:3, 3])
-    return x, -g / math.sqrt(float(g @ g))
+        f = 0.5 * (x * (gx + 2.0 * c14) + y * (gy + 2.0 * c24) + z * (gz - 1.0)) + c44
+        # along the gradient to the surface, and back over the start along the tangent plane
+        ox, oy, oz = x - sx, y - sy, z - sz
+        k = (ox * gx + oy * gy + oz * gz - f) / square
+        x, y, z = sx + k * gx, sy + k * gy, sz + k * gz
+    size = -1.0 / math.sqrt(square)
+    return np.array([x, y, z]), np.array([gx * size, gy * size, gz * size])
 
 
 def anchor(c: Array, T_frame_work: Array, point: Array, length: float) -> Anchor:

@@ -18,7 +18,6 @@ from canprobe.touch.nonlinear import fit
 from canprobe.touch.prior import Prior, path_extent
 from canprobe.touch.quadric import design
 
-
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 

@@ -131,4 +131,3 @@ def _root_of(covariance: Array) -> Array:
     inverse = np.where(values > 1e-14 * max(float(values[-1]), 1e-300), 1.0 / np.maximum(values, 1e-300), 0.0)
     result: Array = np.sqrt(inverse)[:, None] * vectors.T
     return result
-

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +16,14 @@ from canprobe.touch.surface import SurfaceMatrix
 _ROOT2 = math.sqrt(2.0)
 _TO_Q = np.array([1.0, _ROOT2, 1.0])
 _ENTRY_LIMIT = 0.02
+"""Largest unobserved part of an entry of K that still has a number."""
 _DIRECTION_LIMIT = 0.05
+"""The same for the normal curvature along a direction."""
 _UMBILIC_CHI2 = 5.99
+_ARRAYS = (
+    *("S", "T_frame_contact", "K", "kappa", "directions", "covariance"),
+    *("observed", "combinations", "information"),
+)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -70,10 +76,8 @@ class SurfaceEstimate:
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, np.ndarray):
-                value.flags.writeable = False
+        for name in _ARRAYS:
+            getattr(self, name).flags.writeable = False
 
     @property
     def T_base_contact(self) -> Array:

@@ -91,7 +91,7 @@ def _run_filter(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(
-            f"points: expected a path that moves beyond its noise for method 'recursive', got {touches.distance:.3g} long"
+            f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all"
         )
     return answer
 

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, upper_root
+from canprobe.touch._arrays import Array, solved, upper_root
 from canprobe.touch.quadric import UNIT, Design, linear_rows, rows
 from canprobe.touch.rank import Decision, decide, spread_of
 
@@ -54,10 +54,11 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
     for _ in range(_ITERATIONS):
-        r, J = rows(c, d)
+        r, J, log_det = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
         weight, cost = huber(square)
-        if cost > best_cost * 1.001 + 1e-9 and halvings < 12:
+        cost += log_det  # without it a large K, which explains any residual by noise of the points, would look good
+        if cost > best_cost + 1e-3 * len(square) and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
             continue
@@ -101,9 +102,9 @@ def _solve(A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: 
     data = upper_root(np.concatenate([A, P[:3]])) if has_prior else root
     decision = decide(data[6:, 6:] * UNIT, spread, size)
     if has_prior or decision.rank == 3:
-        return np.linalg.solve(root, z), root, decision
+        return solved(root, z), root, decision
     V = decision.vectors[:, decision.passed]
     c = np.empty(9)
     c[6:] = UNIT * (V @ np.linalg.lstsq(root_q @ V, z[6:], rcond=None)[0]) if decision.rank else 0.0
-    c[:6] = np.linalg.solve(root[:6, :6], z[:6] - root[:6, 6:] @ c[6:])
+    c[:6] = solved(root[:6, :6], z[:6] - root[:6, 6:] @ c[6:])
     return c, root, decision

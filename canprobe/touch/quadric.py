@@ -32,10 +32,11 @@ _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
 
 
 class Rows(NamedTuple):
-    """Whitened residuals (n, 3) and their Jacobian (n, 3, 9) at some parameters."""
+    """Whitened residuals (n, 3), their Jacobian (n, 3, 9) and the log-determinant of their covariances."""
 
     r: Array
     J: Array
+    log_det: float
 
 
 class Design(NamedTuple):
@@ -150,7 +151,8 @@ def rows(c: Array, d: Design) -> Rows:
     J[:, 0] = value_rows(X)
     J *= inverse[:, None, None]
     J[:, 1:] -= bend[:, 0, :, None] * J[:, :1]  # the foot moves with the model
-    return Rows(r, W @ J)
+    log_det = -2.0 * float(np.log(W[:, 1, 1] * W[:, 2, 2]).sum())
+    return Rows(r, W @ J, log_det)
 
 
 def _whitener(K: Array, ghat: Array, d: Design) -> Array:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 Row = list[float]
 
 
-def sample_rows(
+def sample_rows(  # noqa: PLR0915 - one formula, unrolled
     c: Sequence[float], x: Sequence[float], n: Sequence[float], point_variance: float, normal_variance: float
 ) -> tuple[Row, Row, Row]:
     """Whitened rows of one sample with isotropic noise.

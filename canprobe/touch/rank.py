@@ -96,7 +96,7 @@ def spread_of(points: Array, variance: float) -> Array:
 
 def outside(decision: Decision, q: Array) -> float:
     """Length of the part of q (3,) that the data did not observe, relative to q."""
-    hidden = decision.vectors[:, ~decision.passed].T @ q
+    hidden = decision.vectors[:, np.logical_not(decision.passed)].T @ q
     return math.sqrt(float(hidden @ hidden) / float(q @ q))
 
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, positive, upper_root
+from canprobe.touch._arrays import Array, positive, solved, upper_root
 from canprobe.touch.anchor import anchor, foot, solution
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
@@ -22,11 +22,11 @@ from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
 from canprobe.touch.noise import Noise
-from canprobe.touch.nonlinear import CHI2_999, huber
+from canprobe.touch.nonlinear import CHI2_999, fit
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric import UNIT, Design, design, rows, transport
+from canprobe.touch.quadric import UNIT, Design, design, transport
 from canprobe.touch.quadric_row import sample_rows
-from canprobe.touch.rank import SPREAD, decide, spread_of
+from canprobe.touch.rank import decide
 
 DIFFUSE = 1e-2
 """Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
@@ -38,9 +38,13 @@ CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
 START = (0.1, 0.4)
 """Travel over the memory at the first and last batch solution of the start; it doubles from one to the next."""
-START_SAMPLES = 64
+START_SAMPLES = 128
 FADE = 0.1
-ALARM = 3.0
+"""What an alarm leaves of the information's root."""
+ALARM = 2.2
+"""Running innovation, over its long-term mean, at which the surface is taken to have changed."""
+RUNNING, LONG_TERM = 0.1, 0.004
+"""Weights of one sample in the running and in the long-term innovation."""
 
 
 class _Pending(NamedTuple):
@@ -87,9 +91,14 @@ class RecursiveEstimator:
         self._T = np.eye(4)
         self._c = np.zeros(9)
         self._root = np.zeros((9, 9))
-        self._innovation = 1.0
+        self._innovation = self._usual = 1.0
         self._faded = 0
+        self._first = True
+        self._restart()
+
+    def _restart(self) -> None:
         self._start: list[_Pending] = []
+        self._started = self._travel.total
         self._next_start = START[0] * self._memory
 
     def add(self, sample: ContactSample) -> None:
@@ -116,7 +125,7 @@ class RecursiveEstimator:
         tangent = a.T_frame_contact[:3, :2]
         spread = tangent.T @ self._spread.covariance @ tangent / self._gate.sigma_point**2
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
-        root = upper_root(np.linalg.solve(a.M.T, self._root.T).T)
+        root = upper_root(solved(a.M.T, self._root.T).T)
         decision = decide(root[6:, 6:] * UNIT, spread, size)
         here = a._replace(M=np.eye(9), turn=0.0)
         singular = np.linalg.svd(self._root, compute_uv=False)
@@ -130,7 +139,7 @@ class RecursiveEstimator:
             samples=self._spread.weight,
             method="recursive",
             prior=self._prior.name,
-            notes=(f"memory shortened {self._faded} times",) if self._faded else (),
+            notes=(f"the surface changed {self._faded} times: memory shortened",) if self._faded else (),
         )
 
     def _make_prior_rows(self) -> Array:
@@ -147,7 +156,9 @@ class RecursiveEstimator:
         kept = math.exp(-moved / self._memory)
         root = math.sqrt(kept) * self._root
         block = self._rows_of_pending()
-        weight, self._innovation = self._judge(block, root)
+        weight, changed = self._judge(block, root)
+        if changed:
+            root, weight, kept = FADE * root, np.ones_like(weight), FADE**2 * kept
         crowd = min(1.0, self._crowd * moved / len(self._pending))
         self._spread.fade(kept)
         self._spread.add(np.array([s.point for s in self._pending]), crowd)
@@ -159,7 +170,7 @@ class RecursiveEstimator:
         stacked[18:] = block
         full = upper_root(stacked)
         self._root = full[:9, :9]
-        self._c = self._c + np.linalg.solve(self._root, full[:9, 9])
+        self._c = self._c + solved(self._root, full[:9, 9])
         self._move_frame()
 
     def _start_up(self) -> None:
@@ -167,14 +178,15 @@ class RecursiveEstimator:
         self._start += self._pending
         if len(self._start) > START_SAMPLES:
             self._start = self._start[::2]
-        if self._travel.total < self._next_start:
+        travelled = self._travel.total - self._started
+        if travelled < self._next_start:
             return
-        d = self._design(self._start)
-        if float(np.linalg.eigvalsh(spread_of(d.X, float(d.point_variance.mean())))[0]) >= SPREAD:
-            self._c, self._root = self._batch(d)
+        fitted = fit(self._design(self._start), self._prior.rows(self._memory))
+        if fitted.decision.rank == 3 and fitted.converged:
+            self._c, self._root = fitted.c, fitted.root
             self._next_start *= 2.0
-        if self._travel.total >= START[1] * self._memory:
-            self._next_start, self._start = math.inf, []
+        if travelled >= START[1] * self._memory:
+            self._next_start, self._start, self._first = math.inf, [], False
 
     def _design(self, samples: list[_Pending]) -> Design:
         L, R = self._memory, self._T[:3, :3]
@@ -183,43 +195,32 @@ class RecursiveEstimator:
         noise = Noise(np.array([s.sigma_point for s in samples]) / L, np.array([s.sigma_normal for s in samples]))
         return design(points, normals, noise)
 
-    def _batch(self, d: Design) -> tuple[Array, Array]:
-        """Gauss–Newton from the present parameters; they stay where it does not get better."""
-        c, best, answer = self._c, math.inf, (self._c, self._root)
-        for _ in range(4):
-            r, J = rows(c, d)
-            weight, cost = huber(np.einsum("ij,ij->i", r, r))
-            if not cost < best:
-                break
-            w = np.sqrt(weight)[:, None]
-            stacked = np.empty((9 + r.size, 10))
-            stacked[:9, :9], stacked[:9, 9] = self._prior_rows, -(self._prior_rows @ c)
-            stacked[9:, :9], stacked[9:, 9] = (J * w[:, :, None]).reshape(-1, 9), -(r * w).reshape(-1)
-            full = upper_root(stacked)
-            best, answer = cost, (c, full[:9, :9])
-            c = c + np.linalg.solve(full[:9, :9], full[:9, 9])
-        return answer
-
     def _rows_of_pending(self) -> Array:
         """(3n, 10): whitened Jacobian and minus residual."""
         R, origin, L = self._T[:3, :3], self._T[:3, 3], self._memory
         c = self._c.tolist()
-        block = []
+        block: list[list[float]] = []
         for s in self._pending:
             x = (s.point - origin) @ R / L
             n = s.normal @ R
             block += sample_rows(c, x.tolist(), n.tolist(), (s.sigma_point / L) ** 2, s.sigma_normal**2)
         return np.array(block)
 
-    def _judge(self, block: Array, root: Array) -> tuple[Array, float]:
-        """Weights (n,) by Huber's rule on the innovations, and their running mean square per degree of freedom."""
-        spread = np.linalg.solve(root.T, block[:, :9].T)
-        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", spread, spread))
+    def _judge(self, block: Array, root: Array) -> tuple[Array, bool]:
+        """Weights (n,) by Huber's rule on the innovations, and whether they say that the surface has changed."""
+        predicted = solved(root.T, block[:, :9].T)
+        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", predicted, predicted))
         d2 = square.reshape(-1, 3).sum(axis=1)
         weight = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
         mean = float(np.minimum(d2, CHI2_999).mean()) / 3.0
-        share = min(1.0, 0.05 * len(d2))
-        return weight, self._innovation + share * (mean - self._innovation)
+        self._innovation += min(1.0, RUNNING * len(d2)) * (mean - self._innovation)
+        self._usual += min(1.0, LONG_TERM * len(d2)) * (mean - self._usual)
+        if self._first or self._innovation < ALARM * max(1.0, self._usual):
+            return weight, False
+        self._innovation = self._usual
+        self._faded += 1
+        self._restart()
+        return weight, True
 
     def _move_frame(self) -> None:
         assert self._last is not None
@@ -231,5 +232,5 @@ class RecursiveEstimator:
         turned = transported_rotation(np.eye(3), z)
         self._c, M = transport(self._c, homogeneous(turned, x))
         self._c[:3] = 0.0
-        self._root = np.linalg.solve(M.T, self._root.T).T
+        self._root = solved(M.T, self._root.T).T
         self._T = homogeneous(R @ turned, origin + R @ (L * x))
