@@ -134,7 +134,7 @@ class TaskSettings:
     length_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING] = 36.0  # full size; a circle's diameter
     width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
     wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave
-    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.1  # 0: pad follows the normal, 1: fixed orientation
+    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05  # 0: pad follows the normal, 1: fixed orientation
     swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)  # amplitude of each joint
     swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
 

@@ -89,10 +89,12 @@ def make_task(plan: Plan) -> Controller:
 
         return FreeTask(np.radians(task.swing_deg), task.swing_period_s, task.duration_s, period_s)
     if task.kind == "listen":
+        from canprobe.cell.tasks.calibration import array_calibration
         from canprobe.cell.tasks.untouched import ListenTask
-        from canprobe.touch.patch import PatchCalibration
 
-        return ListenTask(PatchCalibration(), task.duration_s, period_s, tactile_timeout(plan.scene))
+        assert plan.scene.sensor is not None
+        calibration = array_calibration(plan.scene.sensor.full_scale_kpa * 1e3)
+        return ListenTask(calibration, task.duration_s, period_s, tactile_timeout(plan.scene))
     from canprobe.cell.tasks.build import make_touch_task
 
     return make_touch_task(plan, period_s, tactile_timeout(plan.scene))

@@ -91,8 +91,10 @@ def _draw_trajectory(axes: Any, result: RunResult) -> None:
     axes.set_ylabel("y (mm)")
     axes.set_zlabel("z (mm)")
     axes.set_aspect("equal")
-    axes.view_init(elev=24, azim=-62)
-    axes.locator_params(nbins=5)
+    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.35) if hasattr(axes, "get_box_aspect") else None
+    axes.view_init(elev=22, azim=-150)
+    axes.locator_params(nbins=4)
+    axes.tick_params(labelsize=8)
 
 
 def _surface_near(result: RunResult, points: Array) -> tuple[Array, Array, Array]:

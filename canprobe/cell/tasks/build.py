@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.cell.tasks.calibration import array_calibration
 from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeTracker
@@ -15,7 +16,6 @@ from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene, ServoSettings, TaskSettings
 from canprobe.scene_geometry import T_flange_probe, scan_axes
-from canprobe.touch.patch import PatchCalibration
 from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import Strategy, make_strategy
 
@@ -34,7 +34,11 @@ def make_touch_task(plan: Plan, period_s: float, tactile_timeout: int) -> TouchT
     model = MODELS[scene.arm.model]
     flange_probe = T_flange_probe(scene.probe)
     sensing = ContactSensing(
-        model, flange_probe, PatchCalibration(), scene.probe.radius_mm * 1e-3, scene.probe.stiffness_n_m3
+        model,
+        flange_probe,
+        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
+        scene.probe.radius_mm * 1e-3,
+        scene.probe.stiffness_n_m3,
     )
     margin = math.radians(scene.limits.joint_margin_deg)
     return TouchTask(
