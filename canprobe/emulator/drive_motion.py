@@ -8,6 +8,9 @@ from typing import Protocol
 from canprobe.emulator.timers import Timers
 
 STEP_NS = 2_500_000
+STANDSTILL_COUNTS = 0.1
+"""Motion in one step below which the motor is at rest."""
+PATIENCE_STEPS = 400
 
 
 class AxisPlant(Protocol):
@@ -35,6 +38,8 @@ class Motion:
         self._start = self._end = 0.0
         self._t0 = self._t1 = 0
         self._speed = self._rate = 0.0
+        self._patience = 0
+        self._was = 0.0
         self._done: Callable[[int], None] = _nothing
 
     @property
@@ -68,8 +73,12 @@ class Motion:
     def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None]) -> None:
         """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
 
-        A rate of 0 stops the reference at once.
+        Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
+        reference at once.
         """
+        self._patience = PATIENCE_STEPS
+        self._plant.advance(t_ns)
+        self._was = self._plant.motor_counts(self._axis)
         self._speed = self.speed(t_ns) if rate > 0 else 0.0
         self._rate, self._done = rate, done
         here = self.demand(t_ns)
@@ -82,7 +91,7 @@ class Motion:
     def _step(self, due_ns: int) -> None:
         speed = self._speed
         if not speed:
-            self._done(due_ns)
+            self._await_standstill(due_ns)
             return
         seconds = min(STEP_NS * 1e-9, abs(speed) / self._rate)
         rest = speed - self._rate * seconds * (1 if speed > 0 else -1)
@@ -90,6 +99,16 @@ class Motion:
         travel = (speed + self._speed) / 2 * seconds
         self._ramp(self._end, self._end + travel, due_ns, due_ns + max(1, round(seconds * 1e9)))
         self._timer.arm(due_ns + STEP_NS)
+
+    def _await_standstill(self, due_ns: int) -> None:
+        self._plant.advance(due_ns)
+        here = self._plant.motor_counts(self._axis)
+        moved, self._was = abs(here - self._was), here
+        self._patience -= 1
+        if moved > STANDSTILL_COUNTS and self._patience > 0:
+            self._timer.arm(due_ns + STEP_NS)
+        else:
+            self._done(due_ns)
 
     def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns

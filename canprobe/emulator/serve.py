@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import gc
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
+from contextlib import contextmanager
+from itertools import groupby
 from typing import Protocol
 
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, TimedFrame
 from canprobe.errors import BusError
-from canprobe.protocol.frames import Frame
+from canprobe.protocol.frames import SYNC_ID, Frame
 
 MAX_WAIT_NS = 100_000_000
+_EVERYTHING = range(1 << 32)
 _MOST_FRAMES = 20_000  # in one exchange; above it the nodes are taken to answer each other for ever
 
 
@@ -31,59 +35,127 @@ class Participant(Protocol):
         """Do what is due."""
 
 
+class _Seat:
+    """A node at the exchange, with the frames it has yet to send."""
+
+    __slots__ = ("ears", "node", "queue")
+
+    def __init__(self, node: Participant) -> None:
+        self.node = node
+        self.queue: deque[Frame] = deque()
+        self.ears: Container[int] = getattr(node, "listens", _EVERYTHING)
+
+    def hear(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Give the node a frame that it listens to; keep its answers."""
+        if can_id in self.ears and (answers := self.node.receive(can_id, data, t_ns)):
+            self.queue.extend(answers)
+
+
 class Exchange:
-    """The nodes of one process behind one bus: each hears the bus and the other nodes, none itself."""
+    """The nodes of one process behind one bus: each hears the bus and the other nodes, none itself.
+
+    Frames leave lowest identifier first, each node's own in their order. A SYNC goes to one kind of device after the
+    other, in the order of `nodes`, and what one kind answers leaves before the next kind starts to work: the drives'
+    quick feedback does not wait for the sensor's image.
+    """
 
     def __init__(self, nodes: Sequence[Participant]) -> None:
-        self._nodes = tuple(nodes)
-        self._queues: tuple[deque[Frame], ...] = tuple(deque() for _ in nodes)
+        self._seats = tuple(_Seat(node) for node in nodes)
+        self._kinds = tuple(tuple(seats) for _, seats in groupby(self._seats, key=_kind))
 
     @property
     def next_deadline_ns(self) -> int | None:
         """The earliest deadline of all nodes."""
-        return min((due for node in self._nodes if (due := node.next_deadline_ns) is not None), default=None)
+        return min((due for seat in self._seats if (due := seat.node.next_deadline_ns) is not None), default=None)
 
     def start(self, t_ns: int) -> list[Frame]:
         """Power on all nodes; returns what goes on the bus."""
-        for node, queue in zip(self._nodes, self._queues, strict=True):
-            queue.extend(node.start(t_ns))
+        for seat in self._seats:
+            seat.queue.extend(seat.node.start(t_ns))
         return self._settle(t_ns)
 
-    def step(self, frames: Sequence[tuple[int, bytes, int]], t_ns: int) -> list[Frame]:
+    def step(self, frames: Sequence[TimedFrame], t_ns: int) -> list[Frame]:
         """Feed what came from the bus, then do what is due by `t_ns`; returns what goes on the bus.
 
         Args:
             frames: (can_id, data, time of reception in ns), in order.
             t_ns: now; receptions in the future count as now.
         """
+        return [frame for batch in self.batches(frames, t_ns) for frame in batch]
+
+    def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
+        """As `step`, but each batch is computed only when the one before it has been sent."""
         for can_id, data, received_ns in frames:
-            for node, queue in zip(self._nodes, self._queues, strict=True):
-                if answers := node.receive(can_id, data, min(received_ns, t_ns)):
-                    queue.extend(answers)
-        for node, queue in zip(self._nodes, self._queues, strict=True):
-            due = node.next_deadline_ns
+            heard_ns = min(received_ns, t_ns)
+            if can_id == SYNC_ID:
+                yield from self._synchronise(data, heard_ns)
+                continue
+            for seat in self._seats:
+                seat.hear(can_id, data, heard_ns)
+        for seat in self._seats:
+            due = seat.node.next_deadline_ns
             if due is not None and due <= t_ns:
-                queue.extend(node.advance(t_ns))
-        return self._settle(t_ns)
+                seat.queue.extend(seat.node.advance(t_ns))
+        if rest := self._settle(t_ns):
+            yield rest
+
+    def _synchronise(self, data: bytes, t_ns: int) -> Iterator[list[Frame]]:
+        """Pass a SYNC on. The nodes hear each other's answers to it only once they have all heard the SYNC itself."""
+        if before := self._settle(t_ns):
+            yield before
+        spoken: list[tuple[_Seat, Frame]] = []
+        for kind in self._kinds:
+            for seat in kind:
+                seat.hear(SYNC_ID, data, t_ns)
+            first = len(spoken)
+            while (sender := self._next_sender()) is not None:
+                spoken.append((sender, sender.queue.popleft()))
+            if len(spoken) > first:
+                yield [frame for _, frame in spoken[first:]]
+        for sender, frame in spoken:
+            self._overhear(sender, frame, t_ns)
 
     def _settle(self, t_ns: int) -> list[Frame]:
         """Empty the queues, lowest identifier first, each in its own order; let the other nodes hear every frame."""
         sent: list[Frame] = []
-        while True:
-            sender = min((q for q in self._queues if q), key=_head, default=None)
-            if sender is None:
-                return sent
-            can_id, data = frame = sender.popleft()
+        while (sender := self._next_sender()) is not None:
+            frame = sender.queue.popleft()
             sent.append(frame)
             if len(sent) > _MOST_FRAMES:
-                raise BusError(f"the emulated nodes answer each other without an end, last {can_id:03X}")
-            for node, queue in zip(self._nodes, self._queues, strict=True):
-                if queue is not sender and (answers := node.receive(can_id, data, t_ns)):
-                    queue.extend(answers)
+                raise BusError(f"the emulated nodes answer each other without an end, last {frame[0]:03X}")
+            self._overhear(sender, frame, t_ns)
+        return sent
+
+    def _next_sender(self) -> _Seat | None:
+        return min((seat for seat in self._seats if seat.queue), key=_head, default=None)
+
+    def _overhear(self, sender: _Seat, frame: Frame, t_ns: int) -> None:
+        for seat in self._seats:
+            if seat is not sender:
+                seat.hear(*frame, t_ns)
 
 
-def _head(queue: deque[Frame]) -> int:
-    return queue[0][0]
+def _head(seat: _Seat) -> int:
+    return seat.queue[0][0]
+
+
+def _kind(seat: _Seat) -> type:
+    return type(getattr(seat.node, "application", seat.node))
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """Keep the collector, which stops everything for tens of milliseconds, out of a loop that makes no cycles."""
+    was_enabled = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+        if was_enabled:
+            gc.enable()
 
 
 def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], max_wait_ns: int = MAX_WAIT_NS) -> None:
@@ -96,16 +168,15 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
         max_wait_ns: longest wait, so that `stop` is asked often enough.
     """
     exchange, clock = Exchange(nodes), port.clock
-    now_ns = clock.now_ns()
-    frames = exchange.start(now_ns)
-    while True:
-        if frames:
-            port.send_batch(frames)
-        if stop():
-            return
-        due_ns = exchange.next_deadline_ns
-        until_ns = now_ns + max_wait_ns
-        port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
-        received = port.drain()
+    with _without_garbage_collection():
         now_ns = clock.now_ns()
-        frames = exchange.step(received, now_ns)
+        if boot_ups := exchange.start(now_ns):
+            port.send_batch(boot_ups)
+        while not stop():
+            due_ns = exchange.next_deadline_ns
+            until_ns = now_ns + max_wait_ns
+            port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
+            received = port.drain()
+            now_ns = clock.now_ns()
+            for frames in exchange.batches(received, now_ns):
+                port.send_batch(frames)

@@ -13,6 +13,7 @@ GAIN_ONE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
 _LAST_ORIGIN = SIDE - WINDOW
 _INDEX = np.arange(SIDE, dtype=np.float64)
+_SUMS = np.stack((np.ones(SIDE), _INDEX), axis=1)
 TAXEL_AREA_M2 = 1.5875e-3**2
 
 
@@ -28,17 +29,20 @@ def correct(raw: Image, tare: NDArray[np.float64] | None, gain_permille: int, th
     counts = raw.astype(np.float64)
     if tare is not None:
         counts -= tare
-    rounded = np.clip(np.rint(counts * (gain_permille / GAIN_ONE)), 0, FULL_SCALE).astype(np.uint8)
-    return np.where(rounded >= threshold, rounded, np.uint8(0))
+    if gain_permille != GAIN_ONE:
+        counts *= gain_permille / GAIN_ONE
+    np.rint(counts, out=counts)
+    np.minimum(counts, FULL_SCALE, out=counts)
+    counts[counts < max(threshold, 0)] = 0.0
+    return counts.astype(np.uint8)
 
 
 def _moments(image: Image) -> tuple[float, float, float]:
     """Sum, centroid row, centroid column; the centre of the pad without a contact."""
-    rows, columns = image.sum(axis=1, dtype=np.float64), image.sum(axis=0, dtype=np.float64)
-    total = float(rows.sum())
+    (total, columns), (rows, _) = (_SUMS.T @ image @ _SUMS).tolist()
     if total == 0.0:
         return 0.0, (SIDE - 1) / 2, (SIDE - 1) / 2
-    return total, float(rows @ _INDEX) / total, float(columns @ _INDEX) / total
+    return total, rows / total, columns / total
 
 
 def follow(image: Image, origin: tuple[int, int]) -> tuple[int, int]:

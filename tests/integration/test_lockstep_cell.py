@@ -170,7 +170,7 @@ def test_the_drives_are_moving_until_quick_stop_brings_them_to_rest():
         session.run(step)
     q = session.truth["q"]
     assert np.abs(q[795] - q[790]).max() > 1e-4  # it was moving
-    assert np.abs(q[-1] - q[-2]).max() < 1e-9
+    assert np.abs(q[-1] - q[-2]).max() < 5e-5  # a tenth of a count of the coarsest joint, each cycle
     assert_safe(session)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -60,7 +61,7 @@ class ContactSensing:
         self.flange_probe = flange_probe
         self.radius = radius
         self.stiffness = stiffness
-        self.kappa = np.zeros(2)
+        self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
         self._calibration = calibration
@@ -75,9 +76,13 @@ class ContactSensing:
         self.patch = patch_of(measurement.tactile, self._calibration)
         return self.patch
 
+    def set_kappa(self, kappa: Vector) -> None:
+        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them."""
+        self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, kappa))
+
     def depth(self, force: float) -> float:
-        """Indentation (m) of the layer at ``force`` (N) on the curvature known so far."""
-        return float(indentation_from_force(force, self.stiffness, self.radius, self.kappa))
+        """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
+        return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
 
     def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
         """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""

@@ -173,7 +173,7 @@ class TouchTask:
         }
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
-            self.sensing.kappa = np.asarray(estimate.kappa)
+            self.sensing.set_kappa(np.asarray(estimate.kappa))
 
     def _columns_of(self, measurement: Measurement, patch: Patch, contact: ContactSample | None) -> dict[str, float | Vector]:
         nothing = np.full(3, np.nan)
