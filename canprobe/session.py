@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from canprobe.bus.candump import CandumpWriter, RecordingPort
 from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.memory import garbage_collection_paused
 from canprobe.bus.port import Port
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
@@ -122,6 +123,7 @@ class Session:
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
             self._cell = make_cell(self.plan, port, self._say)
+            self._stack.enter_context(garbage_collection_paused())
             self._stack.enter_context(self._cell)
         except BaseException:
             self._close()

@@ -71,11 +71,27 @@ class Dictionary:
         """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
         self._refreshers[index] = refresh
 
-    def is_plain(self, key: int) -> bool:
-        """Whether a write needs nothing but the assignment."""
-        entry, index = self.entries[key], key >> 8
-        limited = entry.low is not None or entry.high is not None
-        return not (limited or index in self._checks or index in self._hooks)
+    def storer(self, key: int) -> Callable[[Value], None] | None:
+        """What stores a value of a cyclic RPDO, or None where the assignment is all there is to it.
+
+        The same as `write_value`, with the look-ups done once. Hooks and checks hung in later are not seen.
+        """
+        entry, index, subindex = self.entries[key], key >> 8, key & 0xFF
+        checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
+        if entry.low is None and entry.high is None and not checks and not hooks:
+            return None
+        values = self.values
+
+        def store(value: Value) -> None:
+            entry.check_limits(value)
+            for check in checks:
+                check(subindex, value)
+            values[key] = value
+            for hook in hooks:
+                hook(subindex, value)
+            self.written(key)
+
+        return store
 
     def find(self, index: int, subindex: int) -> Entry:
         """The entry, or SdoAbort: no object, or no such subindex of it."""

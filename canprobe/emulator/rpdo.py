@@ -5,10 +5,12 @@ Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from canprobe.emulator.aborts import SdoAbort
 from canprobe.emulator.core import NodeCore
 from canprobe.emulator.emergency import Emergency
-from canprobe.emulator.entries import key_of
+from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.pdo_rules import COB_ID, EVENT, TYPE, PdoRules
 from canprobe.protocol.emcy import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT
 from canprobe.protocol.pdo import PdoLayout
@@ -40,7 +42,7 @@ class Rpdo:
         self._core, self._emcy, self._rules = core, emcy, rules
         self._timer = core.timers.new(self._timed_out)
         self._layout = PdoLayout(0, ())
-        self._plan: tuple[tuple[int, bool], ...] = ()
+        self._plan: tuple[tuple[int, Callable[[Value], None] | None], ...] = ()
         self._event_ns = 0
         self.cob_id: int | None = None
         self.synchronous = False
@@ -57,7 +59,7 @@ class Rpdo:
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, entries)
         keys = [key_of(signal.index, signal.subindex) for signal in self._layout.signals]
-        self._plan = tuple((key, dictionary.is_plain(key)) for key in keys)
+        self._plan = tuple((key, dictionary.storer(key)) for key in keys)
         self.synchronous = dictionary.number(index, TYPE) <= 240
         self._event_ns = dictionary.number(index, EVENT) * 1_000_000
 
@@ -94,13 +96,13 @@ class Rpdo:
     def apply(self, data: bytes) -> None:
         """Store the values; one that the dictionary refuses is dropped."""
         self.pending = None
-        dictionary = self._core.dictionary
-        for value, (key, plain) in zip(self._layout.unpack(data), self._plan, strict=True):
-            if plain:
-                dictionary.values[key] = value
+        values = self._core.dictionary.values
+        for value, (key, store) in zip(self._layout.unpack(data), self._plan, strict=True):
+            if store is None:
+                values[key] = value
                 continue
             try:
-                dictionary.write_value(dictionary.entries[key], value)
+                store(value)
             except SdoAbort:
                 continue
 
