@@ -41,7 +41,7 @@ class Touches(NamedTuple):
 
 def make_touches(points: Array, normals: Array, noise: Noise) -> Touches:
     """Extent and length of arrays that are already checked."""
-    floor = _FLOOR * math.sqrt(float(np.mean(noise.point_variance)))
+    floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
     steps = np.diff(points, axis=0)
     distance = float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
     return Touches(points, normals, noise, path_extent(points, floor), distance)

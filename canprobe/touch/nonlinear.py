@@ -17,8 +17,11 @@ from canprobe.touch.rank import Decision, decide, spread_of
 
 CHI2_999 = 16.27
 _MEDIAN_CHI2 = 2.366
-_TOLERANCE = 1e-9
+_TOLERANCE = 3e-8
 _ITERATIONS = 40
+_START_ROUNDS = 8
+_GROSS = 60.0
+"""Squared residual over its scale, of some sample, at which the linear start is made robust."""
 
 
 class Fit(NamedTuple):
@@ -48,9 +51,8 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
         d: constant parts (`quadric.design`).
         prior: rows (6, 9) and right-hand side (6,) (`Prior.rows`).
     """
-    spread = spread_of(d.X, float(d.point_variance.mean()))
-    A, b = linear_rows(d)
-    c, root, decision = _solve(A, b, prior, spread, 0.0)
+    spread = spread_of(d.X, d.point_variance)
+    c, root, decision = _start(d, prior, spread)
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
     for _ in range(_ITERATIONS):
@@ -65,19 +67,42 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
         best, best_cost, halvings = c, cost, 0
         w = np.sqrt(weight)[:, None]
         rw, Jw = (r * w).reshape(-1), (J * w[:, :, None]).reshape(-1, 9)
-        target, root, decision = _solve(Jw, Jw @ c - rw, prior, spread, _size(c))
+        target, root, decision = _solve(Jw, Jw @ c - rw, prior, spread, _size(c), known=decision)
         step = target - best
         c = target
         if np.abs(step).max() < _TOLERANCE:
-            converged = True
-            break
+            final = _solve(Jw, Jw @ best - rw, prior, spread, _size(c))
+            if final[2].rank == decision.rank:
+                c, root, decision = final
+                converged = True
+                break
+            decision = final[2]
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
     return Fit(c, root, decision, float(weight @ square) / freedom, int(np.sum(weight < 1.0)), converged)
 
 
+def _start(d: Design, prior: tuple[Array, Array], spread: Array) -> tuple[Array, Array, Decision]:
+    """The linear solution; where some samples are far off, again with weights that fall with the square."""
+    A, b = linear_rows(d)
+    answer = _solve(A, b, prior, spread, 0.0)
+    for _ in range(_START_ROUNDS):
+        square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)
+        scale = _median(square) / _MEDIAN_CHI2
+        if float(square.max()) < _GROSS * scale:
+            break
+        w = np.sqrt(1.0 / (1.0 + square / (9.0 * max(scale, 1e-300)))).repeat(3)
+        answer = _solve(A * w[:, None], b * w, prior, spread, 0.0)
+    return answer
+
+
+def _median(values: Array) -> float:
+    middle = len(values) // 2
+    return float(np.partition(values, middle)[middle])
+
+
 def huber(square: Array) -> tuple[Array, float]:
     """Weights (n,) and the robust cost of squared whitened residuals (n,)."""
-    limit = CHI2_999 * max(1.0, float(np.partition(square, len(square) // 2)[len(square) // 2]) / _MEDIAN_CHI2)
+    limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
     ratio = np.sqrt(limit / np.maximum(square, limit))
     # Huber: d² inside, 2 k d − k² outside
     return ratio, float(np.sum(np.where(ratio < 1.0, limit * (2.0 / ratio - 1.0), square)))
@@ -89,18 +114,35 @@ def _size(c: Array) -> float:
     return float(2.0 * np.sqrt(c11 * c11 + 2.0 * c12 * c12 + c22 * c22))
 
 
-def _solve(A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float) -> tuple[Array, Array, Decision]:
-    """Least squares by QR; combinations of K that were not observed are held at the value nearest to flat."""
+def _solve(
+    A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float, *, known: Decision | None = None
+) -> tuple[Array, Array, Decision]:
+    """Least squares by QR; combinations of K that were not observed are held at the value nearest to flat.
+
+    A decision that is `known` to have found everything observed is not taken again.
+    """
     P, p = prior
     stacked = np.empty((len(A) + 6, 10))
     stacked[:-6, :9], stacked[:-6, 9] = A, b
     stacked[-6:, :9], stacked[-6:, 9] = P, p
     full = upper_root(stacked)
     root, z = full[:9, :9], full[:9, 9]
+    if known is not None and known.rank == 3:
+        return solved(root, z), root, known
     root_q, has_prior = root[6:, 6:] * UNIT, bool(P[3:].any())
     # rank is the data's: a prior on K itself is left out of it
     data = upper_root(np.concatenate([A, P[:3]])) if has_prior else root
     decision = decide(data[6:, 6:] * UNIT, spread, size)
+    if has_prior and decision.rank < 3:
+        # what only noise says about the open combinations is taken out, the prior alone speaks there
+        V = UNIT[:, None] * decision.vectors[:, decision.passed]
+        seen = V @ (decision.vectors[:, decision.passed].T / UNIT)
+        hidden = stacked[:-3, 6:9] @ (np.eye(3) - seen)
+        mean = p[3:] / np.diag(P[3:, 6:])
+        stacked[:-3, 6:9] -= hidden
+        stacked[:-3, 9] -= hidden @ mean
+        full = upper_root(stacked)
+        root, z = full[:9, :9], full[:9, 9]
     if has_prior or decision.rank == 3:
         return solved(root, z), root, decision
     V = decision.vectors[:, decision.passed]

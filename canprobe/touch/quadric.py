@@ -139,7 +139,7 @@ def rows(c: Array, d: Design) -> Rows:
     V = np.empty((len(X), 3, 3))
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
-    bend = (V @ B) @ d.T.mT * inverse[:, None, None]
+    bend = (V.reshape(-1, 3) @ B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
     W = _whitener(bend[:, 1:], V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
     X = _likely_places(d, X, (r[:, None] @ W)[:, 0], bend[:, 1:], V[:, 0])

@@ -87,10 +87,11 @@ def turned(angle: float) -> Array:
     return np.array([[c * c, cs, s * s], [-cs, c * c - s * s, cs], [s * s, -cs, c * c]])
 
 
-def spread_of(points: Array, variance: float) -> Array:
-    """Covariance (2, 2) of points (n, 2 or 3) in the tangent plane, over the variance of their noise per axis."""
-    offset = points[:, :2] - points[:, :2].mean(axis=0)
-    result: Array = offset.T @ offset / (len(points) * variance)
+def spread_of(points: Array, variance: Array) -> Array:
+    """Covariance (2, 2) of points (n, 2 or 3) in the tangent plane, over the variance (n,) of their noise per axis."""
+    weight = 1.0 / variance
+    offset = points[:, :2] - weight @ points[:, :2] / weight.sum()
+    result: Array = (offset * weight[:, None]).T @ offset / len(points)
     return result
 
 

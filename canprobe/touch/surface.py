@@ -63,11 +63,10 @@ class SurfaceMatrix:
             radius: m; negative for the inside of a tube.
             axis: direction of the centre line in the tangent plane, "x", "y" or an angle from x in rad.
         """
-        angles = {"x": 0.0, "y": 0.5 * math.pi}
-        if isinstance(axis, str) and axis not in angles:
+        named = {"x": (0.0, 1.0), "y": (1.0, 0.0)}
+        if isinstance(axis, str) and axis not in named:
             raise UsageError(f'axis: expected "x", "y" or an angle in rad, got {axis!r}')
-        angle = angles[axis] if isinstance(axis, str) else float(axis)
-        across = np.array([-math.sin(angle), math.cos(angle)])
+        across = named[axis] if isinstance(axis, str) else (-math.sin(axis), math.cos(axis))
         k = 1.0 / _nonzero("radius", radius)
         return cls.from_curvature(k * np.outer(across, across), c33=0.5 * k)
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive, solved, upper_root
 from canprobe.touch.anchor import anchor, foot, solution
 from canprobe.touch.contact import ContactSample
@@ -61,7 +62,7 @@ class RecursiveEstimator:
         sigma_point, sigma_normal: effective noise, m and rad.
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
-        prior: None for `Prior.weak` over the memory. A prior on curvature itself is not taken here.
+        prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
     """
 
     def __init__(
@@ -78,6 +79,8 @@ class RecursiveEstimator:
         self._memory = positive("memory_m", memory_m)
         self._crowd = CROWD * positive("window", window) / memory_m
         self._prior = Prior.weak(memory_m) if prior is None else prior
+        if math.isfinite(self._prior.sigma_curvature):
+            raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
         self._prior_rows = self._make_prior_rows()
         self.reset()
 
@@ -127,6 +130,8 @@ class RecursiveEstimator:
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
         root = upper_root(solved(a.M.T, self._root.T).T)
         decision = decide(root[6:, 6:] * UNIT, spread, size)
+        known = decision.vectors[:, decision.passed]
+        a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
         here = a._replace(M=np.eye(9), turn=0.0)
         singular = np.linalg.svd(self._root, compute_uv=False)
         return build_estimate(

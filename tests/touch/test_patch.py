@@ -1,0 +1,138 @@
+"""Patch moments against integrals of elliptic patches."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from canprobe.errors import UsageError
+from canprobe.touch.patch import PatchCalibration, calibrate_force, compute_patch, patch_from_features
+
+PITCH = 1.5875e-3
+EXACT = PatchCalibration(threshold_counts=0)
+
+
+def press(u0, v0, a, b, angle=0.0, *, peak=80e3, fine=24):
+    """Exact taxel means of an elliptic paraboloid of pressure, rounded to counts."""
+    k = (np.arange(16 * fine) + 0.5) / fine - 8.0
+    V, U = np.meshgrid(k * PITCH, k * PITCH, indexing="ij")
+    c, s = math.cos(angle), math.sin(angle)
+    x, y = c * (U - u0) + s * (V - v0), -s * (U - u0) + c * (V - v0)
+    p = peak * np.maximum(1 - (x / a) ** 2 - (y / b) ** 2, 0)
+    return np.round(p.reshape(16, fine, 16, fine).mean(axis=(1, 3)) / 100e3 * 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize(("u0", "v0", "angle"), [(0, 0, 0), (1.1e-3, -0.7e-3, 0.5), (-2e-3, 3e-3, -1.2)])
+def test_moments_of_an_elliptic_patch(u0, v0, angle):
+    a, b = 5.8e-3, 4.0e-3
+    patch = compute_patch(press(u0, v0, a, b, angle), EXACT)
+    assert (patch.u, patch.v) == pytest.approx((u0, v0), abs=0.02e-3)
+    assert patch.force == pytest.approx(math.pi * a * b * 80e3 / 2, rel=0.015)
+    c, s = math.cos(angle), math.sin(angle)
+    wanted = np.array([[c, -s], [s, c]]) @ np.diag([a * a / 6, b * b / 6]) @ np.array([[c, s], [-s, c]])
+    got = np.array([[patch.var_uu, patch.var_uv], [patch.var_uv, patch.var_vv]])
+    assert np.allclose(got, wanted, atol=0.03 * a * a / 6)
+    assert patch.good
+
+
+def test_rows_are_v_and_columns_are_u():
+    image = np.zeros((16, 16), np.uint8)
+    image[3, 9:13] = 100
+    patch = compute_patch(image, PatchCalibration())
+    assert patch.v == pytest.approx((3 - 7.5) * PITCH)
+    assert patch.u == pytest.approx((10.5 - 7.5) * PITCH, rel=1e-2)
+    assert patch.var_uu > 0 > patch.var_vv  # one row: no width but what pitch²/12 takes off
+
+
+def test_nothing_there():
+    patch = compute_patch(np.full((16, 16), 4, np.uint8), PatchCalibration())
+    assert patch.force == 0.0
+    assert math.isnan(patch.u)
+    assert patch.n_active == 0
+    assert patch.too_few
+    assert not patch.good
+
+
+def test_flags():
+    image = press(0, 0, 4e-3, 4e-3)
+    assert not compute_patch(image, EXACT, (4, 4, 8, 8)).cut_by_window
+    assert compute_patch(image, EXACT, (6, 4, 8, 8)).cut_by_window
+    assert compute_patch(image, EXACT, (4, 2, 8, 7)).cut_by_window
+    edge = compute_patch(press(-11e-3, 0, 4e-3, 4e-3), EXACT, (4, 0, 8, 8))
+    assert (edge.cut_by_pad, edge.cut_by_window) == (True, False)
+    hot = image.copy()
+    hot[7, 7] = 255
+    assert compute_patch(hot, EXACT).saturated
+    few = np.zeros((16, 16), np.uint8)
+    few[7, 7:10] = 50
+    assert compute_patch(few, EXACT).too_few
+    few[8, 8] = 50
+    assert not compute_patch(few, EXACT).too_few
+
+
+def test_blur_variance_is_taken_off():
+    image = press(0, 0, 5e-3, 4e-3)
+    plain, less = (
+        compute_patch(image, EXACT),
+        compute_patch(image, PatchCalibration(threshold_counts=0, blur_var_m2=1e-6)),
+    )
+    assert plain.var_uu - less.var_uu == pytest.approx(1e-6)
+    assert plain.var_uv == less.var_uv
+
+
+def test_features_say_the_same_as_the_image():
+    image = press(1e-3, -2e-3, 5e-3, 4e-3, 0.4)
+    full = compute_patch(image, EXACT)
+    p = image / 255 * 100e3 * PITCH**2
+    row, col = np.mgrid[:16, :16]
+    force = p.sum()
+    r, q = (p * row).sum() / force, (p * col).sum() / force
+    features = SimpleNamespace(
+        force_n=force,
+        row=r,
+        col=q,
+        var_rr=(p * (row - r) ** 2).sum() / force,
+        var_rc=(p * (row - r) * (col - q)).sum() / force,
+        var_cc=(p * (col - q) ** 2).sum() / force,
+        peak=int(image.max()),
+    )
+    patch = patch_from_features(features, EXACT)
+    assert patch.force == pytest.approx(full.force, rel=0.01)  # the node does not know the sphere
+    assert (patch.u, patch.v) == pytest.approx((full.u, full.v), abs=0.02e-3)
+    assert (patch.var_uu, patch.var_uv, patch.var_vv) == pytest.approx(
+        (full.var_uu, full.var_uv, full.var_vv), abs=0.05e-6
+    )
+    assert patch.peak_pa == full.peak_pa
+    assert not patch.too_few
+    nothing = SimpleNamespace(force_n=0.0, row=0.0, col=0.0, var_rr=0.0, var_rc=0.0, var_cc=0.0, peak=0)
+    assert patch_from_features(nothing, EXACT).too_few
+
+
+def test_force_calibration_recovers_a_lossy_sensor():
+    forces = np.linspace(0.3, 3.0, 12)
+    sums = forces**1.03 * 0.85
+    fitted = calibrate_force(sums, forces, PatchCalibration(full_scale_pa=300e3))
+    assert fitted.full_scale_pa == 300e3
+    back = fitted.force_gain * sums + fitted.edge_gain * np.sqrt(sums)
+    assert np.abs(back / forces - 1).max() < 0.01
+    assert fitted.bias < 0.02
+    exact = calibrate_force(forces, 1.2 * forces - 0.1 * np.sqrt(forces))
+    assert (exact.force_gain, exact.edge_gain) == pytest.approx((1.2, -0.1))
+
+
+@pytest.mark.parametrize(
+    ("call", "field"),
+    [
+        (lambda: compute_patch(np.zeros((8, 8), np.uint8), EXACT), "taxels"),
+        (lambda: compute_patch(np.zeros((16, 16)), EXACT), "taxels"),
+        (lambda: PatchCalibration(pitch_m=0.0), "pitch_m"),
+        (lambda: calibrate_force([1, 2], [1, 2]), "sums, forces"),
+        (lambda: calibrate_force([1, 2, -3], [1, 2, 3]), "sums, forces"),
+    ],
+)
+def test_errors_name_the_field(call, field):
+    with pytest.raises(UsageError, match=f"^{field}: expected"):
+        call()
