@@ -29,7 +29,7 @@ class Participant(Protocol):
     """A node that is a pure function of frames and time; what it returns is sent in that order.
 
     It may have an attribute `listens`, a container that always holds the identifiers it takes at present; the bus then
-    spares it the others.
+    spares it the others. If those change, it also has an attribute `rerouted`, a function of the bus's that it calls.
     """
 
     @property
@@ -50,6 +50,7 @@ class Participant(Protocol):
         ...
 
 
+_Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node"]
 _Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node", Container[int] | None]
 """How to call a participant, its queue, and the identifiers it listens to (None: all)."""
 
@@ -57,7 +58,7 @@ _Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node", Contain
 class _Node:
     """The bus's view of one sender: its queue, and where its frames go."""
 
-    __slots__ = ("due", "inboxes", "order", "outbox", "owner", "receivers")
+    __slots__ = ("due", "inboxes", "listeners", "order", "outbox", "owner", "receivers")
 
     def __init__(self, owner: Participant | LockstepPort, order: int) -> None:
         self.owner = owner
@@ -65,6 +66,7 @@ class _Node:
         self.outbox: deque[Frame] = deque()
         self.due: int | None = None  # the owner's deadline, as last seen
         self.receivers: tuple[_Receiver, ...] = ()
+        self.listeners: dict[int, tuple[_Listener, ...]] = {}  # of an identifier, found once until somebody reroutes
         self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
 
 
@@ -92,6 +94,8 @@ class LockstepBus:
     def attach(self, participant: Participant) -> None:
         """Put `participant` on the bus and start it; what it says is carried when time moves or a port is used."""
         node = self._add(participant)
+        if hasattr(participant, "rerouted"):
+            participant.rerouted = self._forget_listeners
         self._queue(node, participant.start(self.clock.now_ns()))
         node.due = participant.next_deadline_ns
 
@@ -170,9 +174,10 @@ class LockstepBus:
                 raise self._endless(t_ns, what)
             if recorder is not None:
                 recorder(can_id, data, t_ns)
-            for receive, receiver, listens in sender.receivers:
-                if listens is not None and can_id not in listens:
-                    continue
+            listeners = sender.listeners.get(can_id)
+            if listeners is None:
+                listeners = sender.listeners[can_id] = _listeners(sender, can_id)
+            for receive, receiver in listeners:
                 answers = receive(can_id, data, t_ns)
                 receiver.due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
                 if answers:
@@ -218,8 +223,13 @@ class LockstepBus:
                 for other, owner in self._participants
                 if other is not node
             )
+            node.listeners.clear()
             ports = (other.owner for other in self._nodes if other is not node)
             node.inboxes = tuple(port.inbox.append for port in ports if isinstance(port, LockstepPort))
+
+    def _forget_listeners(self) -> None:
+        for node in self._nodes:
+            node.listeners.clear()
 
     def _names_due(self, t_ns: int) -> str:
         return ", ".join(_name(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns)
@@ -229,6 +239,10 @@ class LockstepBus:
         for node in self._nodes:
             node.outbox.clear()
         return BusError(f"{self.channel}: no end at {t_ns * 1e-9:.6f} s: {what}")
+
+
+def _listeners(sender: _Node, can_id: int) -> tuple[_Listener, ...]:
+    return tuple((r, node) for r, node, listens in sender.receivers if listens is None or can_id in listens)
 
 
 class LockstepPort:

@@ -80,6 +80,7 @@ class DriveGroup:
         self._heard = [-1] * len(axes)
         self._targets: list[int] | None = None
         self._words = [0] * len(axes)
+        self._steady: tuple[object, ...] | None = None
         self._frames = _command_frames(axes)
         self._sent: dict[int, tuple[bytes, int]] = {}
         self._repeat = repeat_cycles
@@ -134,7 +135,7 @@ class DriveGroup:
     @property
     def states(self) -> tuple[DriveState, ...]:
         """CiA 402 state of each drive, from its last statusword."""
-        return tuple(state_of(word) for word in self.statuswords)
+        return tuple([state_of(word) for word in self.statuswords])
 
     def all_in(self, *states: DriveState) -> bool:
         """Every drive is in one of ``states``."""
@@ -148,13 +149,17 @@ class DriveGroup:
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
         targets = self._targets if self._targets is not None else self._counts
-        self._words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]
+        key = (self.goal, *self.statuswords)
+        if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
+            words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]
+            self._steady = key if words == self._words else None
+            self._words = words
         values = list(zip(self._words, targets, strict=True))
         frames = []
         for frame in self._frames:
             data = b""
             for axis, layout, picks in frame.parts:
-                part = layout.pack(*(values[axis][pick] for pick in picks))
+                part = layout.pack(*[values[axis][pick] for pick in picks])
                 data = bytes(a | b for a, b in zip(data, part, strict=True)) if data else part
             if frame.every_cycle or self._due(frame.cob_id, data):
                 frames.append((frame.cob_id, data))

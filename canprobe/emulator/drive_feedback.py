@@ -61,7 +61,8 @@ class DriveFeedback:
         values, key = self._core.dictionary.values, index << 8
 
         def sample(t_ns: int) -> None:
-            self.measure(t_ns)
+            if t_ns != self._t_ns:
+                self.measure(t_ns)
             values[key] = source()
 
         return sample

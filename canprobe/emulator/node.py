@@ -11,7 +11,7 @@ Source: CiA 301 (the clauses are cited in the services).
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Callable, Container
 
 from canopen.objectdictionary import ObjectDictionary
 
@@ -38,6 +38,7 @@ class SlaveNode:
         core: state, dictionary and timers, shared with the services.
         emcy, pdos, store: the services an application works with.
         application: the device.
+        rerouted: called when `listens` has changed; a bus puts its own function there.
     """
 
     def __init__(
@@ -56,6 +57,7 @@ class SlaveNode:
         self._boot_ns = boot_ns
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
+        self.rerouted: Callable[[], None] = _nothing
         self.emcy = Emergency(core)
         self.pdos = PdoEngine(core, self.emcy, self.application)
         self.store = Store(core)
@@ -194,6 +196,11 @@ class SlaveNode:
             for service in self._services:
                 routes.update(service.routes())
             routes[NMT_ID] = self._nmt
+        self.rerouted()
+
+
+def _nothing() -> None:
+    return None
 
 
 def _sdo_servers(core: NodeCore) -> list[int]:

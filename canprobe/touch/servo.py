@@ -11,6 +11,7 @@ Source: Chen, Rink & Zhang, section 4.2 (the five steps around (36)), with a dam
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,6 +20,9 @@ from numpy.typing import NDArray
 from canprobe.touch.strategy import PathFollower
 
 Vector = NDArray[np.float64]
+Floats = Sequence[float]
+STEEPEST = 0.2
+"""Least cosine between surface normal and approach direction that is reckoned with: 78 degrees."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,18 +50,44 @@ class LocalSurface:
     """
 
     def __init__(self, point: Vector, normal: Vector, gains: SurfaceGains) -> None:
-        self.point = np.array(point, dtype=float)
-        self.normal = np.array(normal, dtype=float)
-        self.curvature = np.zeros((3, 3))
+        self._point: Floats = tuple(point.tolist())
+        self._normal: Floats = _unit(normal.tolist())
+        self._curvature: list[list[float]] = [[0.0] * 3] * 3
         self._gains = gains
+
+    @property
+    def point(self) -> Vector:
+        """The point (3,), m, that the model stands on."""
+        return np.array(self._point)
+
+    @property
+    def normal(self) -> Vector:
+        """Outward unit normal (3,) there."""
+        return np.array(self._normal)
 
     def foot(self, x: Vector) -> tuple[Vector, Vector]:
         """Surface point and outward unit normal over the tangential position of ``x`` (3,), m."""
-        d = x - self.point
-        d = d - self.normal * float(self.normal @ d)
-        bent = self.curvature @ d
-        normal = self.normal + bent
-        return self.point + d - self.normal * (0.5 * float(d @ bent)), normal / math.sqrt(float(normal @ normal))
+        foot, normal = self.foot_of(x.tolist())
+        return np.array(foot), np.array(normal)
+
+    def foot_of(self, x: Floats) -> tuple[Floats, Floats]:
+        """The same on plain floats: on 3-vectors numpy costs ten times as much."""
+        a0, a1, a2 = self._point
+        m0, m1, m2 = self._normal
+        d0, d1, d2 = x[0] - a0, x[1] - a1, x[2] - a2
+        height = d0 * m0 + d1 * m1 + d2 * m2
+        d0, d1, d2 = d0 - height * m0, d1 - height * m1, d2 - height * m2
+        (k00, k01, k02), (_, k11, k12), (_, _, k22) = self._curvature
+        b0 = k00 * d0 + k01 * d1 + k02 * d2
+        b1 = k01 * d0 + k11 * d1 + k12 * d2
+        b2 = k02 * d0 + k12 * d1 + k22 * d2
+        sag = 0.5 * (d0 * b0 + d1 * b1 + d2 * b2)
+        n0, n1, n2 = m0 + b0, m1 + b1, m2 + b2
+        size = math.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        return (
+            (a0 + d0 - sag * m0, a1 + d1 - sag * m1, a2 + d2 - sag * m2),
+            (n0 / size, n1 / size, n2 / size),
+        )
 
     def correct(self, point: Vector, normal: Vector, dt: float) -> float:
         """Move the model to a measured contact and towards it.
@@ -70,18 +100,18 @@ class LocalSurface:
         Returns:
             The height error before correction (m), positive where the surface was found higher than modelled.
         """
-        foot, foot_normal = self.foot(point)
-        error = float(foot_normal @ (point - foot))
+        p, n = point.tolist(), normal.tolist()
+        foot, m = self.foot_of(p)
+        error: float = sum(mi * (pi - fi) for mi, pi, fi in zip(m, p, foot, strict=True))
         height = 1 - math.exp(-2 * math.pi * self._gains.height_hz * dt)
         tilt = 1 - math.exp(-2 * math.pi * self._gains.tilt_hz * dt)
-        self.point = foot + foot_normal * (height * error)
-        blended = foot_normal + (normal - foot_normal) * tilt
-        self.normal = blended / math.sqrt(float(blended @ blended))
+        self._point = tuple([fi + mi * height * error for fi, mi in zip(foot, m, strict=True)])
+        self._normal = _unit([mi + (ni - mi) * tilt for mi, ni in zip(m, n, strict=True)])
         return error
 
     def set_curvature(self, tensor: Vector) -> None:
-        """Take the estimator's curvature tensor (3, 3), 1/m, in the same frame."""
-        self.curvature = tensor
+        """Take the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
+        self._curvature = tensor.tolist()
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,12 +146,12 @@ class TactileServo:
     ) -> None:
         self.surface = surface
         self._follower = follower
-        self._heading, self._across, self._up = axes
-        self._origin = origin
+        self._heading, self._across, self._up = axes.tolist()
+        self._origin = origin.tolist()
         self._radius = probe_radius
         self._share = rolling_share
-        self._reference = np.array(surface.point)
-        self._first_pole = -np.array(surface.normal)
+        self._reference: Floats = tuple(surface.point.tolist())
+        self._first_pole = (-surface.normal).tolist()
 
     def step(self, speed: float, depth: float, dt: float) -> ProbePose:
         """One servo cycle.
@@ -134,23 +164,31 @@ class TactileServo:
         Returns:
             The pose the probe must have when this cycle's command takes effect.
         """
-        foot, normal = self.surface.foot(self._reference)
+        foot, normal = self.surface.foot_of(self._reference)
         if speed > 0 and self._follower is not None:
             foot, normal = self._march(self._follower, foot, normal, speed * dt)
         self._reference = foot
-        pole = -(1 - self._share) * normal + self._share * self._first_pole
-        return ProbePose(foot + normal * (self._radius - depth), pole / math.sqrt(float(pole @ pole)))
+        reach, share = self._radius - depth, self._share
+        pole = _unit([share * p - (1 - share) * n for p, n in zip(self._first_pole, normal, strict=True)])
+        return ProbePose(np.array([f + reach * n for f, n in zip(foot, normal, strict=True)]), np.array(pole))
 
-    def _march(
-        self, follower: PathFollower, foot: Vector, normal: Vector, distance: float
-    ) -> tuple[Vector, Vector]:
-        offset = foot - self._origin
-        steep = float(normal @ self._up)
-        along, across = follower.step(
-            float(self._heading @ offset), float(self._across @ offset), distance * max(steep, 0.2)
-        )
-        heading = self._heading * along + self._across * across
-        tangent = heading - self._up * (float(normal @ heading) / max(steep, 0.2))
-        tangent = tangent - normal * float(normal @ tangent)
-        return self.surface.foot(foot + tangent * (distance / math.sqrt(float(tangent @ tangent))))
+    def _march(self, follower: PathFollower, foot: Floats, normal: Floats, distance: float) -> tuple[Floats, Floats]:
+        """One step along the heading, lifted out of the scan plane into the tangent plane."""
+        offset = [f - o for f, o in zip(foot, self._origin, strict=True)]
+        steep = max(_dot(normal, self._up), STEEPEST)
+        along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), distance * steep)
+        flat = [along * h + across * c for h, c in zip(self._heading, self._across, strict=True)]
+        rise = _dot(normal, flat) / steep
+        lifted = [f - rise * u for f, u in zip(flat, self._up, strict=True)]
+        out = _dot(normal, lifted)
+        tangent = _unit([v - out * n for v, n in zip(lifted, normal, strict=True)])
+        return self.surface.foot_of([f + distance * t for f, t in zip(foot, tangent, strict=True)])
 
+
+def _dot(a: Floats, b: Floats) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _unit(v: Floats) -> Floats:
+    size = math.sqrt(_dot(v, v))
+    return (v[0] / size, v[1] / size, v[2] / size)

@@ -125,6 +125,6 @@ def test_local_surface_bends_away_from_the_outward_normal_where_convex():
 def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
     local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
     servo = TactileServo(local, None, axes=AXES, origin=np.zeros(3), probe_radius=RADIUS_P, rolling_share=share)
-    local.normal = np.array((np.sin(0.1), 0.0, np.cos(0.1)))
+    local.correct(np.zeros(3), np.array((np.sin(0.1), 0.0, np.cos(0.1))), dt=1e6)
     pole = servo.step(0.0, DEPTH, DT).pole
     assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))

@@ -139,16 +139,17 @@ class IdealArm:
         """
         a = self._axes[axis]
         ramp = (t0_ns, t1_ns, start_counts, end_counts)
-        a.coming = [r for r in a.coming if r[0] < t0_ns]
+        if a.coming:
+            a.coming = [r for r in a.coming if r[0] < t0_ns]
         if t0_ns > self.t_ns:
             a.coming.append(ramp)
             a.plan_event()
             return
-        a.anchor(self.t_ns, self._state(a, self.t_ns))
+        states = self._states()
+        a.anchor(self.t_ns, states[axis])
         a.coming.clear()
         a.begin(ramp)
-        if self._evaluated is not None:  # the other motors know nothing of this ramp
-            self._evaluated[axis] = self._state(a, self.t_ns)
+        states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
