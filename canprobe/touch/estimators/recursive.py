@@ -27,7 +27,7 @@ from canprobe.touch.nonlinear import CHI2_999, fit
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import UNIT, Design, design, transport
 from canprobe.touch.quadric_row import sample_rows
-from canprobe.touch.rank import decide
+from canprobe.touch.rank import SPREAD, decide, spread_of
 
 DIFFUSE = 1e-2
 """Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
@@ -44,6 +44,8 @@ FADE = 0.1
 """What an alarm leaves of the information's root."""
 ALARM = 2.2
 """Running innovation, over its long-term mean, at which the surface is taken to have changed."""
+LEAST_USUAL = 0.3
+"""Least long-term innovation that an alarm is measured by; it is below 1 where the stated noise is generous."""
 RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
@@ -160,13 +162,14 @@ class RecursiveEstimator:
     def _absorb(self, moved: float) -> None:
         kept = math.exp(-moved / self._memory)
         root = math.sqrt(kept) * self._root
-        block = self._rows_of_pending()
+        points = np.array([s.point for s in self._pending])
+        block = self._rows_of_pending(points)
         weight, changed = self._judge(block, root)
         if changed:
             root, weight, kept = FADE * root, np.ones_like(weight), FADE**2 * kept
         crowd = min(1.0, self._crowd * moved / len(self._pending))
         self._spread.fade(kept)
-        self._spread.add(np.array([s.point for s in self._pending]), crowd)
+        self._spread.add(points, crowd)
         block *= np.sqrt(crowd * weight).repeat(3)[:, None]
         lost = math.sqrt(1.0 - kept) * self._prior_rows
         stacked = np.empty((18 + len(block), 10))
@@ -186,9 +189,11 @@ class RecursiveEstimator:
         travelled = self._travel.total - self._started
         if travelled < self._next_start:
             return
-        fitted = fit(self._design(self._start), self._prior.rows(self._memory))
-        if fitted.decision.rank == 3 and fitted.converged:
-            self._c, self._root = fitted.c, fitted.root
+        d = self._design(self._start)
+        if float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) >= SPREAD:
+            fitted = fit(d, self._prior.rows(self._memory))
+            if fitted.decision.rank == 3 and fitted.converged:
+                self._c, self._root = fitted.c, fitted.root
             self._next_start *= 2.0
         if travelled >= START[1] * self._memory:
             self._next_start, self._start, self._first = math.inf, [], False
@@ -200,15 +205,15 @@ class RecursiveEstimator:
         noise = Noise(np.array([s.sigma_point for s in samples]) / L, np.array([s.sigma_normal for s in samples]))
         return design(points, normals, noise)
 
-    def _rows_of_pending(self) -> Array:
+    def _rows_of_pending(self, points: Array) -> Array:
         """(3n, 10): whitened Jacobian and minus residual."""
         R, origin, L = self._T[:3, :3], self._T[:3, 3], self._memory
         c = self._c.tolist()
+        normals = np.array([s.normal for s in self._pending]) @ R
+        x = (points - origin) @ (R / L)
         block: list[list[float]] = []
-        for s in self._pending:
-            x = (s.point - origin) @ R / L
-            n = s.normal @ R
-            block += sample_rows(c, x.tolist(), n.tolist(), (s.sigma_point / L) ** 2, s.sigma_normal**2)
+        for s, xi, ni in zip(self._pending, x.tolist(), normals.tolist(), strict=True):
+            block += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
         return np.array(block)
 
     def _judge(self, block: Array, root: Array) -> tuple[Array, bool]:
@@ -220,7 +225,7 @@ class RecursiveEstimator:
         mean = float(np.minimum(d2, CHI2_999).mean()) / 3.0
         self._innovation += min(1.0, RUNNING * len(d2)) * (mean - self._innovation)
         self._usual += min(1.0, LONG_TERM * len(d2)) * (mean - self._usual)
-        if self._first or self._innovation < ALARM * max(1.0, self._usual):
+        if self._first or self._innovation < ALARM * max(LEAST_USUAL, self._usual):
             return weight, False
         self._innovation = self._usual
         self._faded += 1
