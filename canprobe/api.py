@@ -11,10 +11,10 @@ from typing import Any
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.shape import ShapeRecord, replay_samples
-from canprobe.errors import CanprobeError, NodeError
+from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import Session, resolve_scene
+from canprobe.session import LOCKSTEP, Session, resolve_scene
 
 __all__ = ["Command", "Measurement", "RunResult", "emulate", "open_cell", "run", "scan", "up"]
 
@@ -177,6 +177,8 @@ def up(
     Raises:
         UsageError, BusError, SafetyStop: as :func:`run`.
     """
+    if (interface or scene.bus.interface) == LOCKSTEP:
+        raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
     with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())

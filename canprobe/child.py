@@ -26,10 +26,16 @@ END_TIMEOUT_S = 10.0
 _PR_SET_PDEATHSIG = 1
 
 
-def _die_with_parent() -> None:
-    """In the child: be told to stop when the parent is killed. Linux only, and only a second line of defence."""
+def end_with_parent(parent: int) -> None:
+    """In the child: be told to stop when the parent is killed. Linux only, and only a second line of defence.
+
+    Args:
+        parent: its process id; if it has gone already, this process stops at once.
+    """
     with contextlib.suppress(OSError, AttributeError):
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+        if os.getppid() != parent:
+            os.kill(os.getpid(), signal.SIGTERM)
 
 
 class EmulatorChild:
@@ -62,16 +68,15 @@ class EmulatorChild:
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
             *("--bus", bus.interface, "--channel", bus.channel, "--bitrate", str(bus.bitrate)),
-            *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth)),
+            *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth), "--parent", str(os.getpid())),
         ]
         self._errors = (self._folder / "stderr").open("w+b")
-        self._process = subprocess.Popen(
+        self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=self._errors,
             start_new_session=True,
-            preexec_fn=_die_with_parent,  # noqa: PLW1509 - nothing here runs threads
         )
         self._await_boot_ups(port, set(nodes))
 

@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; those of the process by default.
 
     Returns:
-        The exit status, as DESIGN lists it: 0, 1, 2, 3, 130 or 143; 141 when the reader of our output went away.
+        The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:

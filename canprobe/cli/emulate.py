@@ -33,6 +33,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="write the plant's true values there at the end (.npz)"
     )
+    parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.set_defaults(run=run, bus="socketcan")
 
 
@@ -47,8 +48,11 @@ def run(args: argparse.Namespace) -> int:
     wanted = _nodes(args.nodes, scene)
 
     from canprobe import api
+    from canprobe.child import end_with_parent
 
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+        if args.parent is not None:
+            end_with_parent(args.parent)
         api.emulate(
             scene,
             interface=target.interface,

@@ -15,6 +15,8 @@ from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_f
 from canprobe.cell.measurement import Measurement, TactileSample
 
 Vector = NDArray[np.float64]
+HOLLOWEST = 0.9
+"""Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
 
 class JointHistory:
@@ -77,8 +79,12 @@ class ContactSensing:
         return self.patch
 
     def set_kappa(self, kappa: Vector) -> None:
-        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them."""
-        self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, kappa))
+        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
+
+        An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
+        """
+        possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
 
     def depth(self, force: float) -> float:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
