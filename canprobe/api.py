@@ -114,10 +114,11 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     from canprobe.cell.tasks.build import make_shape_estimator
 
     every = max(1, round(0.1 * scene.sensor.rate_hz)) if scene.sensor is not None else 1
-    also = [method for method in scene.shape.also if method != scene.shape.method]
-    return {scene.shape.method: tracker.records} | {
-        method: replay_samples(make_shape_estimator(scene, method), tracker.samples, every) for method in also
-    }
+    estimates: dict[str, list[ShapeRecord]] = {scene.shape.method: tracker.records}
+    for method in scene.shape.also:
+        if method != scene.shape.method:
+            estimates[method] = replay_samples(make_shape_estimator(scene, method), tracker.samples, every)
+    return estimates
 
 
 def _draw(result: RunResult, out: Path) -> None:
@@ -214,7 +215,9 @@ def emulate(
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
-            raise NodeError(busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes")
+            raise NodeError(
+                busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes"
+            )
         say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
         serve(world.participants, port, lambda: False)
     finally:

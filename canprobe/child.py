@@ -41,7 +41,7 @@ def end_with_parent(parent: int) -> None:
 class EmulatorChild:
     """``canprobe emulate`` as a child process.
 
-    It gets a session of its own, so that Ctrl-C reaches only the master, which then stops the drives before their process.
+    It gets a session of its own, so that Ctrl-C reaches only the master, which stops the drives before their process.
 
     Args:
         scene: the resolved scene.

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.cell import Cell
-from canprobe.cell.scoring import ShapeScore, score_contact, score_shape
+from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.planning import Plan
 from canprobe.scene_writer import dump_scene
@@ -74,9 +74,7 @@ def summarise(
         "contact": _contact(session, controller, log),
         "shape": _shape(session, controller, estimates, log),
         "cycle": _cycle(cell, scene.cycle.rate_hz),
-        "bus_load": {
-            scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}
-        },
+        "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "faults": list(cell.faults),
     }
@@ -105,7 +103,9 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
 
 
-def score_all(session: Session, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]) -> dict[str, ShapeScore]:
+def score_all(
+    session: Session, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
+) -> dict[str, ShapeScore]:
     """Score of every estimator against the truth, by name."""
     return {name: score_shape(records, session.truth, log["t_s"]) for name, records in estimates.items()}
 
@@ -137,6 +137,7 @@ def _shape(
         "kappa_rms_error_percent": score.kappa_rms_percent,
         "normal_rms_deg": score.normal_rms_deg,
         "position_rms_mm": score.position_rms_mm,
+        "cramer_rao_ratio": _bound_ratio(session, controller, score, log),
         "methods": {
             name: {
                 "kappa_rms_error_per_m": s.kappa_rms,
@@ -150,6 +151,24 @@ def _shape(
         },
     }
     return shape
+
+
+def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: dict[str, Array]) -> float | None:
+    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise."""
+    from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
+
+    tracker, shape = getattr(controller, "shape", None), session.scene.shape
+    if tracker is None or shape is None or score.kappa_rms is None:
+        return None
+    bound = bound_of_scan(
+        tracker.samples,
+        session.truth,
+        log["t_s"],
+        memory_m=shape.memory_mm * 1e-3,
+        sigma_point=SIGMA_POINT_M,
+        sigma_normal=SIGMA_NORMAL_RAD,
+    )
+    return None if bound is None else score.kappa_rms / bound
 
 
 def _numbers(values: Sequence[float] | Array) -> list[float | None]:
@@ -186,7 +205,7 @@ def write_files(result: RunResult, out: Path) -> None:
         json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     (out / "scene.toml").write_text(dump_scene(result.plan.scene), encoding="utf-8")
-    np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)  # type: ignore[arg-type]
+    np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)
 
 
 def _figure(value: float | None, unit: str, digits: int = 2) -> str:

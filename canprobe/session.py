@@ -130,7 +130,9 @@ class Session:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._close()
 
     def run(
@@ -158,9 +160,7 @@ class Session:
     def _writer(self, t0_ns: int) -> Callable[[int, bytes, int], None]:
         write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
-            writer = self._stack.enter_context(
-                CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns)
-            )
+            writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             write = writer.write
         self.traffic = TrafficCounter(write)
         return self.traffic.write
@@ -211,4 +211,3 @@ class _Sink:
 
     def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
         self.write = write
-

@@ -232,7 +232,9 @@ class LockstepBus:
             node.listeners.clear()
 
     def _names_due(self, t_ns: int) -> str:
-        return ", ".join(_name(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns)
+        return ", ".join(
+            _name(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns
+        )
 
     def _endless(self, t_ns: int, what: str) -> BusError:
         self._heads.clear()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 from canopen import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
@@ -116,8 +117,7 @@ class BringUp:
         self._network.pump_until(lambda: bool(self._watch.foreign), self._times.listen)
         if self._watch.foreign:
             raise BusError(
-                f"{self._network.port.channel}: {self._watch.foreign[0]}: another master is at work on this bus; stop it"
-                " first"
+                f"{self._network.port.channel}: {self._watch.foreign[0]}: another master is at work here; stop it first"
             )
 
     def _boot(self) -> None:
@@ -161,7 +161,9 @@ class BringUp:
         try:
             return int(variable.decode_raw(self._nodes[setup.node_id].sdo.upload(index, subindex)))
         except (SdoAbortedError, SdoCommunicationError) as error:
-            raise NodeError(setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}") from error
+            raise NodeError(
+                setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
+            ) from error
 
     def _write(self, setup: NodeSetup, write: Write) -> None:
         variable = _variable(setup, write.index, write.subindex)
@@ -169,7 +171,9 @@ class BringUp:
         try:
             self._nodes[setup.node_id].sdo.download(write.index, write.subindex, variable.encode_raw(write.value))
         except (SdoAbortedError, SdoCommunicationError) as error:
-            raise NodeError(setup.node_id, f"({setup.name}) write of {where} = {write.value:#x} failed: {error}") from error
+            raise NodeError(
+                setup.node_id, f"({setup.name}) write of {where} = {write.value:#x} failed: {error}"
+            ) from error
         if write.read_back and (got := self._read(setup, write.index, write.subindex)) != write.value:
             raise NodeError(
                 setup.node_id, f"({setup.name}) {where} reads back {got:#x} after {write.value:#x} was written"
@@ -206,11 +210,9 @@ class BringUp:
             raise failures[0]
 
 
-def _variable(setup: NodeSetup, index: int, subindex: int):  # type: ignore[no-untyped-def]  # canopen has no types here
+def _variable(setup: NodeSetup, index: int, subindex: int) -> Any:  # canopen has no types here
     try:
-        entry = setup.dictionary[index]
+        entry: Any = setup.dictionary[index]
         return entry[subindex] if hasattr(entry, "subindices") else entry
     except KeyError:
-        raise NodeError(
-            setup.node_id, f"({setup.name}) {index:04X}h:{subindex:02X} is not in {setup.eds}"
-        ) from None
+        raise NodeError(setup.node_id, f"({setup.name}) {index:04X}h:{subindex:02X} is not in {setup.eds}") from None

@@ -44,11 +44,11 @@ def make_cell(
         port,
         make_setups(plan),
         settings,
-        _drives(plan),
-        _tactile(plan),
-        HEARTBEAT_CONSUMED_MS * 1_000_000,
-        say,
-        times,
+        drives=_drives(plan),
+        tactile=_tactile(plan),
+        heartbeat_timeout_ns=HEARTBEAT_CONSUMED_MS * 1_000_000,
+        say=say,
+        times=times,
     )
 
 

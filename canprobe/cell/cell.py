@@ -43,6 +43,7 @@ class Cell:
         port: Port,
         setups: tuple[NodeSetup, ...],
         settings: CycleSettings,
+        *,
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         heartbeat_timeout_ns: int,
@@ -79,7 +80,12 @@ class Cell:
         try:
             self._bring_up.run()
             self.cycle = Cycle(
-                self._port, self._settings, self.drives, self.tactile, self.watch, self._network.feed
+                self._port,
+                self._settings,
+                drives=self.drives,
+                tactile=self.tactile,
+                watch=self.watch,
+                other=self._network.feed,
             )
             self.watch.start(self._port.clock.now_ns())
         except BaseException:
@@ -87,7 +93,9 @@ class Cell:
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def run(
@@ -128,9 +136,7 @@ class Cell:
         self._say("enable the drives")
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until(DriveState.OPERATION_ENABLED, ENABLE_TIMEOUT_S):
-            i, state = next(
-                (i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED
-            )
+            i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
             raise NodeError(
                 self.drives.axes[i].node_id,
                 f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
@@ -195,7 +201,7 @@ class Cell:
     # the way out
 
     def close(self) -> None:
-        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures go to ``faults``."""
+        """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
         for action in (self._stop_drives, self._bring_up.release):
             self._try(action)
         self._try(self._port.close)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
-from canopen import ObjectDictionary
 
 from canprobe.cell.bringup import NodeSetup, Write
 from canprobe.eds import load_eds
@@ -18,7 +19,7 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
-from canprobe.robot.puma260 import MODELS, PumaModel
+from canprobe.robot.puma260 import MODELS, Array, PumaModel
 
 INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
@@ -60,7 +61,7 @@ def _common_writes(plan: Plan) -> list[Write]:
     ]
 
 
-def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: ObjectDictionary) -> list[Write]:
+def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: Any) -> list[Write]:
     writes = []
     for direction, number in node.switched_off:
         index = COMMUNICATION[direction] + number - 1
@@ -71,7 +72,7 @@ def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: ObjectDictionary) -> 
     return writes
 
 
-def _one_pdo(pdo: PlannedPdo, dictionary: ObjectDictionary) -> list[Write]:
+def _one_pdo(pdo: PlannedPdo, dictionary: Any) -> list[Write]:
     communication = COMMUNICATION[pdo.direction] + pdo.number - 1
     mapping = MAPPING[pdo.direction] + pdo.number - 1
     writes = [Write(communication, 1, pdo.cob_id | INVALID), Write(communication, 2, pdo.transmission_type)]
@@ -105,7 +106,7 @@ def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
     ]
 
 
-def software_limits(model: PumaModel) -> tuple[np.ndarray, np.ndarray]:
+def software_limits(model: PumaModel) -> tuple[Array, Array]:
     """Extremes of each motor (6,) and (6,), counts, over the joints' ranges; the coupled ones span both joints'."""
     a, b = model.counts * model.q_min, model.counts * model.q_max
     return np.floor(np.minimum(a, b).sum(axis=1)), np.ceil(np.maximum(a, b).sum(axis=1))
@@ -114,6 +115,9 @@ def software_limits(model: PumaModel) -> tuple[np.ndarray, np.ndarray]:
 def _sensor_writes(plan: Plan) -> list[Write]:
     assert plan.scene.sensor is not None
     writes = [Write(0x2000, 0, TactileMode[plan.scene.sensor.mode.upper()])]
-    if plan.scene.task.kind in ("scan", "press"):  # nothing touches the array yet; a listening cell knows no such moment
+    if plan.scene.task.kind in (
+        "scan",
+        "press",
+    ):  # nothing touches the array yet; a listening cell knows no such moment
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes

@@ -1,4 +1,4 @@
-"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else of the world."""
+"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else."""
 
 from __future__ import annotations
 
@@ -62,6 +62,7 @@ class Cycle:
         self,
         port: Port,
         settings: CycleSettings,
+        *,
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         watch: NodeWatch,

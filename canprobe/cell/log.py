@@ -1,12 +1,9 @@
-"""The run's log: one row a cycle in memory, columns with units on disk."""
+"""The run's log: one row a cycle in memory, columns with units as arrays."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import NDArray
-
 
 
 class RunLog:
@@ -43,14 +40,10 @@ class RunLog:
 
     def _array(self, name: str) -> NDArray[np.float64]:
         column = self._columns[name]
-        shape = next((np.shape(v) for v in column if v is not None), ())
-        out = np.full((self._rows, *shape), np.nan)
+        known = (np.asarray(value).shape for value in column if value is not None)
+        out = np.full((self._rows, *next(known, ())), np.nan)
         first = self._first[name]
         for i, value in enumerate(column):
             if value is not None:
                 out[first + i] = value
         return out
-
-    def save(self, path: Path) -> None:
-        """Write the columns as a compressed ``.npz``."""
-        np.savez_compressed(path, allow_pickle=False, **self.arrays())  # type: ignore[arg-type]

@@ -40,8 +40,8 @@ class Measurement:
         torque_permille: motor torque as reported (6,).
         statuswords: CiA 402 statuswords (6,).
         enabled: every drive is in operation enabled.
-        tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in cycle k + 1
-            at the earliest, on every bus.
+        tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
+            cycle k + 1 at the earliest, on every bus.
         tactile_age: cycles since the trigger of the newest tactile sample; None before the first.
     """
 

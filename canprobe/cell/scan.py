@@ -15,7 +15,7 @@ NUMBERS = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_numb
 
 
 def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
-    """Every node whose SDO server answers: ``node_id``, the four numbers of 1018h and the name of 1008h, None where absent.
+    """Every node whose SDO server answers: ``node_id``, the numbers of 1018h and the name of 1008h, None where absent.
 
     Args:
         port: the bus.
@@ -27,7 +27,7 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
     network = PumpedNetwork(port)
     nodes = []
     for node_id in answering_nodes(port, range(1, 128), timeout_s):
-        node = network.add_node(node_id, ObjectDictionary())
+        node = network.add_node(node_id, ObjectDictionary())  # type: ignore[no-untyped-call]
         node.sdo.RESPONSE_TIMEOUT = timeout_s
         numbers = {name: _number(node, subindex) for name, subindex in NUMBERS.items()}
         nodes.append({"node_id": node_id, **numbers, "device_name": _name(node)})

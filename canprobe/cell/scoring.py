@@ -9,15 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.touch.contact import ContactSample
 
 Array = NDArray[np.float64]
 RUN_IN_M = 0.020
 """Path that an estimator is given before its answers count."""
+CHECKPOINTS = 12
 
 
 def curvature_tensor(kappa: Array, direction1: Array, direction2: Array) -> Array:
     """Curvature tensor (3, 3), 1/m, from principal curvatures (2,) and unit directions (3,)."""
-    return kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
+    tensor: Array = kappa[0] * np.outer(direction1, direction1) + kappa[1] * np.outer(direction2, direction2)
+    return tensor
 
 
 def score_contact(truth: Mapping[str, Array], first: int, last: int, target_n: float) -> dict[str, float | None]:
@@ -101,6 +104,54 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
         estimates=len(seen),
         observed_fraction=len(seen) / len(late),
     )
+
+
+def bound_of_scan(
+    samples: Sequence[ContactSample],
+    truth: Mapping[str, Array],
+    sync_times: Array,
+    *,
+    memory_m: float,
+    sigma_point: float,
+    sigma_normal: float,
+) -> float | None:
+    """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
+
+    For unbiased estimates from the last ``memory_m`` of path with independent noise of the stated size. The mean over
+    ``CHECKPOINTS`` places after the run-in. An estimator that remembers further back may do better.
+
+    Args:
+        samples: the contacts of the scan.
+        truth: columns of the plant's truth, one row a SYNC.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+        memory_m: path that counts, m.
+        sigma_point, sigma_normal: effective noise, m and rad.
+    """
+    from canprobe.touch.bound import cramer_rao
+    from canprobe.touch.surface import SurfaceMatrix
+
+    points = np.array([s.p_base for s in samples])
+    normals = np.array([s.n_base for s in samples])
+    path = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    if len(path) < 3 or path[-1] < max(RUN_IN_M, memory_m):
+        return None
+    squares = []
+    for place in np.linspace(max(RUN_IN_M, memory_m), path[-1], CHECKPOINTS):
+        last = int(np.searchsorted(path, place - 1e-12))
+        first = int(np.searchsorted(path, path[last] - memory_m))
+        row = int(np.searchsorted(sync_times, samples[last].t_s - 1e-6))
+        T = np.eye(4)
+        T[:3, 2], T[:3, 3] = -truth["contact_normal"][row], truth["contact_point"][row]
+        T[:3, 0] = truth["direction1"][row]
+        T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+        surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
+        C = cramer_rao(
+            points[first : last + 1], normals[first : last + 1], surface,
+            sigma_point=sigma_point, sigma_normal=sigma_normal,
+        )  # fmt: skip
+        squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
+    mean = float(np.mean(squares))
+    return float(np.sqrt(mean)) if np.isfinite(mean) else None
 
 
 def _pair(values: Array) -> tuple[float, float]:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 from canprobe.cell.measurement import TactileSample
+from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 
 
 class TactileReceiver:

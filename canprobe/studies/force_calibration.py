@@ -29,7 +29,12 @@ ROLL_HZ = 0.35
 
 
 def pressed_sums(
-    full_scale_pa: float, forces: Sequence[float], seeds: Sequence[int], *, radius: float = 0.040, stiffness: float = 1.27e8
+    full_scale_pa: float,
+    forces: Sequence[float],
+    seeds: Sequence[int],
+    *,
+    radius: float = 0.040,
+    stiffness: float = 1.27e8,
 ) -> Iterator[tuple[float, float]]:
     """Pairs (plain sum of the image in N, true force in N) of presses after some seconds of contact.
 
@@ -48,7 +53,7 @@ def pressed_sums(
                 array = TaxelArray(
                     TaxelConfig(full_scale_pa=full_scale_pa), rng, radius_m=radius, stiffness_n_m3=stiffness
                 )
-                yield _press(array, plain, force, kappa, rng, radius, stiffness), force
+                yield _press(array, plain, force, kappa, rng, radius=radius, stiffness=stiffness), force
 
 
 def _press(
@@ -57,6 +62,7 @@ def _press(
     force: float,
     kappa: tuple[float, float],
     rng: np.random.Generator,
+    *,
     radius: float,
     stiffness: float,
 ) -> float:

@@ -62,7 +62,8 @@ def _title(result: RunResult) -> str:
     summary = result.summary
     source = "truth" if result.truth else "measured"
     end = "" if summary["completed"] else f" · stopped: {summary['stop_reason']}"
-    return f"{result.plan.scene.title or summary['scene']}\n{summary['bus']}, seed {summary['seed']} · source: {source}{end}"
+    title = result.plan.scene.title or summary["scene"]
+    return f"{title}\n{summary['bus']}, seed {summary['seed']} · source: {source}{end}"
 
 
 def _style(axes: Axes, title: str, x: str, y: str) -> None:
@@ -161,11 +162,12 @@ def _kappa_sigma(record: ShapeRecord) -> Array:
 
 
 def _draw_taxels(axes: Axes, result: RunResult) -> None:
+    assert result.taxels is not None
     image = axes.imshow(result.taxels, cmap="magma", origin="lower", vmin=0)
     axes.set_title("last taxel image of the task (counts)", loc="left", fontsize=10, color=INK)
     axes.set_xlabel("column, u")
     axes.set_ylabel("row, v")
-    axes.figure.colorbar(image, ax=axes, shrink=0.8)  # type: ignore[union-attr]
+    axes.figure.colorbar(image, ax=axes, shrink=0.8)
 
 
 def _draw_joints(axes: Axes, result: RunResult) -> None:

@@ -1,9 +1,11 @@
 """The tactile servo: from contact samples to the pose of the probe, 400 times a second.
 
-One idea: the surface stands still, the probe does not. A local model of the surface (point, normal, curvature) is corrected by
-every tactile sample *at the instant it was sampled*; the pose that will hold the wanted indentation at the instant a command
-takes effect is then read off that model. Force is regulated as indentation: measured force and wanted force are turned into
-depth by the same elastic law, so a wrong stiffness cannot leave a steady error, only change the loop's gain.
+One idea: the surface stands still, the probe does not. A local model of the surface (point, normal, curvature) is
+corrected by every tactile sample *at the instant it was sampled*; the pose that will hold the wanted indentation is
+then read off that model, however late the command takes effect. Force is regulated as indentation: measured force and
+wanted force are turned into depth by the same elastic law, so a wrong stiffness cannot leave a steady error, only
+change the loop's gain: with a relative error e the delayed loop has the gain |e|, so it is stable for any delay while
+the stiffness is known to better than a factor of two.
 
 Source: Chen, Rink & Zhang, section 4.2 (the five steps around (36)), with a damped inverse instead of ``J`` in step 4.
 """
@@ -116,7 +118,7 @@ class LocalSurface:
 
 @dataclass(frozen=True, slots=True)
 class ProbePose:
-    """Where the probe sphere must be: its centre (3,), m, and the direction of its pole (3,), both in the base frame."""
+    """Where the probe sphere must be: its centre (3,), m, and the direction of its pole (3,), in base."""
 
     centre: Vector
     pole: Vector

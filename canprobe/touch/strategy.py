@@ -1,12 +1,13 @@
 """Exploration strategies: where the contact goes next, as a heading in the scan plane.
 
-The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length, so that
-the contact speed is the same everywhere; the servo lifts the heading into the estimated tangent plane of the surface.
+The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length,
+so that the contact speed is the same everywhere; the servo lifts the heading into the surface's tangent plane.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 
@@ -27,8 +28,8 @@ _TRIANGLE = {1: 1, 3: -1, 5: 1}
 class Weave:
     """To and fro along the heading with a sine across it: excites the curvature in both directions everywhere.
 
-    Along the heading it is a triangle wave without its sharp tips (three terms of its series), so that the path does not
-    linger at the ends, where a plain sine would leave the curvature along the heading without excitation.
+    Along the heading it is a triangle wave without its sharp tips (three terms of its series), so that the path does
+    not linger at the ends, where a plain sine would leave the curvature along the heading without excitation.
 
     Args:
         length_m: full size along the heading.
@@ -89,7 +90,7 @@ def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: floa
     Raises:
         KeyError: for a name that is none of ``weave``, ``circle``, ``straight``.
     """
-    makers = {
+    makers: dict[str, Callable[[], Strategy]] = {
         "weave": lambda: Weave(length_m, width_m, wavelength_m),
         "circle": lambda: Circle(length_m),
         "straight": lambda: Straight(length_m),

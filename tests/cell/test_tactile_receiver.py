@@ -1,4 +1,4 @@
-"""The delay contract of tactile frames: never in the cycle of their trigger, and placed at the instant they were sampled."""
+"""The delay contract of tactile frames: never in the cycle of their trigger, and placed when they were sampled."""
 
 import numpy as np
 import pytest

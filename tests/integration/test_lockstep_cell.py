@@ -33,14 +33,11 @@ def assert_safe(session, but=()):
             continue
         assert slave.state is NmtState.PRE_OPERATIONAL, slave.name
         if slave.node_id <= 6:
-            statusword = slave.dictionary.values[(0x6041, 0)] if (0x6041, 0) in slave.dictionary.values else None
-            statusword = statusword if statusword is not None else statusword_of(slave)
-            assert state_of(statusword) not in POWERED_STATES, slave.name
+            assert state_of(statusword_of(slave)) not in POWERED_STATES, slave.name
 
 
 def statusword_of(slave):
     """6041h as the node answers an SDO upload."""
-    slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
     answer = slave.receive(0x600 + slave.node_id, bytes((0x40, 0x41, 0x60, 0, 0, 0, 0, 0)), slave.core.now_ns)
     return int.from_bytes(dict(answer)[0x580 + slave.node_id][4:6], "little")
 

@@ -47,10 +47,10 @@ def curvature_of(surface, n):
     return (np.eye(3) - np.outer(n, n)) / surface.r
 
 
-def follow(surface, *, know_curvature=True, seconds=3.0, delay=10, stiffness_error=0.0, gains=SurfaceGains()):
+def follow(surface, *, know_curvature=True, seconds=3.0, delay=10, stiffness_error=0.0, gains=None):
     """Depth errors (m) and contact points of a closed loop; each command acts ``delay`` cycles later."""
     p, n = surface.closest(np.array((0.0, 0.0, RADIUS_P)))
-    local = LocalSurface(p, n, gains)
+    local = LocalSurface(p, n, gains or SurfaceGains())
     servo = TactileServo(
         local,
         PathFollower(make_strategy("weave", 0.03, 0.008)),

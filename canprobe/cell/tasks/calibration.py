@@ -20,6 +20,4 @@ def array_calibration(full_scale_pa: float, radius_m: float = 0.040) -> PatchCal
     """
     nearest = min(FORCE_GAINS, key=lambda pressed: abs(math.log(pressed / full_scale_pa)))
     force_gain, edge_gain = FORCE_GAINS[nearest]
-    return PatchCalibration(
-        full_scale_pa=full_scale_pa, radius_m=radius_m, force_gain=force_gain, edge_gain=edge_gain
-    )
+    return PatchCalibration(full_scale_pa=full_scale_pa, radius_m=radius_m, force_gain=force_gain, edge_gain=edge_gain)

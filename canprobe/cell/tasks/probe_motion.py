@@ -68,7 +68,7 @@ class ProbeMotion:
     def _increment(self, J: Vector, twist: Vector) -> Vector:
         """The exact step; the damped one where the exact step would be no small one, as near a singular pose."""
         try:
-            dq: Vector = np.linalg.solve(J, twist)
+            dq = np.asarray(np.linalg.solve(J, twist), dtype=np.float64)
         except np.linalg.LinAlgError:
             return damped_step(J, twist)
         return dq if float(np.abs(dq).max()) < SMALL_STEP else damped_step(J, twist)

@@ -8,11 +8,11 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.measurement import Measurement, TactileSample
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import PumaModel
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
-from canprobe.cell.measurement import Measurement, TactileSample
 
 Vector = NDArray[np.float64]
 HOLLOWEST = 0.9

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch.contact import ContactSample
-from canprobe.touch.patch import Patch
-from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
-from canprobe.touch.strategy import PathFollower, Strategy
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.patch import Patch
+from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
+from canprobe.touch.strategy import PathFollower, Strategy
 
 Vector = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ class TouchSettings:
     speed: float
     rolling_share: float
     lead_s: float
-    gains: SurfaceGains = SurfaceGains()
+    gains: SurfaceGains = field(default_factory=SurfaceGains)
     touch_force: float = 0.15
     approach_speed: float = 4e-3
     retreat_speed: float = 20e-3
@@ -175,7 +175,9 @@ class TouchTask:
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             self.sensing.set_kappa(np.asarray(estimate.kappa))
 
-    def _columns_of(self, measurement: Measurement, patch: Patch, contact: ContactSample | None) -> dict[str, float | Vector]:
+    def _columns_of(
+        self, measurement: Measurement, patch: Patch, contact: ContactSample | None
+    ) -> dict[str, float | Vector]:
         nothing = np.full(3, np.nan)
         assert measurement.tactile is not None
         return {

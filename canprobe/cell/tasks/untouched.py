@@ -7,10 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch.patch import PatchCalibration
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.probe_motion import smooth_step
 from canprobe.cell.tasks.sensing import patch_of
+from canprobe.touch.patch import PatchCalibration
 
 Vector = NDArray[np.float64]
 
@@ -56,9 +56,7 @@ class ListenTask:
         tactile_timeout: cycles without a frame after which the task gives up.
     """
 
-    def __init__(
-        self, calibration: PatchCalibration, duration_s: float, period_s: float, tactile_timeout: int
-    ) -> None:
+    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float, tactile_timeout: int) -> None:
         self._calibration = calibration
         self._left = duration_s
         self._period = period_s
