@@ -131,7 +131,7 @@ class TouchTask:
         pose = _STEPS[self.phase](self)
         self._t += self._s.period_s
         target = self._motion.step(pose)
-        if self._motion.limit is not None and self.phase is not Phase.RETREAT:
+        if self._motion.limit is not None and self.phase < Phase.RETREAT:
             self._leave(self._motion.limit)
         self._columns["phase"] = float(self.phase)
         return Command(
@@ -192,7 +192,7 @@ class TouchTask:
         }
 
     def _watch(self, measurement: Measurement) -> None:
-        if self.phase in (Phase.RETREAT, Phase.DONE):
+        if self.phase >= Phase.RETREAT:
             return
         if self._force > self._s.force_max:
             self._leave(f"measured force {self._force:.2f} N above the limit of {self._s.force_max:.2f} N")

@@ -1,0 +1,92 @@
+"""The touch task's own reasons to stop: each retreats from the object first, names the reason, and leaves the cell safe."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.build import make_task
+from canprobe.errors import SafetyStop
+from canprobe.session import Session, resolve_scene
+
+
+def run_until_stopped(session, at_cycle=None, action=None):
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        if measurement.cycle == at_cycle:
+            action(session)
+        return controller.step(measurement)
+
+    with pytest.raises(SafetyStop) as stopped, session:
+        session.run(step)
+    return stopped.value.reason, session.truth
+
+
+def press_session(**changes):
+    scene = resolve_scene(canprobe.load_scene("press"), duration_s=3.0)
+    for section, values in changes.items():
+        scene = replace(scene, **{section: replace(getattr(scene, section), **values)})
+    return Session(scene)
+
+
+def test_force_above_the_limit():
+    reason, truth = run_until_stopped(press_session(limits={"force_max_n": 1.5}))
+    assert "above the limit of 1.50 N" in reason
+    assert np.count_nonzero(truth["force"] > 1.5) < 60  # 150 ms: approach goes on until the sample is in, then retreat
+    assert truth["force"][-1] == 0.0  # it let go
+
+
+def test_no_object_where_it_was_expected():
+    scene = canprobe.load_scene("press")
+    below = tuple(np.array(scene.object.position_mm) - (0, 0, 7.5))
+    session = press_session(object={"position_mm": below}, task={"search_mm": 8.0})
+    session.scene = session.plan.scene
+
+    def sink(session):
+        plant = session.world.plant
+        plant.config = replace(plant.config, object=None)
+        plant._solved = None
+
+    reason, truth = run_until_stopped(session, at_cycle=10, action=sink)
+    assert "no object found up to 8 mm beyond" in reason
+    assert truth["force"].max() == 0.0
+
+
+def test_contact_lost_in_the_hold():
+    def vanish(session):
+        plant = session.world.plant
+        plant.config = replace(plant.config, object=None)
+        plant._solved = None
+
+    reason, _ = run_until_stopped(press_session(), at_cycle=1100, action=vanish)
+    assert reason == "contact lost"
+
+
+def test_sensor_falls_silent_but_lives():
+    def mute(session):
+        sensor = next(n for n in session.world.nodes if n.node_id == 16)
+        original = sensor.receive
+        sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] < 0x511]
+        session.lockstep._connect()
+
+    reason, truth = run_until_stopped(press_session(), at_cycle=1100, action=mute)
+    assert "no tactile frame for 13 cycles" in reason
+    assert truth["force"][-1] == 0.0
+
+
+def test_joint_at_its_stop():
+    session = press_session()
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        command = controller.step(measurement)
+        if measurement.cycle == 1000:
+            motion = controller._motion
+            motion._high = motion.q + 1e-6  # the stops close in on the posture
+            motion._low = motion.q - 1e-6
+        return command
+
+    with pytest.raises(SafetyStop, match=r"joint \d at .* deg, its stop"), session:
+        session.run(step)
