@@ -1,4 +1,4 @@
-"""The touch task's own reasons to stop: each retreats from the object first, names the reason, and leaves the cell safe."""
+"""The touch task's own reasons to stop: each retreats first, names the reason, and leaves the cell safe."""
 
 from dataclasses import replace
 
