@@ -60,15 +60,22 @@ class TrafficCounter:
     """Counts frames and bits for the log's writer; bits without stuffing, as canbusload counts by default."""
 
     def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
-        self.frames = 0
-        self.bits = 0
         self._write = write
-        self._bits = [best_case_bits(n) for n in range(9)]
+        self._by_length = [0] * 9
+
+    @property
+    def frames(self) -> int:
+        """Frames so far."""
+        return sum(self._by_length)
+
+    @property
+    def bits(self) -> int:
+        """Bits so far."""
+        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
-        self.frames += 1
-        self.bits += self._bits[len(data)]
+        self._by_length[len(data)] += 1
         self._write(can_id, data, t_ns)
 
 

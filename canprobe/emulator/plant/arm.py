@@ -16,6 +16,8 @@ import numpy.typing as npt
 from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
 
 Transition = tuple[float, float, float, float]
+State = tuple[float, float, float]
+"""Position, rate and reference of one motor: counts, counts/s, counts."""
 _NEVER = 1 << 62
 
 REFLECTED_INERTIA = (0.030, 0.088, 0.022, 0.0072, 0.0064, 0.0073)
@@ -123,7 +125,7 @@ class IdealArm:
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_counts(model, q0).tolist()]
         self._phi: dict[int, Transition] = {}
         self._rows = [[(j, g) for j, g in enumerate(row) if g] for row in model.joints_per_count.tolist()]
-        self._evaluated: list[tuple[float, float, float]] | None = None
+        self._evaluated: list[State] | None = None
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
@@ -212,12 +214,31 @@ class IdealArm:
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
         return max(-_PEAK_PERMILLE, min(_PEAK_PERMILLE, permille))
 
-    def _states(self) -> list[tuple[float, float, float]]:
+    def _states(self) -> list[State]:
         if self._evaluated is None:
-            self._evaluated = [self._state(a, self.t_ns) for a in self._axes]
+            self._evaluated = self._evaluate(self.t_ns)
         return self._evaluated
 
-    def _state(self, a: _Axis, t_ns: int) -> tuple[float, float, float]:
+    def _evaluate(self, t_ns: int) -> list[State]:
+        """All states at once. At the very end of a ramp its own formula still holds, and mostly the next ramp follows."""
+        states: list[State] = []
+        lag, last_ns, tau = self.lag_s, -1, 0.0
+        p11 = p12 = p21 = p22 = 0.0
+        for a in self._axes:
+            if t_ns > a.event_ns or a.coming:
+                states.append(self._state(a, t_ns))
+                continue
+            dt_ns = t_ns - a.t_ns
+            if dt_ns != last_ns:
+                (p11, p12, p21, p22), tau, last_ns = self._transition(dt_ns), 1e-9 * dt_ns, dt_ns
+            slope = a.slope
+            behind = lag * slope
+            e, de = a.q - a.r + behind, a.v - slope
+            r = a.r + slope * tau
+            states.append((r - behind + p11 * e + p12 * de, slope + p21 * e + p22 * de, r))
+        return states
+
+    def _state(self, a: _Axis, t_ns: int) -> State:
         while t_ns >= a.event_ns:
             when = a.event_ns
             a.anchor(when, a.at(self._transition(when - a.t_ns), 1e-9 * (when - a.t_ns)))
