@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import gc
 from collections import deque
 from collections.abc import Callable, Container, Iterator, Sequence
-from contextlib import contextmanager
 from itertools import groupby
 from typing import Protocol
 
+from canprobe.bus.memory import garbage_collection_paused
 from canprobe.bus.port import Port, TimedFrame
 from canprobe.errors import BusError
 from canprobe.protocol.frames import SYNC_ID, Frame
@@ -143,21 +142,6 @@ def _kind(seat: _Seat) -> type:
     return type(getattr(seat.node, "application", seat.node))
 
 
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """Keep the collector, which stops everything for tens of milliseconds, out of a loop that makes no cycles."""
-    was_enabled = gc.isenabled()
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    try:
-        yield
-    finally:
-        gc.unfreeze()
-        if was_enabled:
-            gc.enable()
-
-
 def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], max_wait_ns: int = MAX_WAIT_NS) -> None:
     """Power on the nodes and serve them until `stop()`; it is asked after every wait.
 
@@ -168,7 +152,7 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
         max_wait_ns: longest wait, so that `stop` is asked often enough.
     """
     exchange, clock = Exchange(nodes), port.clock
-    with _without_garbage_collection():
+    with garbage_collection_paused():
         now_ns = clock.now_ns()
         if boot_ups := exchange.start(now_ns):
             port.send_batch(boot_ups)
@@ -177,6 +161,7 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
             until_ns = now_ns + max_wait_ns
             port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
             received = port.drain()
-            now_ns = clock.now_ns()
+            # The last arrival is the time to work at: one reading of the clock less before the answers leave.
+            now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()
             for frames in exchange.batches(received, now_ns):
                 port.send_batch(frames)

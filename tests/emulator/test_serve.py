@@ -63,6 +63,65 @@ def test_nodes_that_answer_each_other_for_ever_are_caught():
         Exchange([a, b]).start(0)
 
 
+class Slow(Scripted):
+    """Another kind of device, that notes what had left when it began to work on a SYNC."""
+
+    def __init__(self, port, answers=()):
+        super().__init__([], answers)
+        self.port, self.had_left = port, []
+
+    def receive(self, can_id, data, t_ns):
+        if can_id == 0x80:
+            self.had_left.append([list(batch) for batch in self.port.sent])
+        return super().receive(can_id, data, t_ns)
+
+
+class OneShot:
+    """A port on which the given frames arrive at once; it keeps what is sent."""
+
+    def __init__(self, *arrivals):
+        self.clock, self.arrivals, self.sent = VirtualClock(), list(arrivals), []
+
+    def wait(self, until_ns):
+        return None
+
+    def drain(self):
+        taken, self.arrivals = self.arrivals, []
+        return taken
+
+    def send_batch(self, frames):
+        self.sent.append(list(frames))
+
+
+def test_answers_to_sync_leave_before_another_kind_of_node_starts_to_work():
+    port = OneShot((0x80, b"", 5))
+    a = Scripted([], {0x80: [(0x186, b""), (0x281, b"")], 0x182: [(0x700, b"")]})
+    b = Scripted([], {0x80: [(0x182, b"")]})
+    slow = Slow(port, {0x80: [(0x150, b"")]})
+    serve([a, b, slow], port, lambda: bool(port.sent))
+    drives, sensor, late = [(0x182, b""), (0x186, b""), (0x281, b"")], [(0x150, b"")], [(0x700, b"")]
+    assert port.sent == [drives, sensor, late]
+    assert slow.had_left == [[drives]]
+
+
+def test_nodes_hear_the_sync_before_anybody_s_answer_to_it():
+    port = OneShot((0x201, b"", 4), (0x80, b"", 5), (0x202, b"", 6))
+    a = Scripted([], {0x80: [(0x181, b"")], 0x201: [(0x81, b"")]})
+    b, slow = Scripted([], {0x80: [(0x182, b"")]}), Slow(port)
+    serve([a, b, slow], port, lambda: bool(port.sent))
+    assert port.sent == [[(0x81, b"")], [(0x181, b""), (0x182, b"")]]
+    assert a.heard == [0x201, 0x80, 0x182, 0x202]
+    assert b.heard == [0x201, 0x81, 0x80, 0x181, 0x202]
+    assert slow.heard == [0x201, 0x81, 0x80, 0x181, 0x182, 0x202]
+
+
+def test_a_node_is_spared_what_it_does_not_listen_to():
+    a, b = Scripted([(0x300, b""), (0x301, b"")]), Scripted([])
+    b.listens = {0x301}
+    Exchange([a, b]).start(0)
+    assert b.heard == [0x301]
+
+
 def test_serve_on_a_port_answers_a_master(plant):
     bus = LockstepBus(VirtualClock(), "test")
     master, port = bus.port(), bus.port()

@@ -220,7 +220,7 @@ class IdealArm:
         return self._evaluated
 
     def _evaluate(self, t_ns: int) -> list[State]:
-        """All states at once. At the very end of a ramp its own formula still holds, and mostly the next ramp follows."""
+        """All states at once. At the very end of a ramp its own formula still holds."""
         states: list[State] = []
         lag, last_ns, tau = self.lag_s, -1, 0.0
         p11 = p12 = p21 = p22 = 0.0
