@@ -183,7 +183,7 @@ class Cell:
         assert self.drives is not None
         i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
         node_id = self.drives.axes[i].node_id
-        why = "".join(f"; {e}" for e in self.watch.alarms() if e.node_id == node_id)
+        why = "".join(f"; {e}" for e in [e for e in self.watch.alarms() if e.node_id == node_id][-1:])
         raise NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:

@@ -18,8 +18,9 @@ from canprobe.protocol.sync import SyncCounter, pack_sync
 
 COLLECT_SHARE = 0.6
 """Share of the period after SYNC in which TPDOs are waited for."""
+FIRST_LOOK_SHARE = 0.25
 LOOKS_A_PERIOD = 16
-"""How often TPDOs are looked for. Waking up for each frame as it comes costs more than it gains: on one processor every
+"""When TPDOs are looked for: first a quarter of the period after SYNC, then every sixteenth of it. Waking up for each frame as it comes costs more than it gains: on one processor every
 wake-up takes it from the sender, and no RPDO is latched before the next SYNC anyway."""
 
 
@@ -118,10 +119,11 @@ class Cycle:
         self._route(port.drain())
         if drives is None:
             return
-        pause = self._s.period_ns // LOOKS_A_PERIOD
-        while not drives.complete and (now := clock.now_ns()) < until_ns:
-            clock.sleep_until_ns(min(until_ns, now + pause))
+        look_ns = self._deadline + int(self._s.period_ns * FIRST_LOOK_SHARE)
+        while not drives.complete and clock.now_ns() < until_ns:
+            clock.sleep_until_ns(min(until_ns, look_ns))
             self._route(port.drain())
+            look_ns += self._s.period_ns // LOOKS_A_PERIOD
         drives.end_collect()
 
     def _route(self, frames: list[TimedFrame]) -> None:
