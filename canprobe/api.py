@@ -12,9 +12,10 @@ from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.shape import ShapeRecord, replay_samples
 from canprobe.errors import CanprobeError, NodeError, UsageError
+from canprobe.rehearsal import rehearse
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Session, resolve_scene
+from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
 
 __all__ = ["Command", "Measurement", "RunResult", "emulate", "open_cell", "run", "scan", "up"]
 
@@ -58,11 +59,12 @@ def run(
     resolved = resolve_scene(
         scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s
     )
-    folder = _folder(resolved, out) if files else None
+    folder = results_folder(resolved, out) if files else None
     session = Session(resolved, folder, say)
     controller = make_task(session.plan)
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
+    if resolved.bus.interface != LOCKSTEP:
+        say("rehearse in lockstep")
+        rehearse(resolved)
     failure: BaseException | None = None
     try:
         with session:
@@ -77,7 +79,8 @@ def run(
     return result
 
 
-def _folder(scene: Scene, out: Path | str | None) -> Path:
+def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
+    """Where :func:`run` puts the files: ``out``, or ``runs/<scene>-<time>``."""
     return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S}"
 
 
@@ -158,10 +161,7 @@ def open_cell(
         BusError: an interface or a node failed.
     """
     resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
-    folder = Path(out) if out is not None else None
-    if folder is not None:
-        folder.mkdir(parents=True, exist_ok=True)
-    with Session(resolved, folder, say) as session:
+    with Session(resolved, Path(out) if out is not None else None, say) as session:
         yield session
 
 
@@ -205,14 +205,17 @@ def emulate(
     """
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
+    from canprobe.bus.priority import ask_for_processor
     from canprobe.bus.probe import answering_nodes
     from canprobe.emulator.build import make_world
     from canprobe.emulator.serve import serve
     from canprobe.planning import make_plan
 
     resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    rehearse(resolved)
     world = make_world(make_plan(resolved), node_ids)
     port = open_port(interface, channel, bitrate, MonotonicClock())
+    ask_for_processor()
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(
@@ -236,6 +239,7 @@ def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> 
     from canprobe.bus.open import open_port
     from canprobe.cell.scan import scan_nodes
 
+    hush_canopen()
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
         return scan_nodes(port, timeout_s)

@@ -5,6 +5,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -54,6 +55,16 @@ def resolve_scene(
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
     return replace(scene, bus=bus, scene=info, task=task)
+
+
+def hush_canopen() -> None:
+    """Keep canopen's warnings off a terminal that asked for no log: errors are raised and said once, by us.
+
+    Where somebody has set up logging, nothing changes.
+    """
+    logger = logging.getLogger("canopen")
+    if not logger.handlers:
+        logger.addHandler(logging.NullHandler())
 
 
 class TrafficCounter:
@@ -125,6 +136,7 @@ class Session:
 
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
+        hush_canopen()
         try:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
@@ -167,6 +179,7 @@ class Session:
     def _writer(self, t0_ns: int) -> Callable[[int, bytes, int], None]:
         write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
+            self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             write = writer.write
         self.traffic = TrafficCounter(write)
@@ -179,9 +192,9 @@ class Session:
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
         bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        bus.recorder = self._writer(0)
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
-        bus.recorder = self._writer(0)
         for participant in self.world.participants:
             bus.attach(participant)
         return bus.port()
@@ -198,6 +211,11 @@ class Session:
         from canprobe.child import EmulatorChild
 
         bus = self.scene.bus
+        if bus.interface == "virtual" and self.scene.emulated_node_ids:
+            raise UsageError(
+                "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
+                " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
+            )
         clock = MonotonicClock()
         real = open_port(bus.interface, bus.channel, bus.bitrate, clock)
         self._stack.callback(real.close)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.interrupts import termination_interrupts
-from canprobe.cli.output import print_json, progress_bar, say_on_terminal
+from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
 from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, whole
 from canprobe.cli.target import target_of
 
@@ -43,18 +43,24 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
 
-    with termination_interrupts():
-        result = api.run(
-            scene,
-            interface=target.interface,
-            channel=target.channel,
-            bitrate=target.bitrate,
-            out=args.out,
-            seed=args.seed,
-            duration_s=args.duration,
-            progress=progress_bar(),
-            say=say_on_terminal,
-        )
+    folder = api.results_folder(scene, args.out)
+    try:
+        with termination_interrupts():
+            result = api.run(
+                scene,
+                interface=target.interface,
+                channel=target.channel,
+                bitrate=target.bitrate,
+                out=folder,
+                seed=args.seed,
+                duration_s=args.duration,
+                progress=progress_bar(),
+                say=say_on_terminal,
+            )
+    except KeyboardInterrupt:
+        where = f"; what was measured until then: {folder}" if folder.exists() else ""
+        say(f"canprobe: interrupted, the cell is stopped{where}")
+        raise
     if args.json:
         print_json(result.summary)
     else:

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 import pytest
 
@@ -141,7 +142,7 @@ def test_exit_status_of_every_error(error, status, monkeypatch, capsys):
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "Traceback" not in captured.err
-    expected = [] if status > 100 else str(error).splitlines()
+    expected = ["interrupted"] if status > 100 else str(error).splitlines()
     assert len(captured.err.splitlines()) == len(expected)
 
 
@@ -176,7 +177,8 @@ def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, _, kwargs),) = calls
     assert (kwargs["interface"], kwargs["channel"], kwargs["bitrate"]) == ("lockstep", "can0", 1_000_000)
-    assert (kwargs["seed"], kwargs["duration_s"], kwargs["out"]) == (None, None, None)
+    assert (kwargs["seed"], kwargs["duration_s"]) == (None, None)
+    assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
 
 
 def test_run_json_is_one_document(calls, capsys):

@@ -1,0 +1,178 @@
+"""What goes wrong on the command line, as a user sees it: one clear line a problem, the exit status, no traceback.
+
+Each case is a process of its own; nothing here needs a CAN interface.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from canprobe.bus.candump import read_candump
+from canprobe.bus.socketcan import has_socketcan
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
+
+ROOT = Path(__file__).parents[2]
+SCENES = ROOT / "canprobe" / "scenes"
+NO_AF_CAN = pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN; the vcan tests cover it")
+
+
+def start(folder, *words):
+    """`canprobe` in a session of its own, so that a signal to it reaches nobody else."""
+    return subprocess.Popen(
+        [sys.executable, "-m", "canprobe", *map(str, words)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def lines_of(folder, status, *words):
+    """The lines on stderr of a command that must end with `status` and say nothing on stdout."""
+    process = start(folder, *words)
+    out, err = process.communicate()
+    assert process.returncode == status, err
+    assert out == ""
+    assert "Traceback" not in err
+    return err.splitlines()
+
+
+def edited(folder, name, *changes):
+    """A packaged scene with texts replaced, as a file."""
+    text = (SCENES / f"{name}.toml").read_text()
+    for old, new in changes:
+        assert old in text
+        text = text.replace(old, new)
+    path = folder / f"{name}-edited.toml"
+    path.write_text(text)
+    return path.name
+
+
+@pytest.mark.parametrize("command", ["run", "plan", "up", "emulate"])
+def test_unknown_scene(command, tmp_path):
+    (line,) = lines_of(tmp_path, 2, command, "cylindre")
+    assert line.startswith("canprobe: cylindre: no such scene or file; did you mean cylinder?")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_wrong_keys_are_all_told_with_file_path_and_suggestion(tmp_path):
+    scene = edited(tmp_path, "cylinder", ("force_n = 2", "force_m = 2"), ("[arm]", "[arm]\nemulatd = true"))
+    assert lines_of(tmp_path, 2, "run", scene) == [
+        f"canprobe: {scene}: task.force_m: unknown key; did you mean force_n?",
+        f"canprobe: {scene}: arm.emulatd: unknown key; did you mean emulated?",
+    ]
+    assert [path.name for path in tmp_path.iterdir()] == [scene]
+
+
+def test_wrong_value_and_wrong_type(tmp_path):
+    scene = edited(tmp_path, "press", ("force_n = 2", 'force_n = "two"'), ("radius_mm = 36", "radius_mm = -36"))
+    lines = lines_of(tmp_path, 2, "run", scene)
+    assert len(lines) == 2
+    for key, line in zip(("object.radius_mm", "task.force_n"), sorted(lines), strict=True):
+        assert line.startswith(f"canprobe: {scene}: {key}: ")
+
+
+def test_not_toml(tmp_path):
+    (tmp_path / "broken.toml").write_text("[scene\nname = 3")
+    (line,) = lines_of(tmp_path, 2, "run", "broken.toml")
+    assert line.startswith("canprobe: broken.toml: ")
+    assert "line 1" in line
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+def test_a_hollow_tighter_than_the_probe(command, tmp_path):
+    scene = edited(tmp_path, "cylinder", ('kind = "cylinder"', 'kind = "bowl"'), ("radius_mm = 36", "radius_mm = 30"))
+    (line,) = lines_of(tmp_path, 2, command, scene)
+    assert line.startswith("canprobe: object: a hollow of radius 30 mm is tighter than the probe of radius 40 mm")
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+def test_an_object_out_of_reach(command, tmp_path):
+    scene = edited(tmp_path, "cylinder", ("[-120, -122.5, 374]", "[-500, -122.5, 374]"))
+    (line,) = lines_of(tmp_path, 2, command, scene)
+    assert line.startswith("canprobe: task: contact at (-500.0, -122.5, 377.0) mm out of reach")
+
+
+def test_an_eds_file_that_does_not_exist(tmp_path):
+    scene = edited(tmp_path, "press", ("[sensor]", '[sensor]\neds = "nowhere.eds"'))
+    (line,) = lines_of(tmp_path, 2, "run", scene)
+    assert "nowhere.eds" in line
+
+
+@NO_AF_CAN
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "press", "--bus", "socketcan", "--channel", "can0", "--out", "results"),
+        ("up", "press", "--bus", "socketcan", "--channel", "can0"),
+        ("emulate", "press", "--channel", "can0"),
+        ("scan",),
+    ],
+)
+def test_no_socketcan_in_this_kernel(words, tmp_path):
+    (line,) = lines_of(tmp_path, 3, *words)
+    assert line.startswith("canprobe: can0: this kernel has no SocketCAN")
+    assert list(tmp_path.iterdir()) == [], "a run that never had a bus leaves no folder"
+
+
+def test_an_interface_that_python_can_does_not_know(tmp_path):
+    (line,) = lines_of(tmp_path, 3, "run", "press", "--bus", "token-ring", "--channel", "x")
+    assert line.startswith("canprobe: x: no interface 'token-ring'")
+
+
+def test_emulated_nodes_cannot_be_reached_over_a_virtual_bus_of_one_process(tmp_path):
+    (line,) = lines_of(tmp_path, 2, "run", "press", "--bus", "virtual", "--channel", "x")
+    assert "ends at the process" in line
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("emulate", "press"), "--channel is missing"),
+        (("emulate", "press", "--channel", "can0", "--nodes", "1-7"), "has no node [7]"),
+        (("up", "press"), "a lockstep bus lives inside one run"),
+        (("run", "press", "--channel", "tactile=can1"), "the scene has no channel tactile, only can0"),
+        (("run", "press", "--duration", "-1"), "expected seconds above 0"),
+        (("scan", "--bus", "lockstep"), "has nobody on it"),
+    ],
+)
+def test_wrong_use(words, text, tmp_path):
+    (line,) = lines_of(tmp_path, 2, *words)
+    assert text in line
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):
+    (tmp_path / "file").write_text("")
+    (line,) = lines_of(tmp_path, 3, "run", "press", "--out", "file/results")
+    assert line == "canprobe: file/results: Not a directory"
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, tmp_path):
+    process = start(tmp_path, "run", "cylinder", "--out", "results")
+    results = tmp_path / "results"
+    while not (log := results / "bus.log").exists() or log.stat().st_size < 1 << 20:  # in the scan, by its volume
+        assert process.poll() is None, process.communicate()
+    process.send_signal(number)
+    out, err = process.communicate()
+    assert (process.returncode, out) == (status, "")
+    assert err == "canprobe: interrupted, the cell is stopped; what was measured until then: results\n"
+    summary = json.loads((results / "summary.json").read_text())
+    assert (summary["completed"], summary["stop_reason"]) == (False, "interrupted")
+    assert 0 < summary["cycle"]["cycles"] < 8000
+    with np.load(results / "log.npz") as columns:
+        assert len(columns["t_s"]) in (summary["cycle"]["cycles"], summary["cycle"]["cycles"] - 1)  # amid a cycle
+    last = {can_id: data for _, _, can_id, data in read_candump(log)}
+    for node_id in (1, 2, 3, 4, 5, 6):
+        assert state_of(int.from_bytes(last[0x180 + node_id][:2], "little")) not in POWERED_STATES
+        assert last[0x700 + node_id] == b"\x7f"
+    assert last[0x710] == b"\x7f"
