@@ -28,14 +28,19 @@ _FRAME = struct.Struct("=IB3x8s")
 # struct can_frame, then the control messages in the order in which the kernel writes them: SCM_TIMESTAMPNS, SO_RXQ_OVFL
 _SLOT = struct.Struct("=IB3x8sQiiqqQiiI4x8x")
 _CONTROL = _SLOT.size - _FRAME.size
+_MSG_WAITFORONE = 0x10000
 _BATCH = 64
 
 
 class FrameSocket(Protocol):
     """Moves frames through one socket."""
 
-    def receive(self) -> list[Row]:
-        """Return what is there, without waiting; OSError if the interface failed."""
+    def receive(self, wait: bool = False) -> list[Row]:
+        """Return what is there; OSError if the interface failed.
+
+        Args:
+            wait: for the first frame, as long as the socket's own time-out says; it must be a blocking one.
+        """
         ...
 
     def send(self, frames: Sequence[Frame]) -> int:
@@ -98,13 +103,15 @@ class BatchedSocket:
         self._in = _Slots(_SLOT.size, _CONTROL)
         self._out = _Slots(_FRAME.size, 0)
 
-    def receive(self) -> list[Row]:
+    def receive(self, wait: bool = False) -> list[Row]:
         """Return everything that is there, 64 frames a call."""
         rows: list[Row] = []
         slots = self._in
         count = _BATCH
+        flags = _MSG_WAITFORONE if wait else socket.MSG_DONTWAIT
         while count == _BATCH:
-            count = self._recvmmsg(self._fd, slots.headers, _BATCH, socket.MSG_DONTWAIT, None)
+            count = self._recvmmsg(self._fd, slots.headers, _BATCH, flags, None)
+            flags = socket.MSG_DONTWAIT
             if count < 0:
                 if _nothing_there(ctypes.get_errno()):
                     break
@@ -135,16 +142,18 @@ class PlainSocket:
     def __init__(self, sock: socket.socket) -> None:
         self._socket = sock
 
-    def receive(self) -> list[Row]:
+    def receive(self, wait: bool = False) -> list[Row]:
         """Return everything that is there."""
         rows: list[Row] = []
+        flags = 0 if wait else socket.MSG_DONTWAIT
         while True:
             try:
-                raw, control, _, _ = self._socket.recvmsg(_FRAME.size, _CONTROL, socket.MSG_DONTWAIT)
+                raw, control, _, _ = self._socket.recvmsg(_FRAME.size, _CONTROL, flags)
             except OSError as error:
                 if _nothing_there(error.errno):
                     return rows
                 raise
+            flags = socket.MSG_DONTWAIT
             can_id, length, data = _FRAME.unpack(raw)
             rows.append((can_id, data[:length], *_parse_control(control)))
 

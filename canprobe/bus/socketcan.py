@@ -65,7 +65,7 @@ class SocketCanPort:
         self._socket = _open(channel, filters)
         self._frames = frame_socket(self._socket, batched)
         self._poll = _Poll(self._socket.fileno())
-        self._offset_ns = self._calibrated_ns = 0
+        self._offset_ns = self._calibrated_ns = self._patience_ns = 0
 
     def send_batch(self, frames: Sequence[Frame]) -> None:
         """Send `frames` in order; a full queue is waited for up to 10 ms.
@@ -89,8 +89,11 @@ class SocketCanPort:
     def drain(self) -> list[TimedFrame]:
         """Return every frame that has arrived, with the kernel's time of its arrival."""
         self._check_open()
+        return self._take(wait=False)
+
+    def _take(self, wait: bool) -> list[TimedFrame]:
         try:
-            rows = self._frames.receive()
+            rows = self._frames.receive(wait)
         except OSError as error:
             raise self._failed(error) from error
         if not rows:
@@ -110,6 +113,20 @@ class SocketCanPort:
         while (left_ns := until_ns - self.clock.now_ns()) > 0:
             if self._poll(left_ns):
                 return
+
+    def receive(self, timeout_ns: int) -> list[TimedFrame]:
+        """Wait for frames and return them, as `wait` and `drain` do, with one system call where they take three.
+
+        Args:
+            timeout_ns: longest wait; it is set once and kept.
+        """
+        self._check_open()
+        if timeout_ns != self._patience_ns:
+            self._socket.setblocking(True)
+            seconds, ns = divmod(timeout_ns, 1_000_000_000)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, ns // 1000))
+            self._patience_ns = timeout_ns
+        return self._take(wait=True)
 
     def close(self) -> None:
         """Close the socket."""

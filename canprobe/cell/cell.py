@@ -18,6 +18,8 @@ from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 
+WARM_UP_S = 0.1
+"""Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
 MISSED_LIMIT = 5
@@ -134,6 +136,8 @@ class Cell:
         if self.drives is None:
             return
         self._say("enable the drives")
+        self.drives.goal = DriveState.SWITCH_ON_DISABLED
+        self._cycle_until(WARM_UP_S)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until(DriveState.OPERATION_ENABLED, ENABLE_TIMEOUT_S):
             i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
@@ -149,7 +153,7 @@ class Cell:
         assert self.cycle is not None and self.drives is not None and isinstance(timeout, float)
         for _ in range(int(timeout * 1e9 / self._settings.period_ns)):
             measurement = self.cycle.begin()
-            reached = measurement.q is not None and self.drives.all_in(*states)  # type: ignore[arg-type]
+            reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)  # type: ignore[arg-type]
             self.cycle.end(None)
             self._record(measurement, None)
             if reached:
@@ -158,8 +162,8 @@ class Cell:
 
     def _supervise(self, measurement: Measurement) -> None:
         self._check_alarms()
-        now = self._port.clock.now_ns()
-        if (node_id := self.watch.silent(now)) is not None:
+        assert self.cycle is not None
+        if (node_id := self.watch.silent(self.cycle.woken_ns)) is not None:
             raise NodeError(node_id, "lost: no heartbeat within its time-out")
         if (node_id := self.watch.not_in(NmtState.OPERATIONAL)) is not None:
             raise NodeError(node_id, f"left operation: NMT state {self.watch.states[node_id].name}")

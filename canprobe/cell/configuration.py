@@ -25,6 +25,8 @@ INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
 MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
 SYNC_START_VALUE = 1
+EMCY_INHIBIT_100US = 1000
+"""At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
@@ -56,6 +58,7 @@ def _common_writes(plan: Plan) -> list[Write]:
         Write(0x1006, 0, 0),  # 1019h may only change while 1006h is 0
         Write(0x1019, 0, plan.sync.overflow),
         Write(0x1006, 0, plan.sync.period_us),
+        Write(0x1015, 0, EMCY_INHIBIT_100US),
         Write(0x1017, 0, HEARTBEAT_PRODUCED_MS),
         Write(0x1016, 1, MASTER_NODE_ID << 16 | HEARTBEAT_CONSUMED_MS),
     ]

@@ -13,6 +13,10 @@ from canprobe.errors import BusError
 from canprobe.protocol.frames import SYNC_ID, Frame
 
 MAX_WAIT_NS = 100_000_000
+SINGLE_WAIT_NS = 2_000_000
+"""Longest wait of a port that waits and receives in one call: how late a deadline may be served on an idle bus."""
+GATHER_NS = 100_000
+"""How long frames other than SYNC are gathered before they are answered."""
 _EVERYTHING = range(1 << 32)
 _MOST_FRAMES = 20_000  # in one exchange; above it the nodes are taken to answer each other for ever
 
@@ -142,6 +146,19 @@ def _kind(seat: _Seat) -> type:
     return type(getattr(seat.node, "application", seat.node))
 
 
+def _receiver(port: Port, max_wait_ns: int) -> Callable[[int | None, int], list[TimedFrame]]:
+    """How to wait for frames until a deadline: by the port's own single call where it has one, in steps of 2 ms."""
+    if (at_once := getattr(port, "receive", None)) is not None:
+        return lambda due_ns, now_ns: at_once(SINGLE_WAIT_NS)
+
+    def receive(due_ns: int | None, now_ns: int) -> list[TimedFrame]:
+        until_ns = now_ns + max_wait_ns
+        port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
+        return port.drain()
+
+    return receive
+
+
 def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], max_wait_ns: int = MAX_WAIT_NS) -> None:
     """Power on the nodes and serve them until `stop()`; it is asked after every wait.
 
@@ -156,11 +173,13 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
         now_ns = clock.now_ns()
         if boot_ups := exchange.start(now_ns):
             port.send_batch(boot_ups)
+        receive = _receiver(port, max_wait_ns)
         while not stop():
-            due_ns = exchange.next_deadline_ns
-            until_ns = now_ns + max_wait_ns
-            port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
-            received = port.drain()
+            received = receive(exchange.next_deadline_ns, now_ns)
+            if received and received[-1][0] != SYNC_ID:
+                # Mostly the first of a burst: let its sender finish. Being woken for each frame costs both sides more.
+                clock.sleep_until_ns(received[-1][2] + GATHER_NS)
+                received += port.drain()
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
             now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()
             for frames in exchange.batches(received, now_ns):

@@ -49,7 +49,7 @@ def test_no_object_where_it_was_expected():
         plant.config = replace(plant.config, object=None)
         plant._solved = None
 
-    reason, truth = run_until_stopped(session, at_cycle=10, action=sink)
+    reason, truth = run_until_stopped(session, at_cycle=60, action=sink)
     assert "no object found up to 8 mm beyond" in reason
     assert truth["force"].max() == 0.0
 
