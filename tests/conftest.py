@@ -1,7 +1,7 @@
 """Plumbing of the whole suite: tests marked `vcan` run on a real SocketCAN interface, in a guest machine if need be.
 
 Where this kernel has a vcan0, they simply run. Elsewhere one `canprobe vcan -- python -m pytest ...` runs all of them
-beside the other tests, and each one's outcome there, with its duration and failure text, becomes its outcome here.
+before the other tests, and each one's outcome there, with its duration and failure text, becomes its outcome here.
 Where no vcan can be had they are skipped, and the summary says what to type.
 
     CANPROBE_REQUIRE_VCAN=1   a missing vcan is a failure, never a skip
@@ -50,6 +50,11 @@ def pytest_configure(config: pytest.Config) -> None:
             install = [*_CANPROBE, "vcan", "--install", "--", "true"]
             subprocess.run(install, cwd=config.rootpath, stdin=subprocess.DEVNULL, check=False)
         config.pluginmanager.register(OuterRun(config))
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The vcan tests first, and alone: a cell at 400 Hz shares its processor with no other test."""
+    items.sort(key=lambda item: not _is_vcan(item))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
