@@ -1,0 +1,159 @@
+"""Every way out of a cell on a real interface: interrupts, nodes that die or never were there, other masters."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
+
+pytestmark = pytest.mark.vcan
+NODES = (1, 2, 3, 4, 5, 6, 16)
+ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_in_mid_scan(bench: Any, number: int, status: int) -> None:
+    command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=400)
+    command.send(number)
+    assert command.end(status) == ["canprobe: interrupted, the cell is stopped; what was measured until then: results"]
+    results = bench.results("results")
+    assert (results.summary["completed"], results.summary["stop_reason"]) == (False, "interrupted")
+    assert results.summary["cycle"]["cycles"] >= 400
+    bench.assert_left_safe(results.last, *NODES)
+    with np.load(bench.folder / "results" / "truth.npz") as truth:
+        assert len(truth["t_s"]) >= 400
+        steps = np.abs(np.diff(truth["q"], axis=0)).max(axis=1)
+        assert steps[-1] < 0.1 * steps.max(), "the arm comes to rest"
+
+
+def test_up_ends_with_an_interrupt(bench: Any) -> None:
+    command = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    bench.bus.until_enabled(1, by=command)
+    command.send(signal.SIGINT)
+    lines = command.end(0)
+    bench.bus.hear()
+    bench.assert_left_safe(bench.bus.last, *NODES[:6])
+    assert "the cell is up: nodes 1, 2, 3, 4, 5, 6; Ctrl-C stops it" in lines
+
+
+def test_the_emulator_is_killed_in_mid_scan(bench: Any) -> None:
+    (bench.folder / "results").mkdir()
+    (bench.folder / "results" / "truth.npz").write_text("of an earlier run")
+    command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=400)
+    (child,) = command.children
+    os.kill(child, signal.SIGKILL)
+    (line,) = command.end(3)
+    assert line.startswith("canprobe: node 1: lost: ")
+    results = bench.results("results")
+    assert results.summary["completed"] is False
+    assert results.summary["stop_reason"] == line.removeprefix("canprobe: ")
+    assert results.summary["cycle"]["missed_pdos"] >= 6 * 6
+    assert not (bench.folder / "results" / "truth.npz").exists(), "the truth died with the emulator"
+
+
+def test_one_node_is_missing_then_there_then_killed(bench: Any) -> None:
+    scene, run = bench.scene("free"), ("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out")
+    five = bench.start("emulate", scene, "--channel", "vcan0", "--nodes", "1,2,4-6")
+    bench.bus.until_booted(1, 2, 4, 5, 6, by=five)
+
+    (line,) = bench.start(*run, "missing").end(3)
+    assert line.startswith("canprobe: node 3: (joint 3) sent no boot-up within ")
+    assert "nor did" not in line
+
+    third = bench.start("emulate", scene, "--channel", "vcan0", "--nodes", "3")
+    bench.bus.until_booted(3, by=third)
+    command = bench.start(*run, "killed")
+    bench.bus.until_enabled(6, by=command, cycles=100)
+    third.send(signal.SIGKILL)
+    (line,) = command.end(3)
+    assert line.startswith("canprobe: node 3: lost: ")
+    results = bench.results("killed")
+    assert results.summary["stop_reason"] == line.removeprefix("canprobe: ")
+    bench.assert_left_safe(results.last, 1, 2, 4, 5, 6)
+
+    five.send(signal.SIGTERM)
+    five.end(0)
+
+
+def test_emulated_nodes_go_with_their_master(bench: Any) -> None:
+    command = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    bench.bus.until_enabled(1, by=command)
+    (child,) = command.children
+    command.send(signal.SIGKILL)
+    while Path(f"/proc/{child}").exists():
+        bench.bus.hear()
+
+
+def test_drives_stop_by_themselves_when_their_master_is_killed(bench: Any) -> None:
+    served = bench.start("emulate", bench.scene("free"), "--channel", "vcan0")
+    bench.bus.until_booted(*NODES[:6], by=served)
+    command = bench.start("up", bench.scene("free", emulated=False), *ON_VCAN0)
+    bench.bus.until_enabled(6, by=command)
+    command.send(signal.SIGKILL)
+    emergencies: set[int] = set()
+
+    def complete(frame: tuple[int, bytes, int]) -> bool:
+        if frame[0] in range(0x81, 0x87) and frame[1][:2] != bytes(2):
+            emergencies.add(frame[0])
+        return len(emergencies) == 6
+
+    bench.bus.until(complete, served)
+    answers: dict[int, bytes] = {}
+
+    def all_off(frame: tuple[int, bytes, int]) -> bool:
+        if frame[0] in range(0x581, 0x587):
+            answers[frame[0] - 0x580] = frame[1][4:6]
+        elif frame[0] == 0x701:  # ask once a heartbeat
+            bench.bus.port.send_batch([(0x600 + n, bytes.fromhex("4041600000000000")) for n in NODES[:6]])
+        states = [state_of(int.from_bytes(word, "little")) for word in answers.values()]
+        return len(states) == 6 and not POWERED_STATES.intersection(states)
+
+    bench.bus.until(all_off, served)
+
+
+def test_nobody_is_there(bench: Any) -> None:
+    (line,) = bench.start("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out", "results").end(3)
+    assert line.startswith("canprobe: node 1: (joint 1) sent no boot-up within ")
+    assert "nor did 2 (joint 2), 3 (joint 3)" in line
+
+
+@pytest.mark.parametrize(
+    ("frame", "what"),
+    [
+        ((0x77F, b"\x05"), "a heartbeat of node 127"),
+        ((0x080, b"\x01"), "SYNC"),
+        ((0x000, b"\x01\x00"), "an NMT command"),
+    ],
+)
+def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: str) -> None:
+    command = bench.start("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out", "results")
+    while command.running:
+        bench.bus.port.send_batch([frame])
+        bench.bus.hear()
+    (line,) = command.end(3)
+    assert line.startswith(f"canprobe: vcan0: {what}")
+    assert line.endswith("another master is at work here; stop it first")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run", "press", "--bus", "socketcan", "--channel", "vcan7"),
+        ("up", "press", "--bus", "socketcan", "--channel", "vcan7"),
+        ("emulate", "press", "--channel", "vcan7"),
+        ("scan", "--channel", "vcan7"),
+    ],
+)
+def test_an_interface_that_is_not_there(bench: Any, words: tuple[str, ...]) -> None:
+    (line,) = bench.start(*words).end(3)
+    assert line.startswith("canprobe: vcan7: no such interface; type: ")
+    assert "ip link add dev vcan7 type vcan" in line
+    assert not (bench.folder / "runs").exists()

@@ -1,0 +1,100 @@
+"""Emulated nodes in a process of their own, served to whoever comes: `canprobe`, or a master that is not ours."""
+
+from __future__ import annotations
+
+import json
+import signal
+from typing import Any
+
+import canopen
+import pytest
+
+from canprobe.eds import eds_path
+
+pytestmark = pytest.mark.vcan
+NODES = (1, 2, 3, 4, 5, 6, 16)
+ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
+
+
+@pytest.fixture(scope="module")
+def served(start_shared: Any) -> Any:
+    """`canprobe emulate cylinder`, started once; the last test of the module ends it."""
+    command = start_shared("emulate", "cylinder", "--channel", "vcan0")
+    while not command.err.startswith("serving nodes"):
+        assert command.running, command.err
+    return command
+
+
+def test_scan_lists_the_nodes_with_their_identity(served: Any, bench: Any) -> None:
+    command = bench.start("scan", "--channel", "vcan0", "--json")
+    assert command.end(0) == []
+    nodes = {node["node_id"]: node for node in json.loads(command.out)}
+    assert tuple(nodes) == NODES
+    for node_id, node in nodes.items():
+        eds: Any = canopen.import_od(str(eds_path("tactile_array" if node_id == 16 else "puma260_joint")), node_id)
+        for subindex, name in enumerate(("vendor_id", "product_code", "revision_number"), start=1):
+            assert node[name] == eds[0x1018][subindex].default, (node_id, name)
+        assert node["device_name"] == eds[0x1008].default
+
+
+def test_a_canopen_master_that_is_not_ours(served: Any, vcan0: str) -> None:
+    network = canopen.Network()
+    network.connect(interface="socketcan", channel=vcan0)
+    try:
+        node: Any = network.add_node(3, str(eds_path("puma260_joint")))
+        node.sdo.RESPONSE_TIMEOUT = 2.0
+        for subindex in (1, 2, 3):
+            assert node.sdo[0x1018][subindex].raw == node.object_dictionary[0x1018][subindex].default
+        node.sdo[0x1017].raw = 50
+        assert node.nmt.wait_for_heartbeat(timeout=10) == "PRE-OPERATIONAL"
+        node.nmt.state = "OPERATIONAL"
+        while node.nmt.wait_for_heartbeat(timeout=10) != "OPERATIONAL":
+            pass
+        node.sdo[0x6040].raw = 0x06
+        assert node.sdo[0x6041].raw & 0x6F == 0x21, "ready to switch on"
+        node.nmt.state = "RESET"
+        node.nmt.wait_for_bootup(timeout=10)
+    finally:
+        network.disconnect()
+
+
+def test_a_run_that_emulates_nothing(served: Any, bench: Any) -> None:
+    scene = bench.scene("press", emulated=False)
+    command = bench.start("run", scene, *ON_VCAN0, "--duration", 1, "--out", "results")
+    assert command.end(0) == []
+    results = bench.results("results")
+    assert not (bench.folder / "results" / "truth.npz").exists(), "nothing knows the truth about real nodes"
+    assert results.summary["completed"] is True
+    assert results.summary["contact"]["force_target_n"] == 2.0
+    assert results.summary["contact"]["force_measured_rms_error_n"] < 1.0
+    bench.assert_left_safe(results.last, *NODES)
+    assert served.running
+
+
+def test_a_node_of_another_make_is_refused(served: Any, bench: Any) -> None:
+    text = eds_path("puma260_joint").read_text()
+    assert "DefaultValue=0x00000260" in text
+    other = bench.folder / "other_drive.eds"
+    other.write_text(text.replace("DefaultValue=0x00000260", "DefaultValue=0x00000261"))
+    scene = bench.scene("free", emulated=False, eds=str(other))
+    (line,) = bench.start("run", scene, *ON_VCAN0, "--out", "results").end(3)
+    assert line.startswith("canprobe: node 1: (joint 1) is not the device of ")
+    assert "other_drive.eds: 1018h:02 product code expected 0x261, got 0x260" in line
+
+
+@pytest.mark.parametrize(("nodes", "first"), [("1-6,16", 1), ("16,5", 5)])
+def test_a_busy_node_id_is_refused(served: Any, bench: Any, nodes: str, first: int) -> None:
+    (line,) = bench.start("emulate", "cylinder", "--channel", "vcan0", "--nodes", nodes).end(3)
+    assert line.startswith(f"canprobe: node {first}: is on vcan0 already; its id is busy")
+
+
+def test_a_run_whose_emulated_nodes_are_there_already(served: Any, bench: Any) -> None:
+    (line,) = bench.start("run", "press", *ON_VCAN0, "--out", "results").end(3)
+    assert line.startswith("canprobe: node 1: is on vcan0 already; its id is busy")
+    assert served.running
+
+
+def test_serving_ends_with_an_interrupt(served: Any) -> None:
+    served.send(signal.SIGINT)
+    (line,) = served.end(0)
+    assert line == "serving nodes 1, 2, 3, 4, 5, 6, 16 on vcan0; Ctrl-C stops them"
