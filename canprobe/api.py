@@ -62,9 +62,6 @@ def run(
     folder = results_folder(resolved, out) if files else None
     session = Session(resolved, folder, say)
     controller = make_task(session.plan)
-    if resolved.bus.interface != LOCKSTEP:
-        say("rehearse in lockstep")
-        rehearse(resolved)
     failure: BaseException | None = None
     try:
         with session:
@@ -212,21 +209,25 @@ def emulate(
     from canprobe.planning import make_plan
 
     resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
-    rehearse(resolved)
-    world = make_world(make_plan(resolved), node_ids)
+    plan = make_plan(resolved)
     port = open_port(interface, channel, bitrate, MonotonicClock())
-    ask_for_processor()
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(
                 busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes"
             )
+        rehearse(resolved)
+        world = make_world(plan, node_ids)
+        port.drain()  # what passed meanwhile
+        ask_for_processor()
         say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
-        serve(world.participants, port, lambda: False)
+        try:
+            serve(world.participants, port, lambda: False)
+        finally:
+            if truth_path is not None:
+                world.recorder.save(truth_path)
     finally:
         port.close()
-        if truth_path is not None and world.recorder is not None:
-            world.recorder.save(truth_path)
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

@@ -55,13 +55,9 @@ class EmulatorChild:
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
 
-    def start(self, port: Port) -> None:
-        """Start the process and wait for the boot-up of each of its nodes.
-
-        Raises:
-            BusError: the process ended; with its own last words.
-            NodeError: a node did not boot in time.
-        """
+    def start(self) -> None:
+        """Start the process."""
+        self._truth.unlink(missing_ok=True)  # of an earlier run into the same folder
         scene_file = self._folder / "scene.toml"
         scene_file.write_text(dump_scene(self._scene), encoding="utf-8")
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
@@ -78,10 +74,16 @@ class EmulatorChild:
             stderr=self._errors,
             start_new_session=True,
         )
-        self._await_boot_ups(port, set(nodes))
 
-    def _await_boot_ups(self, port: Port, waiting: set[int]) -> None:
+    def await_boot_ups(self, port: Port) -> None:
+        """Wait for the boot-up of each of its nodes.
+
+        Raises:
+            BusError: the process ended; with its own last words.
+            NodeError: a node did not boot in time.
+        """
         assert self._process is not None
+        waiting = set(self._scene.emulated_node_ids)
         clock = port.clock
         deadline = clock.now_ns() + round(START_TIMEOUT_S * 1e9)
         while waiting:
@@ -101,12 +103,11 @@ class EmulatorChild:
         return lines[-1].removeprefix("canprobe: ") if lines else ""
 
     def end(self) -> dict[str, NDArray[np.float64]]:
-        """Stop the process, first politely; the plant's truth where it left any."""
+        """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
         if self._process is not None:
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-                with contextlib.suppress(ProcessLookupError):
-                    os.kill(self._process.pid, number)
-                with contextlib.suppress(subprocess.TimeoutExpired):
+                self._process.send_signal(number)
+                with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(END_TIMEOUT_S)
                     break
         truth = {}

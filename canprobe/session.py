@@ -209,6 +209,7 @@ class Session:
     def _open_real(self) -> Port:
         from canprobe.bus.open import open_port
         from canprobe.child import EmulatorChild
+        from canprobe.rehearsal import rehearse
 
         bus = self.scene.bus
         if bus.interface == "virtual" and self.scene.emulated_node_ids:
@@ -220,11 +221,16 @@ class Session:
         real = open_port(bus.interface, bus.channel, bus.bitrate, clock)
         self._stack.callback(real.close)
         port = RecordingPort(real, _Sink(self._writer(clock.now_ns())))
+        child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
             child = EmulatorChild(self.scene, self.out)
             self._stack.callback(self._end_child, child)
-            child.start(port)
+            child.start()
+        self._say("rehearse in lockstep")
+        rehearse(self.scene)
+        if child is not None:
+            child.await_boot_ups(port)
         return port
 
     def _end_child(self, child: Any) -> None:
