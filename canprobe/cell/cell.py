@@ -144,7 +144,7 @@ class Cell:
             raise NodeError(
                 self.drives.axes[i].node_id,
                 f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
-                + "".join(f"; {event}" for event in self.watch.alarms()[-1:]),
+                + "".join(f"; {event}" for event in self.watch.alarms[-1:]),
             )
 
     def _cycle_until(self, *states_and_timeout: DriveState | float) -> bool:
@@ -178,16 +178,16 @@ class Cell:
             self._raise_not_enabled()
 
     def _check_alarms(self) -> None:
-        alarms = self.watch.alarms()
-        for event in alarms[self._alarms :]:
-            self.faults.append(str(event))
-        self._alarms = len(alarms)
+        alarms = self.watch.alarms
+        while self._alarms < len(alarms):
+            self.faults.append(str(alarms[self._alarms]))
+            self._alarms += 1
 
     def _raise_not_enabled(self) -> None:
         assert self.drives is not None
         i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
         node_id = self.drives.axes[i].node_id
-        why = "".join(f"; {e}" for e in [e for e in self.watch.alarms() if e.node_id == node_id][-1:])
+        why = "".join(f"; {e}" for e in [e for e in self.watch.alarms if e.node_id == node_id][-1:])
         raise NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:

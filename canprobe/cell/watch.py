@@ -28,6 +28,13 @@ class NodeWatch:
         node_ids: the nodes that are watched.
         master_id: our own node id; its heartbeat from anybody else is foreign.
         heartbeat_timeout_ns: silence after which a node is lost.
+
+    Attributes:
+        states: NMT state that each node told last.
+        boot_ups: boot-up messages of each node.
+        emergencies: every EMCY, in order.
+        alarms: those that report an error, not its end.
+        foreign: what another master sent.
     """
 
     def __init__(self, node_ids: tuple[int, ...], master_id: int, heartbeat_timeout_ns: int) -> None:
@@ -35,6 +42,7 @@ class NodeWatch:
         self.states: dict[int, NmtState] = {}
         self.boot_ups: dict[int, int] = dict.fromkeys(node_ids, 0)
         self.emergencies: list[EmcyEvent] = []
+        self.alarms: list[EmcyEvent] = []
         self.foreign: list[str] = []
         self._master_id = master_id
         self._timeout_ns = heartbeat_timeout_ns
@@ -67,9 +75,12 @@ class NodeWatch:
 
     def _push_emcy(self, node_id: int, data: bytes, t_ns: int) -> None:
         try:
-            self.emergencies.append(EmcyEvent(node_id, Emcy.unpack(data), t_ns))
+            event = EmcyEvent(node_id, Emcy.unpack(data), t_ns)
         except ProtocolError:
             return
+        self.emergencies.append(event)
+        if event.emcy.code != NO_ERROR:
+            self.alarms.append(event)
 
     def forget(self) -> None:
         """Start the heartbeat supervision afresh: nobody has been heard yet."""
@@ -88,7 +99,3 @@ class NodeWatch:
     def not_in(self, state: NmtState) -> int | None:
         """A node whose last heartbeat told another state than ``state``, or None."""
         return next((node_id for node_id, seen in self.states.items() if seen is not state), None)
-
-    def alarms(self) -> list[EmcyEvent]:
-        """Emergencies that report an error (those that only report its end are left out)."""
-        return [event for event in self.emergencies if event.emcy.code != NO_ERROR]

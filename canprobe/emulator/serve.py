@@ -49,8 +49,8 @@ class _Seat:
         self.ears: Container[int] = getattr(node, "listens", _EVERYTHING)
 
     def hear(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Give the node a frame that it listens to; keep its answers."""
-        if can_id in self.ears and (answers := self.node.receive(can_id, data, t_ns)):
+        """Give the node a frame; keep its answers."""
+        if answers := self.node.receive(can_id, data, t_ns):
             self.queue.extend(answers)
 
 
@@ -65,6 +65,17 @@ class Exchange:
     def __init__(self, nodes: Sequence[Participant]) -> None:
         self._seats = tuple(_Seat(node) for node in nodes)
         self._kinds = tuple(tuple(seats) for _, seats in groupby(self._seats, key=_kind))
+        self._audiences: dict[int, tuple[_Seat, ...]] = {}
+        for node in nodes:
+            if hasattr(node, "rerouted"):
+                node.rerouted = self._audiences.clear
+
+    def _audience(self, can_id: int) -> tuple[_Seat, ...]:
+        """Who listens to an identifier: found once, until a node changes its mind."""
+        seats = self._audiences.get(can_id)
+        if seats is None:
+            seats = self._audiences[can_id] = tuple(seat for seat in self._seats if can_id in seat.ears)
+        return seats
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -93,7 +104,7 @@ class Exchange:
             if can_id == SYNC_ID:
                 yield from self._synchronise(data, heard_ns)
                 continue
-            for seat in self._seats:
+            for seat in self._audience(can_id):
                 seat.hear(can_id, data, heard_ns)
         for seat in self._seats:
             due = seat.node.next_deadline_ns
@@ -109,12 +120,11 @@ class Exchange:
         spoken: list[tuple[_Seat, Frame]] = []
         for kind in self._kinds:
             for seat in kind:
-                seat.hear(SYNC_ID, data, t_ns)
-            first = len(spoken)
-            while (sender := self._next_sender()) is not None:
-                spoken.append((sender, sender.queue.popleft()))
-            if len(spoken) > first:
-                yield [frame for _, frame in spoken[first:]]
+                if SYNC_ID in seat.ears:
+                    seat.hear(SYNC_ID, data, t_ns)
+            if said := self._said():
+                spoken += said
+                yield [frame for _, frame in said]
         for sender, frame in spoken:
             self._overhear(sender, frame, t_ns)
 
@@ -129,11 +139,24 @@ class Exchange:
             self._overhear(sender, frame, t_ns)
         return sent
 
+    def _said(self) -> list[tuple[_Seat, Frame]]:
+        """Empty the queues, lowest identifier first, each in its own order."""
+        talking = [seat for seat in self._seats if seat.queue]
+        said: list[tuple[_Seat, Frame]] = []
+        if len(talking) == 1 or all(len(seat.queue) == 1 for seat in talking):  # as after nearly every SYNC
+            for seat in sorted(talking, key=_head):
+                said += [(seat, frame) for frame in seat.queue]
+                seat.queue.clear()
+            return said
+        while (sender := self._next_sender()) is not None:
+            said.append((sender, sender.queue.popleft()))
+        return said
+
     def _next_sender(self) -> _Seat | None:
         return min((seat for seat in self._seats if seat.queue), key=_head, default=None)
 
     def _overhear(self, sender: _Seat, frame: Frame, t_ns: int) -> None:
-        for seat in self._seats:
+        for seat in self._audience(frame[0]):
             if seat is not sender:
                 seat.hear(*frame, t_ns)
 
