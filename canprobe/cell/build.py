@@ -37,7 +37,7 @@ def make_cell(
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
         sync_overflow=plan.sync.overflow,
-        heartbeat_cycles=max(1, HEARTBEAT_PRODUCED_MS * 1_000_000 // plan.sync.period_ns),
+        heartbeat_ns=HEARTBEAT_PRODUCED_MS * 1_000_000,
         master_id=MASTER_NODE_ID,
     )
     return Cell(

@@ -34,13 +34,13 @@ class CycleSettings:
     Attributes:
         period_ns: from SYNC to SYNC.
         sync_overflow: of the SYNC counter (1019h).
-        heartbeat_cycles: cycles between two heartbeats of the master.
+        heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
     """
 
     period_ns: int
     sync_overflow: int
-    heartbeat_cycles: int
+    heartbeat_ns: int
     master_id: int
 
 
@@ -80,6 +80,7 @@ class Cycle:
         self.t_first_ns = port.clock.now_ns() + settings.period_ns
         self.t_ns = 0
         self.woken_ns = 0
+        self._heartbeat_ns = 0
         self._port = port
         self._s = settings
         self._drives = drives
@@ -170,7 +171,8 @@ class Cycle:
             if command is not None:
                 self._drives.set_target(command.q_target)
             frames = self._drives.frames()
-        if self.number % self._s.heartbeat_cycles == 0:
+        if self.woken_ns >= self._heartbeat_ns:
+            self._heartbeat_ns = self._deadline + self._s.heartbeat_ns
             frames.append(pack_heartbeat(self._s.master_id, NmtState.OPERATIONAL))
         if frames:
             self._port.send_batch(frames)

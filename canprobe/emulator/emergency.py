@@ -28,6 +28,10 @@ def register_bit(code: int) -> int:
     return _REGISTER_BITS.get(code >> 12, 0)
 
 
+_MOST_WAITING = 16
+"""Messages kept while the inhibit time runs; of a flood the oldest go."""
+
+
 class Emergency:
     """Reports errors once, tells when they are gone, and remembers them.
 
@@ -40,7 +44,7 @@ class Emergency:
         self._active: set[int] = set()
         self.any = False
         self._history: list[int] = []
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
         self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
         self._timer = core.timers.new(self._inhibit_over)
         core.dictionary.on_check(0x1003, self._check_history)
@@ -110,10 +114,11 @@ class Emergency:
         dictionary.put(0x1001, 0, self._register())
         del self._history[self._room :]
         dictionary.put(0x1003, 0, len(self._history))
-        for subindex in range(1, self._room + 1):
-            dictionary.put(0x1003, subindex, self._history[subindex - 1] if subindex <= len(self._history) else 0)
 
     def _check_read(self, subindex: int) -> None:
+        """Refuse an entry that is not there; bring one that is up to date, which is only needed now."""
+        if 0 < subindex <= len(self._history):
+            self._core.dictionary.put(0x1003, subindex, self._history[subindex - 1])
         if subindex > len(self._history):
             raise SdoAbort(Abort.NO_DATA)
 
