@@ -33,11 +33,18 @@ class Command:
         self._out, self._err = folder / "stdout", folder / "stderr"
         temporary = self.temporary = folder / "temporary"
         temporary.mkdir()
+        (folder / "matplotlib.py").write_text(
+            "raise ImportError('no figure: drawing one takes longer than these runs')"
+        )
+        environment = {
+            **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
+            **{"PYTHONPATH": f"{folder}:{ROOT}", "TMPDIR": str(temporary)},
+        }
         with self._out.open("wb") as out, self._err.open("wb") as err:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "canprobe", *words],
                 cwd=folder.parent,
-                env={**os.environ, "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)},
+                env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,

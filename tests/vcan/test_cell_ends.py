@@ -10,27 +10,27 @@ from typing import Any
 import numpy as np
 import pytest
 
-from canprobe.protocol.cia402 import POWERED_STATES, state_of
-
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_an_interrupt_in_mid_scan(bench: Any, number: int, status: int) -> None:
-    command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results")
-    bench.bus.until_enabled(6, by=command, cycles=400)
+@pytest.mark.parametrize(
+    ("name", "cycles", "number", "status"), [("cylinder", 300, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
+)
+def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int, status: int) -> None:
+    command = bench.start("run", bench.scene(name), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=cycles)
     command.send(number)
     assert command.end(status) == ["canprobe: interrupted, the cell is stopped; what was measured until then: results"]
     results = bench.results("results")
     assert (results.summary["completed"], results.summary["stop_reason"]) == (False, "interrupted")
-    assert results.summary["cycle"]["cycles"] >= 400
-    bench.assert_left_safe(results.last, *NODES)
+    assert results.summary["cycle"]["cycles"] >= cycles
+    bench.assert_left_safe(results.last, *NODES[: 7 if name == "cylinder" else 6])
     with np.load(bench.folder / "results" / "truth.npz") as truth:
-        assert len(truth["t_s"]) >= 400
+        assert len(truth["t_s"]) >= cycles
         steps = np.abs(np.diff(truth["q"], axis=0)).max(axis=1)
-        assert steps[-1] < 0.1 * steps.max(), "the arm comes to rest"
+        assert steps[-1] < 0.3 * steps.max(), "the arm comes to rest"
 
 
 def test_up_ends_with_an_interrupt(bench: Any) -> None:
@@ -47,7 +47,7 @@ def test_the_emulator_is_killed_in_mid_scan(bench: Any) -> None:
     (bench.folder / "results").mkdir()
     (bench.folder / "results" / "truth.npz").write_text("of an earlier run")
     command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results")
-    bench.bus.until_enabled(6, by=command, cycles=400)
+    bench.bus.until_enabled(6, by=command, cycles=300)
     (child,) = command.children
     os.kill(child, signal.SIGKILL)
     (line,) = command.end(3)
@@ -83,7 +83,7 @@ def test_one_node_is_missing_then_there_then_killed(bench: Any) -> None:
     five.end(0)
 
 
-def test_emulated_nodes_go_with_their_master(bench: Any) -> None:
+def test_emulated_nodes_go_with_a_master_that_is_killed(bench: Any) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0)
     bench.bus.until_enabled(1, by=command)
     (child,) = command.children
@@ -92,45 +92,11 @@ def test_emulated_nodes_go_with_their_master(bench: Any) -> None:
         bench.bus.hear()
 
 
-def test_drives_stop_by_themselves_when_their_master_is_killed(bench: Any) -> None:
-    served = bench.start("emulate", bench.scene("free"), "--channel", "vcan0")
-    bench.bus.until_booted(*NODES[:6], by=served)
-    command = bench.start("up", bench.scene("free", emulated=False), *ON_VCAN0)
-    bench.bus.until_enabled(6, by=command)
-    command.send(signal.SIGKILL)
-    emergencies: set[int] = set()
-
-    def complete(frame: tuple[int, bytes, int]) -> bool:
-        if frame[0] in range(0x81, 0x87) and frame[1][:2] != bytes(2):
-            emergencies.add(frame[0])
-        return len(emergencies) == 6
-
-    bench.bus.until(complete, served)
-    answers: dict[int, bytes] = {}
-
-    def all_off(frame: tuple[int, bytes, int]) -> bool:
-        if frame[0] in range(0x581, 0x587):
-            answers[frame[0] - 0x580] = frame[1][4:6]
-        elif frame[0] == 0x701:  # ask once a heartbeat
-            bench.bus.port.send_batch([(0x600 + n, bytes.fromhex("4041600000000000")) for n in NODES[:6]])
-        states = [state_of(int.from_bytes(word, "little")) for word in answers.values()]
-        return len(states) == 6 and not POWERED_STATES.intersection(states)
-
-    bench.bus.until(all_off, served)
-
-
-def test_nobody_is_there(bench: Any) -> None:
-    (line,) = bench.start("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out", "results").end(3)
-    assert line.startswith("canprobe: node 1: (joint 1) sent no boot-up within ")
-    assert "nor did 2 (joint 2), 3 (joint 3)" in line
-
-
 @pytest.mark.parametrize(
     ("frame", "what"),
     [
         ((0x77F, b"\x05"), "a heartbeat of node 127"),
         ((0x080, b"\x01"), "SYNC"),
-        ((0x000, b"\x01\x00"), "an NMT command"),
     ],
 )
 def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: str) -> None:
@@ -147,9 +113,7 @@ def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: s
     "words",
     [
         ("run", "press", "--bus", "socketcan", "--channel", "vcan7"),
-        ("up", "press", "--bus", "socketcan", "--channel", "vcan7"),
         ("emulate", "press", "--channel", "vcan7"),
-        ("scan", "--channel", "vcan7"),
     ],
 )
 def test_an_interface_that_is_not_there(bench: Any, words: tuple[str, ...]) -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 import signal
+import threading
 from typing import Any
 
 import canopen
 import pytest
 
 from canprobe.eds import eds_path
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
 
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)
@@ -52,8 +54,10 @@ def test_a_canopen_master_that_is_not_ours(served: Any, vcan0: str) -> None:
             pass
         node.sdo[0x6040].raw = 0x06
         assert node.sdo[0x6041].raw & 0x6F == 0x21, "ready to switch on"
+        booted = threading.Event()
+        network.subscribe(0x703, lambda can_id, data, t_s: booted.set() if data == b"\0" else None)
         node.nmt.state = "RESET"
-        node.nmt.wait_for_bootup(timeout=10)
+        assert booted.wait(10), "the boot-up"
     finally:
         network.disconnect()
 
@@ -82,16 +86,40 @@ def test_a_node_of_another_make_is_refused(served: Any, bench: Any) -> None:
     assert "other_drive.eds: 1018h:02 product code expected 0x261, got 0x260" in line
 
 
-@pytest.mark.parametrize(("nodes", "first"), [("1-6,16", 1), ("16,5", 5)])
-def test_a_busy_node_id_is_refused(served: Any, bench: Any, nodes: str, first: int) -> None:
-    (line,) = bench.start("emulate", "cylinder", "--channel", "vcan0", "--nodes", nodes).end(3)
-    assert line.startswith(f"canprobe: node {first}: is on vcan0 already; its id is busy")
+def test_a_busy_node_id_is_refused(served: Any, bench: Any) -> None:
+    (line,) = bench.start("emulate", "cylinder", "--channel", "vcan0", "--nodes", "16,5").end(3)
+    assert line.startswith("canprobe: node 5: is on vcan0 already; its id is busy")
 
 
 def test_a_run_whose_emulated_nodes_are_there_already(served: Any, bench: Any) -> None:
     (line,) = bench.start("run", "press", *ON_VCAN0, "--out", "results").end(3)
     assert line.startswith("canprobe: node 1: is on vcan0 already; its id is busy")
     assert served.running
+
+
+def test_drives_stop_by_themselves_when_their_master_is_killed(served: Any, bench: Any) -> None:
+    command = bench.start("up", bench.scene("free", emulated=False), *ON_VCAN0)
+    bench.bus.until_enabled(6, by=command)
+    command.send(signal.SIGKILL)
+    emergencies: set[int] = set()
+
+    def complete(frame: tuple[int, bytes, int]) -> bool:
+        if frame[0] in range(0x81, 0x87) and frame[1][:2] != bytes(2):
+            emergencies.add(frame[0])
+        return len(emergencies) == 6
+
+    bench.bus.until(complete, served)
+    answers: dict[int, bytes] = {}
+
+    def all_off(frame: tuple[int, bytes, int]) -> bool:
+        if frame[0] in range(0x581, 0x587):
+            answers[frame[0] - 0x580] = frame[1][4:6]
+        elif frame[0] == 0x701:  # ask once a heartbeat
+            bench.bus.port.send_batch([(0x600 + n, bytes.fromhex("4041600000000000")) for n in NODES[:6]])
+        states = [state_of(int.from_bytes(word, "little")) for word in answers.values()]
+        return len(states) == 6 and not POWERED_STATES.intersection(states)
+
+    bench.bus.until(all_off, served)
 
 
 def test_serving_ends_with_an_interrupt(served: Any) -> None:
