@@ -44,7 +44,7 @@ class Emergency:
         self._active: set[int] = set()
         self.any = False
         self._history: list[int] = []
-        self._waiting: deque[bytes] = deque(maxlen=_MOST_WAITING)
+        self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MOST_WAITING)
         self._room = sum(1 for key in core.dictionary.entries if key >> 8 == 0x1003 and key & 0xFF)
         self._timer = core.timers.new(self._inhibit_over)
         core.dictionary.on_check(0x1003, self._check_history)
@@ -85,20 +85,24 @@ class Emergency:
         if code in self._active:
             self._active.discard(code)
             self._show()
-            self._send(NO_ERROR, b"")
+            if self._waiting and self._waiting[-1][0] == code:
+                self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
+            else:
+                self._send(NO_ERROR, b"")
 
     def _send(self, code: int, data: bytes) -> None:
-        cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
-        if cob_id & INVALID or self._core.state not in _SENDING:
+        if self._core.state not in _SENDING:
             return
-        self._waiting.append(Emcy(code, self._register(), data).pack())
+        self._waiting.append((code, self._register(), data))
         if self._timer.due_ns is None:
             self._inhibit_over(self._core.now_ns)
 
     def _inhibit_over(self, due_ns: int) -> None:
         if self._waiting:
             cob_id = self._core.dictionary.number(0x1014, 0, 0x80 + self._core.node_id)
-            self._core.send(cob_id & 0x7FF, self._waiting.popleft())
+            emcy = Emcy(*self._waiting.popleft())
+            if not cob_id & INVALID:
+                self._core.send(cob_id & 0x7FF, emcy.pack())
             if inhibit := self._core.dictionary.number(0x1015):
                 self._timer.arm(due_ns + inhibit * 100_000)
 
@@ -111,7 +115,7 @@ class Emergency:
     def _show(self) -> None:
         dictionary = self._core.dictionary
         self.any = bool(self._active)
-        dictionary.put(0x1001, 0, self._register())
+        dictionary.put(0x1001, 0, self._register() if self._active else 0)
         del self._history[self._room :]
         dictionary.put(0x1003, 0, len(self._history))
 
