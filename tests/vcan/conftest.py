@@ -79,6 +79,12 @@ class Command:
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 
+    def wait(self) -> int:
+        """Wait for the end; return the exit status. Nothing may be left of it."""
+        status = self._process.wait(PATIENCE_S)
+        assert self.children == []
+        return status
+
     def end(self, status: int) -> list[str]:
         """Wait for the end with this status; return the lines on stderr. Nothing may be left of it."""
         ended = self._process.wait(PATIENCE_S)
