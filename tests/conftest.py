@@ -89,6 +89,31 @@ class InnerRun:
         self._wanted = set(json.loads((folder / "items.json").read_text()))
         self._reports = (folder / "reports.jsonl").open("a", encoding="utf-8")
 
+    @pytest.hookimpl(trylast=True)
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        items[:] = [item for item in items if item.nodeid in self._wanted]
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        data = self._config.hook.pytest_report_to_serializable(config=self._config, report=report)
+        self._reports.write(json.dumps(data, default=str) + "\n")
+        self._reports.flush()
+
+    def pytest_unconfigure(self) -> None:
+        self._reports.close()
+
+
+class OuterRun:
+    """The session without a vcan: start the inner one before all else, and report what that one found."""
+
+    def __init__(self, config: pytest.Config) -> None:
+        self._config = config
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._reports: dict[str, list[pytest.TestReport]] = {}
+        self._lines: Iterator[str] = iter(())
+        self._not_run = 0
+        self._why = ""
+
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtestloop(self, session: pytest.Session) -> None:
         items = [item for item in session.items if _is_vcan(item)]
