@@ -230,7 +230,7 @@ class GuestJob:
                 _write_all(target, chunk)
 
     def _boot(self, realtime: bool) -> subprocess.Popen[bytes]:
-        prefix, self._spinner = _pin() if realtime else ([], None)
+        prefix, self._spinner = _pin() if realtime else (_favour(), None)
         if shutil.which("setpriv"):
             prefix = ["setpriv", "--pdeathsig", "TERM", *prefix]  # the guest ends with us, however we end
         memory_folder, memory = _memory()
@@ -291,6 +291,20 @@ def _memory() -> tuple[str, int]:
         if not state.f_flag & os.ST_NOEXEC and free >= _MEMORY // 4:
             return "/dev/shm", min(_MEMORY, free)
     return tempfile.gettempdir(), _MEMORY
+
+
+def _favour() -> list[str]:
+    """Words before the guest that keep it on one processor and before others, as far as they are to be had.
+
+    A guest that wanders between processors loses half its speed: the host faults its pages anew on each.
+    """
+    words = []
+    processors = sorted(os.sched_getaffinity(0))
+    if len(processors) > 1 and shutil.which("taskset") is not None:
+        words += ["taskset", "-c", str(processors[-1])]
+    if os.geteuid() == 0 and shutil.which("nice") is not None:
+        words += ["nice", "-n", "-20"]
+    return words
 
 
 def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
