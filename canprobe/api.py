@@ -201,6 +201,7 @@ def emulate(
         NodeError: somebody on the bus has one of the node ids already.
     """
     from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.memory import reserve_memory
     from canprobe.bus.open import open_port
     from canprobe.bus.priority import ask_for_processor
     from canprobe.bus.probe import answering_nodes
@@ -217,6 +218,7 @@ def emulate(
                 busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes"
             )
         rehearse(resolved)
+        reserve_memory()
         world = make_world(plan, node_ids)
         port.drain()  # what passed meanwhile
         ask_for_processor()

@@ -15,6 +15,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.port import Port
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import HEARTBEAT_BASE
@@ -23,6 +24,8 @@ from canprobe.scene_writer import dump_scene
 
 START_TIMEOUT_S = 30.0
 END_TIMEOUT_S = 10.0
+TRUTH_SHARE = 0.2
+"""Time that the nodes may take at their end to work out what was true, over the time that they ran."""
 _PR_SET_PDEATHSIG = 1
 
 
@@ -54,6 +57,8 @@ class EmulatorChild:
         self._truth = (out or self._folder) / "truth.npz"
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
+        self._clock = MonotonicClock()
+        self._started_ns = self._clock.now_ns()
 
     def start(self) -> None:
         """Start the process."""
@@ -105,10 +110,11 @@ class EmulatorChild:
     def end(self) -> dict[str, NDArray[np.float64]]:
         """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
         if self._process is not None:
+            patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
                 self._process.send_signal(number)
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
-                    self._process.wait(END_TIMEOUT_S)
+                    self._process.wait(patience_s)
                     break
         truth = {}
         if self._truth.exists():

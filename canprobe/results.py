@@ -73,7 +73,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": _shape(session, controller, estimates, log),
-        "cycle": _cycle(cell, scene.cycle.rate_hz),
+        "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "faults": list(cell.faults),
@@ -176,16 +176,21 @@ def _numbers(values: Sequence[float] | Array) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in values]
 
 
-def _cycle(cell: Cell, rate_hz: float) -> dict[str, Any]:
+def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
     cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
     statistics = cycle.statistics if cycle is not None else None
     assembler = tactile.assembler if tactile is not None else None
     return {
-        "rate_hz": rate_hz,
+        "rate_hz": cycle.number / (cycle.t_ns * 1e-9) if cycle is not None and cycle.t_ns > 0 else None,
         "cycles": cycle.number + 1 if cycle is not None else 0,
         "overruns": statistics.overruns if statistics is not None else 0,
         "missed_pdos": drives.missed if drives is not None else 0,
+        "late_pdos": drives.late if drives is not None else 0,
         "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans if assembler is not None else 0,
+        "stale_frames": tactile.stale if tactile is not None else 0,
+        "unplaced_contacts": getattr(controller, "unplaced", 0),
+        "slowed_cycles": getattr(controller, "slowed", 0),
+        "dropped_frames": cell.counters.overruns,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
         "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
     }
@@ -216,11 +221,12 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     """A summary as lines for people."""
     contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
     pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] == LOCKSTEP else "real time"
+    rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
     lines = [
         f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
         + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
         f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
-        f"  cycle      {cycle['cycles']} at {cycle['rate_hz']:g} Hz, {cycle['overruns']} overruns,"
+        f"  cycle      {rate}, {cycle['overruns']} overruns,"
         f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
     ]
     if contact["force_rms_error_n"] is not None:

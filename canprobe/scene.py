@@ -65,6 +65,7 @@ class ArmSettings:
     emulated: bool = True
     # selects the branch of the inverse kinematics; an emulated arm stands here in `free`, above the start in others
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
+    missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
     grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
 
 

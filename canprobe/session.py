@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from canprobe.bus.candump import CandumpWriter, RecordingPort
 from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.memory import garbage_collection_paused
+from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
@@ -229,6 +229,7 @@ class Session:
             child.start()
         self._say("rehearse in lockstep")
         rehearse(self.scene)
+        reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
         return port

@@ -21,6 +21,9 @@ from canprobe.errors import EdsError
 if TYPE_CHECKING:
     import canopen
 
+MISSED_SYNCS = 0x2000
+"""Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
+_MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 _FOLDER = Path(__file__).resolve().parent
 
 
@@ -45,6 +48,11 @@ def eds_path(name: str) -> Path:
     near = difflib.get_close_matches(stem, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
     raise EdsError(f"EDS {name!r}: no such packaged file: {hint}")
+
+
+def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2000h is that object here: another maker's drive may mean something else by the same index."""
+    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == _MISSED_SYNCS_NAME
 
 
 def _resolve(source: str | os.PathLike[str]) -> Path:

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, PortCounters, TimedFrame
 from canprobe.errors import UsageError
 
 _LINE = re.compile(
@@ -165,12 +165,22 @@ class RecordingPort:
         """The port's channel."""
         return self._port.channel
 
-    def send_batch(self, frames: Sequence[Frame]) -> None:
-        """Send `frames` and write them down."""
-        t_ns = self._port.clock.now_ns()
+    @property
+    def counters(self) -> PortCounters:
+        """The port's counters."""
+        return self._port.counters
+
+    @property
+    def stamps_arrival(self) -> bool:
+        """As the port does."""
+        return self._port.stamps_arrival
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send `frames` and write them down, with `t_ns` where it is given."""
+        sent_ns = self._port.clock.now_ns() if t_ns is None else t_ns
         self._port.send_batch(frames)
         for can_id, data in frames:
-            self._write(can_id, data, t_ns)
+            self._write(can_id, data, sent_ns)
 
     def drain(self) -> list[TimedFrame]:
         """Return what arrived, written down."""

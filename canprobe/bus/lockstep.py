@@ -270,7 +270,9 @@ class LockstepPort:
         """The bus's name."""
         return self._bus.channel
 
-    def send_batch(self, frames: Sequence[Frame]) -> None:
+    stamps_arrival = True
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` now and let everybody answer; the answers are there when this returns."""
         self._check_open()
         self.counters.sent += len(frames)

@@ -81,8 +81,22 @@ class Port(Protocol):
         """The bus's name, as in messages and logs."""
         ...
 
-    def send_batch(self, frames: Sequence[Frame]) -> None:
+    @property
+    def counters(self) -> PortCounters:
+        """What has passed since the port was opened."""
+        ...
+
+    @property
+    def stamps_arrival(self) -> bool:
+        """Whether a received frame carries the time of its arrival; if not, that of the `drain` that returned it."""
+        ...
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in this order.
+
+        Args:
+            frames: the frames.
+            t_ns: the present time, where the caller has just read it; only a port that writes down uses it.
 
         Raises:
             InterfaceError: the interface is down, closed, lost or stays full.

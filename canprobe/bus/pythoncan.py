@@ -47,7 +47,9 @@ class PythonCanPort:
         self._arrived: deque[can.Message] = deque()
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters)
 
-    def send_batch(self, frames: Sequence[Frame]) -> None:
+    stamps_arrival = False
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in order, one call of python-can each."""
         bus = self._open_bus()
         for can_id, data in frames:

@@ -15,16 +15,18 @@ import select
 import socket
 import struct
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
-from canprobe.bus.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, Row, frame_socket
-from canprobe.bus.port import ERR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.bus.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
+from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
 
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
+_CAN_RAW_JOIN_FILTERS = 6
+_CAN_INV_FILTER = 0x20000000
 _CAN_ERR_MASK = 0x1FFFFFFF
 _CAN_ERR_CRTL, _CAN_ERR_BUSOFF, _CAN_ERR_RESTARTED = 0x004, 0x040, 0x100
 _CRTL_ACTIVE, _CRTL_PASSIVE, _CRTL_WARNING = 0x40, 0x30, 0x0C
@@ -64,10 +66,17 @@ class SocketCanPort:
         self.state = ControllerState.ACTIVE
         self._socket = _open(channel, filters)
         self._frames = frame_socket(self._socket, batched)
+        self._batched = batched
+        self._filtered = filters is not None
+        self._patient: socket.socket | None = None
+        self._patient_frames: FrameSocket | None = None
+        self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
         self._offset_ns = self._calibrated_ns = self._patience_ns = 0
 
-    def send_batch(self, frames: Sequence[Frame]) -> None:
+    stamps_arrival = True
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` in order; a full queue is waited for up to 10 ms.
 
         Raises:
@@ -96,10 +105,13 @@ class SocketCanPort:
             rows = self._frames.receive(wait)
         except OSError as error:
             raise self._failed(error) from error
+        if self._patient_frames is not None and (patient := self._patient_frames.receive()):
+            self._count_drops(1, patient)
+            rows = sorted(patient + rows, key=_stamp) if rows else patient
         if not rows:
             return []
         self._follow_clock(rows[-1][2])
-        self.counters.overruns = max(self.counters.overruns, rows[-1][3])
+        self._count_drops(0, rows)
         offset_ns = self._offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
@@ -128,9 +140,38 @@ class SocketCanPort:
             self._patience_ns = timeout_ns
         return self._take(wait=True)
 
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Let frames with these 11-bit identifiers wake nobody: `drain` and `receive` return them with the next other,
+        `receive` also at its time-out.
+
+        Whoever has to do nothing about them before that frame (synchronous PDOs: before the SYNC) is spared a wake-up
+        for each. They keep their place by their time of arrival. At a change of the identifiers a frame may come twice.
+
+        Raises:
+            InterfaceError: this port was opened with filters of its own, or the interface is lost.
+        """
+        if self._filtered:
+            raise InterfaceError(f"{self.channel}: a port with filters cannot defer frames")
+        self._check_open()
+        mask = 0x7FF | EFF_FLAG | RTR_FLAG
+        if self._patient is not None:
+            self._patient.close()
+            self._patient = self._patient_frames = None
+        if can_ids:
+            self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], errors=False)
+            self._patient_frames = frame_socket(self._patient, self._batched)
+        try:
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
+            others = [(can_id | _CAN_INV_FILTER, mask) for can_id in can_ids] or [(0, 0)]
+            self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(others))
+        except OSError as error:
+            raise self._failed(error) from error
+
     def close(self) -> None:
         """Close the socket."""
         self._socket.close()
+        if self._patient is not None:
+            self._patient.close()
 
     def _check_open(self) -> None:
         if self._socket.fileno() < 0:
@@ -151,6 +192,10 @@ class SocketCanPort:
         if error.errno == errno.ENETDOWN:
             return _down(self.channel)
         return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
+
+    def _count_drops(self, which: int, rows: Sequence[Row]) -> None:
+        self._dropped[which] = max(self._dropped[which], rows[-1][3])
+        self.counters.overruns = sum(self._dropped)
 
     def _follow_clock(self, stamp_ns: int) -> None:
         if not 0 <= stamp_ns - self._calibrated_ns < _RECALIBRATE_NS:
@@ -219,14 +264,13 @@ def _sudo() -> str:
     return "" if os.geteuid() == 0 else "sudo "
 
 
-def _open(channel: str, filters: Sequence[CanFilter] | None) -> socket.socket:
+def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True) -> socket.socket:
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
         sock.setblocking(False)
         if filters is not None:
-            packed = b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
-            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, packed)
-        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK))
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(filters))
+        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if errors else 0))
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         _enlarge_buffer(sock)
@@ -235,6 +279,14 @@ def _open(channel: str, filters: Sequence[CanFilter] | None) -> socket.socket:
         sock.close()
         raise InterfaceError(f"{channel}: cannot be opened: {error.strerror}") from error
     return sock
+
+
+def _packed(filters: Sequence[CanFilter]) -> bytes:
+    return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
+
+
+def _stamp(row: Row) -> int:
+    return row[2]
 
 
 def _enlarge_buffer(sock: socket.socket) -> None:

@@ -47,6 +47,7 @@ def make_cell(
         drives=_drives(plan),
         tactile=_tactile(plan),
         heartbeat_timeout_ns=HEARTBEAT_CONSUMED_MS * 1_000_000,
+        missed_limit=arm.missed_syncs if (arm := plan.scene.arm) is not None else 0,
         say=say,
         times=times,
     )

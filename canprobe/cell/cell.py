@@ -6,7 +6,7 @@ from collections.abc import Callable
 from types import TracebackType
 
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
@@ -22,8 +22,6 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
-MISSED_LIMIT = 5
-"""Cycles without a TPDO after which a drive is lost, as many SYNCs as a drive waits for its master."""
 
 
 class Cell:
@@ -36,6 +34,7 @@ class Cell:
         drives: the arm, or None.
         tactile: the sensor, or None.
         heartbeat_timeout_ns: silence after which a node is lost.
+        missed_limit: cycles without a TPDO after which a drive is lost, as many SYNCs as a drive waits for its master.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
     """
@@ -49,6 +48,7 @@ class Cell:
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         heartbeat_timeout_ns: int,
+        missed_limit: int,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
     ) -> None:
@@ -60,6 +60,7 @@ class Cell:
         self.cycle: Cycle | None = None
         self._port = port
         self._settings = settings
+        self._missed_limit = missed_limit
         self._say = say
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
@@ -67,6 +68,11 @@ class Cell:
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
+
+    @property
+    def counters(self) -> PortCounters:
+        """What has passed through the cell's port."""
+        return self._port.counters
 
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))
@@ -163,7 +169,7 @@ class Cell:
     def _supervise(self, measurement: Measurement) -> None:
         self._check_alarms()
         assert self.cycle is not None
-        if (node_id := self.watch.silent(self.cycle.woken_ns)) is not None:
+        if (node_id := self.watch.silent(self.cycle.sync_ns)) is not None:
             raise NodeError(node_id, "lost: no heartbeat within its time-out")
         if (node_id := self.watch.not_in(NmtState.OPERATIONAL)) is not None:
             raise NodeError(node_id, f"left operation: NMT state {self.watch.states[node_id].name}")
@@ -172,7 +178,7 @@ class Cell:
         if self.drives is None:
             return
         for axis, age in zip(self.drives.axes, measurement.q_age, strict=True):
-            if age > MISSED_LIMIT:
+            if age > self._missed_limit:
                 raise NodeError(axis.node_id, f"lost: no TPDO for {age} cycles")
         if not measurement.enabled:
             self._raise_not_enabled()

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.eds import load_eds
+from canprobe.eds import MISSED_SYNCS, has_missed_syncs, load_eds
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -96,7 +96,9 @@ def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
     model, axis = MODELS[arm.model], arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
     window = round(float(model.counts[axis, axis]) * np.radians(FOLLOWING_WINDOW_DEG))
+    dictionary = load_eds(node.eds, node.node_id)
     return [
+        *([Write(MISSED_SYNCS, 0, arm.missed_syncs)] if has_missed_syncs(dictionary) else []),
         Write(0x6060, 0, OperationMode.CYCLIC_SYNC_POSITION),
         Write(0x60C2, 1, plan.sync.interpolation_100us),
         Write(0x60C2, 2, -4),

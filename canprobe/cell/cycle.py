@@ -16,13 +16,11 @@ from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState, pack_heartbeat
 from canprobe.protocol.sync import SyncCounter, pack_sync
 
-COLLECT_SHARE = 0.6
-"""Share of the period after SYNC in which TPDOs are waited for."""
-FIRST_LOOK_SHARE = 0.25
-LOOKS_A_PERIOD = 16
-"""When TPDOs are looked for: first a quarter of the period after SYNC, then every sixteenth. Waking up for each frame
-costs more than it gains: on one processor every wake-up takes it from the sender, and no RPDO is latched before the
-next SYNC anyway."""
+LOOKS = (0.25, 0.35, 0.6)
+"""Shares of the period after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
+
+Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender, so that
+many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway."""
 TIMED_CYCLES = 4
 """The computing time of every fourth cycle is taken: in a virtual machine reading a clock costs as much as sending."""
 
@@ -79,7 +77,7 @@ class Cycle:
         self.statistics = CycleStatistics()
         self.t_first_ns = port.clock.now_ns() + settings.period_ns
         self.t_ns = 0
-        self.woken_ns = 0
+        self.sync_ns = 0
         self._heartbeat_ns = 0
         self._port = port
         self._s = settings
@@ -89,6 +87,7 @@ class Cycle:
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)
         self._deadline = self.t_first_ns
+        self._looks = tuple(int(settings.period_ns * share) for share in LOOKS)
         self._feedback = drives.feedback_ids if drives is not None else frozenset()
         self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
         self._started_ns = 0
@@ -96,38 +95,37 @@ class Cycle:
 
     def begin(self) -> Measurement:
         """Sleep to the deadline, send SYNC, collect the answers."""
-        clock = self._port.clock
-        clock.sleep_until_ns(self._deadline)
-        self._route(self._port.drain())
-        self.woken_ns = clock.now_ns()
-        self._count_wake(self.woken_ns)
+        port = self._port
+        port.clock.sleep_until_ns(self._deadline)
+        if not port.stamps_arrival:  # the only way to tell what came before the SYNC from what came after it
+            self._route(port.drain())
+        counter = self._sync.next()
+        self.sync_ns = port.clock.now_ns()
+        port.send_batch([pack_sync(counter)], self.sync_ns)
+        self._count_lateness()
         self.number += 1
         self.t_ns = self._deadline - self.t_first_ns
         self._sync_times.append(self.t_ns)
-        counter = self._sync.next()
-        self._port.send_batch([pack_sync(counter)])
         if self._drives is not None:
-            self._drives.begin(self.number)
-        self._collect(self._deadline + int(self._s.period_ns * COLLECT_SHARE))
+            self._drives.begin(self.number, self.sync_ns)
+        self._collect()
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
         return self._measure(counter or 0)
 
-    def _count_wake(self, woken_ns: int) -> None:
-        error = woken_ns - self._deadline
+    def _count_lateness(self) -> None:
+        error = self.sync_ns - self._deadline
         self.statistics.period_error_ns.append(error)
         if error > self._s.period_ns // 2:
             self.statistics.overruns += 1
             self._deadline += error // self._s.period_ns * self._s.period_ns
 
-    def _collect(self, until_ns: int) -> None:
+    def _collect(self) -> None:
         port, clock, drives = self._port, self._port.clock, self._drives
-        look_ns = self._deadline + int(self._s.period_ns * FIRST_LOOK_SHARE)
-        while look_ns <= until_ns:
-            clock.sleep_until_ns(look_ns)
+        for look_ns in self._looks:
+            clock.sleep_until_ns(self._deadline + look_ns)
             self._route(port.drain())
             if drives is None or drives.complete:
                 break
-            look_ns += self._s.period_ns // LOOKS_A_PERIOD
         if drives is None:
             return
         drives.end_collect()
@@ -137,7 +135,7 @@ class Cycle:
         for frame in frames:
             can_id, data, t_ns = frame
             if can_id in self._feedback:
-                self._drives.push(can_id, data)  # type: ignore[union-attr]
+                self._drives.push(can_id, data, t_ns)  # type: ignore[union-attr]
             elif can_id in self._taxels:
                 self._tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
             elif not self._watch.push(can_id, data, t_ns):
@@ -171,7 +169,7 @@ class Cycle:
             if command is not None:
                 self._drives.set_target(command.q_target)
             frames = self._drives.frames()
-        if self.woken_ns >= self._heartbeat_ns:
+        if self.sync_ns >= self._heartbeat_ns:
             self._heartbeat_ns = self._deadline + self._s.heartbeat_ns
             frames.append(pack_heartbeat(self._s.master_id, NmtState.OPERATIONAL))
         if frames:

@@ -87,15 +87,17 @@ class DriveGroup:
         self._pending = 0
         self._open = False
         self._cycle = -1
+        self._sync_ns = 0
 
     @property
     def feedback_ids(self) -> frozenset[int]:
         """COB-IDs of the TPDOs that belong to the group."""
         return frozenset(self._axis_of)
 
-    def begin(self, cycle: int) -> None:
-        """A new SYNC is out: every TPDO is expected once more."""
+    def begin(self, cycle: int, t_ns: int = 0) -> None:
+        """A new SYNC is out, at ``t_ns``: every TPDO is expected once more."""
         self._cycle = cycle
+        self._sync_ns = t_ns
         self._pending = len(self.axes)
         self._open = True
 
@@ -104,10 +106,13 @@ class DriveGroup:
         """Every TPDO of this cycle is in."""
         return self._pending == 0
 
-    def push(self, can_id: int, data: bytes) -> None:
-        """Take one TPDO; one outside the collection window, or a second one for the same SYNC, is late and not used."""
+    def push(self, can_id: int, data: bytes, t_ns: int = 0) -> None:
+        """Take one TPDO that arrived at ``t_ns``.
+
+        One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used.
+        """
         i = self._axis_of[can_id]
-        if not self._open or self._heard[i] == self._cycle:
+        if not self._open or t_ns < self._sync_ns or self._heard[i] == self._cycle:
             self.late += 1
             return
         self.statuswords[i], self._counts[i], self.torque_permille[i] = self.axes[i].feedback.unpack(data)

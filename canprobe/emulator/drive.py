@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ObjectDictionary
 
+from canprobe.eds import has_missed_syncs
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.drive_feedback import DriveFeedback
@@ -35,13 +36,15 @@ _ENABLED = DriveState.OPERATION_ENABLED
 class DriveApplication(Application):
     """The drive function of one node."""
 
-    def __init__(self, axis: int, plant: AxisPlant) -> None:
+    def __init__(self, axis: int, plant: AxisPlant, has_misses: bool = False) -> None:
         """Make the drive of one axis.
 
         Args:
             axis: of the plant, 0-based.
             plant: shared with the other nodes.
+            has_misses: see `DriveParameters`.
         """
+        self._has_misses = has_misses
         self._axis, self._plant = axis, plant
         self._faults: list[int] = []
         self._limited = self._following_error = self._standstill = False
@@ -53,7 +56,7 @@ class DriveApplication(Application):
         """Hang the drive's objects on the node."""
         self._node, self._core = node, node.core
         self._values = node.dictionary.values
-        self._parameters = DriveParameters(node.dictionary)
+        self._parameters = DriveParameters(node.dictionary, self._has_misses)
         self._motion = Motion(self._axis, self._plant, node.core.timers)
         self._feedback = DriveFeedback(node, self._axis, self._plant, self._motion)
         self._states = DriveStates(self._entered_state, lambda: self._parameters.quick_stop in STAYS_STOPPED)
@@ -243,7 +246,7 @@ def make_drive_node(od: ObjectDictionary, node_id: int, axis: int, plant: AxisPl
         axis: of the plant, 0-based.
         plant: shared by all nodes.
     """
-    return SlaveNode(od, node_id, DriveApplication(axis, plant))
+    return SlaveNode(od, node_id, DriveApplication(axis, plant, has_missed_syncs(od)))
 
 
 def _check_mode(subindex: int, value: Value) -> None:

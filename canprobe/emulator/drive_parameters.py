@@ -5,6 +5,7 @@ Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h, 6066h, 607Dh, 6084h, 608
 
 from __future__ import annotations
 
+from canprobe.eds import MISSED_SYNCS
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.entries import Value
@@ -12,7 +13,23 @@ from canprobe.emulator.entries import Value
 QUICK_STOP_OPTIONS = frozenset({1, 2, 5, 6})
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
-_INDICES = (0x1006, 0x6007, 0x605A, 0x605B, 0x605C, 0x605E, 0x6065, 0x6066, 0x607D, 0x6084, 0x6085, 0x60C2)
+DEFAULT_MISSES = 5
+"""Of a drive whose EDS has no 2000h."""
+_INDICES = (
+    0x1006,
+    MISSED_SYNCS,
+    0x6007,
+    0x605A,
+    0x605B,
+    0x605C,
+    0x605E,
+    0x6065,
+    0x6066,
+    0x607D,
+    0x6084,
+    0x6085,
+    0x60C2,
+)
 
 
 class DriveParameters:
@@ -22,13 +39,16 @@ class DriveParameters:
         interpolation_ns: 60C2h, time to reach a latched target.
         cycle_ns: SYNC period, 1006h or else 60C2h.
         following_window, following_timeout_ns: 6065h (counts), 6066h.
+        misses: 2000h, SYNCs missed before the master is taken for dead.
         low, high: 607Dh, counts; low >= high means no limits.
         abort_connection, quick_stop, shutdown, disable, fault_reaction: option codes.
         deceleration, quick_deceleration: 6084h, 6085h, counts/s².
     """
 
-    def __init__(self, dictionary: Dictionary) -> None:
+    def __init__(self, dictionary: Dictionary, has_misses: bool = False) -> None:
+        """`has_misses` where 2000h is what it is in our own EDS."""
         self._dictionary = dictionary
+        self._has_misses = has_misses
         self.read()
         for index in _INDICES:
             dictionary.on_write(index, lambda _sub, _value: self.read())
@@ -42,6 +62,7 @@ class DriveParameters:
         self.cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
         self.following_window = number(0x6065, 0, NO_WINDOW)
         self.following_timeout_ns = number(0x6066) * 1_000_000
+        self.misses = number(MISSED_SYNCS, 0, DEFAULT_MISSES) if self._has_misses else DEFAULT_MISSES
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
         self.abort_connection = number(0x6007, 0, 3)
         self.quick_stop = number(0x605A, 0, 2)

@@ -11,8 +11,6 @@ from canprobe.emulator.drive_parameters import NO_WINDOW, DriveParameters
 from canprobe.emulator.node import SlaveNode
 from canprobe.protocol.emcy import RPDO_TIMEOUT, SYNC_LOST
 
-MISSES = 5
-
 
 class Supervision:
     """Counts missed SYNCs and targets, and times the following error, between `start` and `stop`."""
@@ -40,7 +38,7 @@ class Supervision:
         """A SYNC came, with a target since the last one (fresh) or without."""
         self._await_sync(t_ns)
         self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
-        if self._misses >= MISSES:
+        if self._misses >= self._parameters.misses:
             self._node.emcy.report(RPDO_TIMEOUT)
             self._on_loss(RPDO_TIMEOUT, t_ns)
 
@@ -56,7 +54,7 @@ class Supervision:
 
     def _await_sync(self, t_ns: int) -> None:
         cycle = self._parameters.cycle_ns
-        self._timer.arm(t_ns + MISSES * cycle + cycle // 2)
+        self._timer.arm(t_ns + self._parameters.misses * cycle + cycle // 2)
 
     def _sync_missing(self, due_ns: int) -> None:
         self._node.emcy.report(SYNC_LOST)

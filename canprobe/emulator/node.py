@@ -189,6 +189,11 @@ class SlaveNode:
         """Identifiers that this node takes now; the same object for ever, so that a bus may keep it."""
         return self._routes
 
+    @property
+    def patient(self) -> frozenset[int]:
+        """Those of them that need nothing done before the next SYNC."""
+        return self.pdos.patient
+
     def _reroute(self) -> None:
         routes = self._routes
         routes.clear()

@@ -97,6 +97,15 @@ class PdoEngine:
                 routes[rpdo.cob_id] = _both(routes.get(rpdo.cob_id), self._route(rpdo))
         return routes
 
+    @property
+    def patient(self) -> frozenset[int]:
+        """Identifiers of RPDOs whose frames can wait for the next SYNC, in operational."""
+        if self._core.state is not NmtState.OPERATIONAL:
+            return frozenset()
+        used = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None]
+        hasty = {rpdo.cob_id for rpdo in used if not rpdo.patient}
+        return frozenset(rpdo.cob_id for rpdo in used if rpdo.cob_id is not None and rpdo.cob_id not in hasty)
+
     def _route(self, rpdo: Rpdo) -> Route:
         if not (self._window_ns and rpdo.synchronous):
             return rpdo.receive

@@ -64,6 +64,11 @@ class Rpdo:
         self._event_ns = dictionary.number(index, EVENT) * 1_000_000
 
     @property
+    def patient(self) -> bool:
+        """Nothing has to be done about a frame before the next SYNC."""
+        return self.synchronous and not self._event_ns
+
+    @property
     def keys(self) -> tuple[int, ...]:
         """Mapped dictionary keys, dummies left out."""
         return tuple(key for key, _ in self._plan)

@@ -15,8 +15,6 @@ from canprobe.protocol.frames import SYNC_ID, Frame
 MAX_WAIT_NS = 100_000_000
 SINGLE_WAIT_NS = 2_000_000
 """Longest wait of a port that waits and receives in one call: how late a deadline may be served on an idle bus."""
-GATHER_NS = 100_000
-"""How long frames other than SYNC are gathered before they are answered."""
 _EVERYTHING = range(1 << 32)
 _MOST_FRAMES = 20_000  # in one exchange; above it the nodes are taken to answer each other for ever
 
@@ -66,9 +64,24 @@ class Exchange:
         self._seats = tuple(_Seat(node) for node in nodes)
         self._kinds = tuple(tuple(seats) for _, seats in groupby(self._seats, key=_kind))
         self._audiences: dict[int, tuple[_Seat, ...]] = {}
+        self.rerouted = True
+        """Set when a node has changed what it listens to; whoever acts on that clears it."""
         for node in nodes:
             if hasattr(node, "rerouted"):
-                node.rerouted = self._audiences.clear
+                node.rerouted = self._reroute
+
+    def _reroute(self) -> None:
+        self._audiences.clear()
+        self.rerouted = True
+
+    @property
+    def patient(self) -> frozenset[int]:
+        """Identifiers that can wait for the next SYNC, whoever listens to them."""
+        by_seat: list[tuple[_Seat, frozenset[int]]] = [
+            (seat, getattr(seat.node, "patient", frozenset())) for seat in self._seats
+        ]
+        wanted = {can_id for _, ids in by_seat for can_id in ids}
+        return frozenset(i for i in wanted if all(i in ids or i not in seat.ears for seat, ids in by_seat))
 
     def _audience(self, can_id: int) -> tuple[_Seat, ...]:
         """Who listens to an identifier: found once, until a node changes its mind."""
@@ -196,13 +209,15 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
         now_ns = clock.now_ns()
         if boot_ups := exchange.start(now_ns):
             port.send_batch(boot_ups)
-        receive = _receiver(port, max_wait_ns)
+        receive, defer = _receiver(port, max_wait_ns), getattr(port, "defer", None)
+        deferred: frozenset[int] = frozenset()
         while not stop():
+            if exchange.rerouted and defer is not None:
+                # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
+                exchange.rerouted = False
+                if exchange.patient != deferred:
+                    defer(deferred := exchange.patient)
             received = receive(exchange.next_deadline_ns, now_ns)
-            if received and received[-1][0] != SYNC_ID:
-                # Mostly the first of a burst: let its sender finish. Being woken for each frame costs both sides more.
-                clock.sleep_until_ns(received[-1][2] + GATHER_NS)
-                received += port.drain()
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
             now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()
             for frames in exchange.batches(received, now_ns):

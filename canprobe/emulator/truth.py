@@ -18,19 +18,25 @@ class TruePlant(Protocol):
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`; idempotent."""
 
-    def truth(self) -> Mapping[str, Any]:
-        """Present true values: numbers and arrays, always under the same names."""
+    def state(self) -> Any:
+        """The present state, all that the truth follows from."""
+
+    def truth(self, state: Any) -> Mapping[str, Any]:
+        """True values of a state: numbers and arrays, always under the same names."""
 
 
 class TruthRecorder:
-    """A silent participant of the bus that writes down the plant's truth at every SYNC."""
+    """A silent participant of the bus that writes down the plant's state at every SYNC.
+
+    What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
+    """
 
     name = "truth recorder"
     listens = frozenset((SYNC_ID,))
 
     def __init__(self, plant: TruePlant) -> None:
         self._plant = plant
-        self._rows: list[tuple[int, int, Mapping[str, Any]]] = []
+        self._rows: list[tuple[int, int, Any]] = []
 
     @property
     def next_deadline_ns(self) -> None:
@@ -46,10 +52,10 @@ class TruthRecorder:
         return []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """On a SYNC, take the truth."""
+        """On a SYNC, take the state."""
         if can_id == SYNC_ID:
             self._plant.advance(t_ns)
-            self._rows.append((t_ns, data[0] if data else 0, self._plant.truth()))
+            self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
         return []
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -59,8 +65,9 @@ class TruthRecorder:
             "sync_count": np.arange(len(self._rows), dtype=np.int64),
             "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
         }
-        for name in self._rows[0][2] if self._rows else ():
-            columns[name] = np.array([row[name] for _, _, row in self._rows])
+        truths = [self._plant.truth(state) for _, _, state in self._rows]
+        for name in truths[0] if truths else ():
+            columns[name] = np.array([truth[name] for truth in truths])
         return columns
 
     def save(self, path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.guest_setup import make_link, remove_link, set_link
 from canprobe.bus.mmsg import Row
-from canprobe.bus.port import ERR_FLAG, ControllerState, Frame, TimedFrame
+from canprobe.bus.port import EFF_FLAG, ERR_FLAG, ControllerState, Frame, TimedFrame
 from canprobe.bus.pythoncan import PythonCanPort
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
@@ -48,6 +48,26 @@ def receive(port: SocketCanPort | PythonCanPort, count: int) -> list[TimedFrame]
         port.wait(port.clock.now_ns() + HOUR_NS)
         frames += port.drain()
     return frames
+
+
+def test_deferred_frames_wake_nobody_and_come_in_their_place(vcan0: str, batched: bool) -> None:
+    clock = MonotonicClock()
+    sender, ours = SocketCanPort(vcan0, clock), SocketCanPort(vcan0, clock, batched=batched)
+    ours.defer({0x201, 0x202})
+    sender.send_batch([(0x201, b"a"), (0x202, b"b")])
+    assert [(i, d) for i, d, _ in ours.receive(20_000_000)] == [(0x201, b"a"), (0x202, b"b")]  # at its time-out
+    sender.send_batch([(0x201, b"c"), (0x080, b""), (0x202, b"d"), (0x201 | EFF_FLAG, b"e")])
+    frames: list[TimedFrame] = []
+    while len(frames) < 4:
+        frames += ours.receive(20_000_000)
+    assert [(i, d) for i, d, _ in frames][-4:] == [(0x201, b"c"), (0x080, b""), (0x202, b"d"), (0x201 | EFF_FLAG, b"e")]
+    ours.defer(())
+    sender.send_batch([(0x201, b"f")])
+    assert [(i, d) for i, d, _ in receive(ours, 1)] == [(0x201, b"f")]
+    ours.close()
+    sender.close()
+    with pytest.raises(InterfaceError, match="closed"):
+        ours.defer({0x201})
 
 
 def test_the_kernel_filters(vcan0: str) -> None:

@@ -67,6 +67,15 @@ def test_a_tpdo_twice_or_after_the_window_is_late_and_not_used():
     assert counts == pytest.approx([20, 20, 10, 20, 20, 20], abs=1e-6)
 
 
+def test_a_tpdo_from_before_the_sync_is_late_though_it_is_read_afterwards():
+    group = make_group()
+    group.begin(0, 1000)
+    group.push(0x181, group.axes[0].feedback.pack(ENABLED, 5, 0), 999)
+    assert (group.late, group.ages()[0]) == (1, 1)
+    group.push(0x181, group.axes[0].feedback.pack(ENABLED, 7, 0), 1000)
+    assert (group.late, group.ages()[0]) == (1, 0)
+
+
 def test_without_a_target_each_drive_is_told_to_stay():
     group = make_group()
     group.begin(0)

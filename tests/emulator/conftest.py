@@ -184,8 +184,11 @@ class FakePlant:
         self.sampled.append(t_ns)
         return self.image.copy()
 
-    def truth(self) -> dict[str, object]:
-        return {"q": np.full(6, self.t_ns * 1e-9), "force": 2.0}
+    def state(self) -> int:
+        return self.t_ns
+
+    def truth(self, state: int) -> dict[str, object]:
+        return {"q": np.full(6, state * 1e-9), "force": 2.0}
 
 
 @pytest.fixture

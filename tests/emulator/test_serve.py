@@ -11,7 +11,7 @@ from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.serve import GATHER_NS, Exchange, serve
+from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.errors import BusError
@@ -155,8 +155,26 @@ def test_serve_keeps_the_deadlines_of_its_nodes(plant):
 
     serve([node], port, stop, max_wait_ns=1000 * MS)
     beats = [t_ns for can_id, data, t_ns in master.drain() if (can_id, data) == (0x701, b"\x7f")]
-    assert beats[0] == GATHER_NS  # the write was gathered first
+    assert beats[0] == 0  # heartbeats start when they are asked for
     assert beats[1:] == [100 * MS, 200 * MS, 300 * MS]
+
+
+def test_only_what_every_listener_can_let_wait_is_patient():
+    a, b = Scripted([]), Scripted([])
+    a.patient, a.listens = frozenset({0x201, 0x202}), {0x201, 0x202, 0x80}
+    b.patient, b.listens = frozenset(), {0x202}
+    assert Exchange([a, b]).patient == {0x201}
+
+
+def test_synchronous_rpdos_without_a_deadline_are_patient_in_operational(plant):
+    node = make_drive_node(load_eds("puma260_joint", 1), 1, 0, plant)
+    exchange = Exchange([node])
+    exchange.start(0)
+    assert exchange.patient == frozenset()
+    exchange.step([(0, b"\x01\x00", 0)], 0)
+    assert exchange.patient == {0x201}
+    exchange.step([(0x601, bytes.fromhex("2b00140564000000"), 0)], 0)  # an event timer: its frame must be seen at once
+    assert exchange.patient == frozenset()
 
 
 def test_a_node_hears_the_heartbeat_of_its_neighbour(plant):

@@ -19,6 +19,8 @@ from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileS
 from canprobe.touch.strategy import PathFollower, Strategy
 
 Vector = NDArray[np.float64]
+LONGEST_STEP = 4
+"""Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
 
 class Phase(IntEnum):
@@ -101,7 +103,8 @@ class TouchTask:
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
-        self.scan_cycles: tuple[int, int] | None = None
+        self._scan_start: int | None = None
+        self._scan_end: int | None = None
         self._s = settings
         self._motion_from = motion_from
         self._strategy = strategy
@@ -109,6 +112,8 @@ class TouchTask:
         self._line: LineMotion | None = None
         self._servo: TactileServo | None = None
         self._t = 0.0
+        self._dt = settings.period_s
+        self._last_ns: int | None = None
         self._cycle = 0
         self._sample_t: float | None = None
         self._force = 0.0
@@ -119,6 +124,23 @@ class TouchTask:
         self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
 
+    @property
+    def scan_cycles(self) -> tuple[int, int] | None:
+        """First cycle of the scan and the one after its last, so far; None before."""
+        if self._scan_start is None:
+            return None
+        return self._scan_start, self._cycle if self._scan_end is None else self._scan_end
+
+    @property
+    def unplaced(self) -> int:
+        """Contacts that were not used because the joints of their instant are unknown."""
+        return self.sensing.dropped
+
+    @property
+    def slowed(self) -> int:
+        """Cycles in which a joint could not keep up with the probe's path."""
+        return self._motion.slowed if self._motion is not None else 0
+
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
         if self._motion is None:
@@ -126,10 +148,11 @@ class TouchTask:
             self._motion = self._motion_from(measurement.q)
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
+        self._pass_time(measurement.t_ns)
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
-        self._t += self._s.period_s
+        self._t += self._dt
         target = self._motion.step(pose)
         if self._motion.limit is not None and self.phase < Phase.RETREAT:
             self._leave(self._motion.limit)
@@ -142,6 +165,12 @@ class TouchTask:
         )
 
     # sensing and supervision
+
+    def _pass_time(self, t_ns: int) -> None:
+        """Where an overrun has swallowed cycles the motion goes on by the time that has passed, within a bound."""
+        passed = self._s.period_s if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
+        self._last_ns = t_ns
+        self._dt = min(passed, LONGEST_STEP * self._s.period_s)
 
     def _sense(self, measurement: Measurement) -> None:
         patch = self.sensing.step(measurement)
@@ -199,15 +228,15 @@ class TouchTask:
         elif measurement.tactile_age is not None and measurement.tactile_age > self._s.tactile_timeout:
             self._leave(f"no tactile frame for {measurement.tactile_age} cycles")
         elif self.phase in (Phase.SETTLE, Phase.SCAN):
-            self._lost = self._lost + self._s.period_s if self._force < self._s.touch_force / 2 else 0.0
+            self._lost = self._lost + self._dt if self._force < self._s.touch_force / 2 else 0.0
             if self._lost > self._s.lost_s:
                 self._leave("contact lost")
 
     def _leave(self, reason: str | None) -> None:
         """Go to the retreat, for ``reason`` or because the work is done."""
         assert self._motion is not None
-        if self.phase is Phase.SCAN and self.scan_cycles is not None:
-            self.scan_cycles = (self.scan_cycles[0], self._cycle)
+        if self.phase is Phase.SCAN:
+            self._scan_end = self._cycle
         self.reason = reason
         pose = self._motion.pose
         away = ProbePose(pose.centre - pose.pole * self._s.retreat, pose.pole)
@@ -261,18 +290,18 @@ class TouchTask:
         assert self._servo is not None
         share = smooth_step(self._t / (0.6 * self._s.settle_s))
         depth = self._depth0 + share * (self._target_depth() - self._depth0)
-        pose = self._servo.step(0.0, depth, self._s.period_s)
+        pose = self._servo.step(0.0, depth, self._dt)
         if self._t >= self._s.settle_s:
             self._enter(Phase.SCAN)
-            self.scan_cycles = (self._cycle, self._cycle)
+            self._scan_start = self._cycle
         pole = self._pole0 + share * (pose.pole - self._pole0)
         return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 
     def _scan(self) -> ProbePose:
-        assert self._servo is not None and self.scan_cycles is not None
+        assert self._servo is not None
         left = self._s.duration_s - self._t
         share = min(1.0, self._t / self._s.ramp_s, max(left, 0.0) / self._s.ramp_s)
-        pose = self._servo.step(self._s.speed * share, self._target_depth(), self._s.period_s)
+        pose = self._servo.step(self._s.speed * share, self._target_depth(), self._dt)
         if left <= 0:
             self._leave(None)
         return pose

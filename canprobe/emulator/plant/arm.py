@@ -163,15 +163,20 @@ class IdealArm:
             self.t_ns = t_ns
             self._evaluated = None
 
+    def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions (counts) and rates (counts/s) of the six motors now."""
+        positions, rates, _ = zip(*self._states(), strict=True)
+        return positions, rates
+
     @property
     def counts(self) -> Array:
         """(6,) motor positions now, counts."""
-        return np.array([s[0] for s in self._states()])
+        return np.array(self.motors()[0])
 
     @property
     def count_rates(self) -> Array:
         """(6,) motor rates now, counts/s."""
-        return np.array([s[1] for s in self._states()])
+        return np.array(self.motors()[1])
 
     @property
     def q(self) -> Array:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from math import cos, pi, sin
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
 from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import chain, point_velocity, tool_z_offset
-from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel
+from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel, counts_to_joints
 from canprobe.touch.objects import ClosestPoint, ObjectShape
 
 Axes = tuple[Vec, Vec, Vec]
@@ -70,6 +71,19 @@ class PlantConfig:
     damping_ratio: float = 1.0
     press: PressMotion = PressMotion()
     seed: int = 0
+
+
+class PlantState(NamedTuple):
+    """All that the truth of an instant follows from.
+
+    Attributes:
+        t_ns: the instant.
+        counts, rates: positions (counts) and rates (counts/s) of the motors; empty without an arm.
+    """
+
+    t_ns: int
+    counts: tuple[float, ...]
+    rates: tuple[float, ...]
 
 
 @dataclass(slots=True, eq=False)
@@ -209,8 +223,17 @@ class Plant:
             self._image = (self.t_ns, image)
         return self._image[1].copy()
 
-    def truth(self) -> Truth:
-        """True values now, SI, base frame.
+    def state(self) -> PlantState:
+        """The present state: cheap to take, `truth` can be asked for it at any time."""
+        if self.arm is None:
+            return PlantState(self.t_ns, (), ())
+        return PlantState(self.t_ns, *self.arm.motors())
+
+    def truth(self, state: PlantState | None = None) -> Truth:
+        """True values of a state, SI, base frame.
+
+        Args:
+            state: of this plant; the present one by default.
 
         Without contact ``force`` is 0 and the contact fields are those of the closest surface point; without an object
         they are zeros.
@@ -220,9 +243,9 @@ class Plant:
             object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
             in_contact.
         """
-        s = self._solution()
+        s = self._solution() if state is None else self._solve(state)
         return {
-            "q": self.arm.q if self.arm is not None else np.zeros(6),
+            "q": s.q,
             "probe_centre": np.array(s.probe.centre),
             "pole": np.array(s.probe.axes[2]),
             "force": s.contact.force,
@@ -239,15 +262,15 @@ class Plant:
 
     def _solution(self) -> _Solution:
         if self._solved is None:
-            self._solved = self._solve()
+            self._solved = self._solve(self.state())
         return self._solved
 
-    def _probe(self) -> _Probe:
+    def _probe(self, t_ns: int, q: Array, qd: Array) -> _Probe:
         if self._pressed is not None:
-            return self._pressed.at(1e-9 * self.t_ns)
+            return self._pressed.at(1e-9 * t_ns)
         if self.arm is None:
             return _Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
-        c = chain(self.arm.model, self.arm.q)
+        c = chain(self.arm.model, q)
         a, b, d = self._tool_origin
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = c.x, c.y, c.z, c.flange
         centre = (
@@ -256,12 +279,15 @@ class Plant:
             p2 + x2 * a + y2 * b + z2 * d,
         )
         axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
-        return _Probe(centre, axes, point_velocity(c, centre, self.arm.qd))
+        return _Probe(centre, axes, point_velocity(c, centre, qd))
 
-    def _solve(self) -> _Solution:
-        probe, config = self._probe(), self.config
+    def _solve(self, state: PlantState) -> _Solution:
+        config, q, qd = self.config, np.zeros(6), np.zeros(6)
+        if config.model is not None:
+            q, qd = counts_to_joints(config.model, state.counts), counts_to_joints(config.model, state.rates)
+        probe = self._probe(state.t_ns, q, qd)
         if config.object is None:
-            return _Solution(probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
+            return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
         foot = config.object.closest(probe.centre)
         nx, ny, nz = foot.normal.tolist()
         vx, vy, vz = probe.velocity
@@ -273,7 +299,7 @@ class Plant:
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
-        return _Solution(probe, foot, depth, rate, contact, (k1, k2), pad_coordinates(d, config.radius_m), d)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), pad_coordinates(d, config.radius_m), d)
 
 
 def _turned(axes: Axes, R: Array) -> Axes:
@@ -292,6 +318,7 @@ def _in_pad(foot: ClosestPoint, probe: _Probe, d: Vec) -> Array:
 class _Solution:
     """Contact at one instant."""
 
+    q: Array
     probe: _Probe
     foot: ClosestPoint
     depth: float

@@ -167,6 +167,17 @@ def test_repeated_calls_at_one_instant_change_nothing():
     assert all(np.array_equal(a, b) for a, b in zip(p.truth().values(), twin.truth().values(), strict=True))
 
 
+@EACH
+def test_truth_of_a_state_taken_earlier_is_the_truth_of_then(kind):
+    p = plant(kind)
+    push(p, p.truth()["q"] + np.array((0.02, 0.004, -0.006, 0.03, -0.05, 0.1)), 0, 40 * MS)
+    p.advance(20 * MS)
+    state, then = p.state(), p.truth()
+    p.advance(60 * MS)
+    assert not np.array_equal(p.truth()["q"], then["q"])
+    assert all(np.array_equal(a, b) for a, b in zip(p.truth(state).values(), then.values(), strict=True))
+
+
 def test_same_seed_same_images_other_seed_other_images():
     one, same, other = (plant(seed=s) for s in (3, 3, 4))
     assert np.array_equal(one.sample_image(MS), same.sample_image(MS))
