@@ -72,6 +72,8 @@ def run(
             raise
     result = _finish(session, controller, failure)
     if failure is not None:
+        if isinstance(failure, CanprobeError):
+            failure.summary = result.summary
         raise failure
     return result
 

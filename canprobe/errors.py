@@ -15,12 +15,18 @@ CanprobeError
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 
 class CanprobeError(Exception):
-    """Base of every error that canprobe raises on purpose."""
+    """Base of every error that canprobe raises on purpose.
+
+    Attributes:
+        summary: of the run that it ended, as in ``summary.json``; None where nothing had been brought up.
+    """
 
     exit_status = 3
+    summary: dict[str, Any] | None = None
 
 
 class UsageError(CanprobeError):

@@ -58,7 +58,7 @@ def summarise(
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
     cycle = cell.cycle
-    sim_time = cycle.number * session.plan.sync.period_ns * 1e-9 if cycle is not None and cycle.number > 0 else 0.0
+    sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
     log = cell.log.arrays()
     return {

@@ -9,6 +9,7 @@ from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
 from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, whole
 from canprobe.cli.target import target_of
+from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
 Emulated nodes run in this process on the lockstep bus, and in a process of their own on any other.
@@ -57,6 +58,10 @@ def run(args: argparse.Namespace) -> int:
                 progress=progress_bar(),
                 say=say_on_terminal,
             )
+    except CanprobeError as error:
+        if args.json and error.summary is not None:
+            print_json(error.summary)
+        raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")

@@ -202,14 +202,18 @@ class Bench:
         self.bus = Bus()
         self.start = Starter(folder)
 
-    def scene(self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "") -> Path:
-        """Write a packaged scene with another rate, with its nodes left to somebody else, or with an EDS of its own.
+    def scene(
+        self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", missed_syncs: int = 5
+    ) -> Path:
+        """Write a packaged scene with another rate or patience, with its nodes left to somebody else, or another EDS.
 
         What does not need 400 Hz runs at 100 Hz: a slow machine must not decide what these tests find.
         """
         extra = "" if emulated else "emulated = false\n"
         text = (SCENES / f"{name}.toml").read_text()
-        text = text.replace("[arm]\n", f"[arm]\n{extra}" + (f'eds = "{eds}"\n' if eds else ""))
+        text = text.replace(
+            "[arm]\n", f"[arm]\nmissed_syncs = {missed_syncs}\n{extra}" + (f'eds = "{eds}"\n' if eds else "")
+        )
         text = text.replace("[sensor]\n", f"[sensor]\n{extra}rate_hz = {rate_hz // 2}\n")
         path = self.folder / f"{name}-{rate_hz}-{emulated}-{bool(eds)}.toml"
         path.write_text(f"{text}\n[cycle]\nrate_hz = {rate_hz}\n")

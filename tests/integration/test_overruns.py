@@ -1,0 +1,62 @@
+"""A cell that cannot keep its deadlines: counted, told, and the contact moves on with the time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.build import make_task
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.results import summarise
+from canprobe.session import Session, resolve_scene
+
+STALL_NS = 8_000_000
+EVERY = 40
+
+
+class Stalls:
+    """A controller that now and then takes longer than three cycles, in virtual time."""
+
+    def __init__(self, session: Session, every: int) -> None:
+        self.task, self._session, self._every = make_task(session.plan), session, every
+
+    def step(self, measurement: Measurement) -> Command:
+        command = self.task.step(measurement)
+        if measurement.cycle % self._every == self._every - 1:
+            bus = self._session.lockstep
+            assert bus is not None
+            bus.clock.sleep_until_ns(bus.clock.now_ns() + STALL_NS)
+        return command
+
+
+@pytest.fixture(scope="module")
+def stalled() -> tuple[Session, Stalls]:
+    scene = resolve_scene(canprobe.load_scene("cylinder"), duration_s=2.0)
+    session = Session(scene)
+    controller = Stalls(session, EVERY)
+    with session:
+        session.run(controller)
+    return session, controller
+
+
+def test_overruns_are_counted_and_the_rate_is_the_true_one(stalled: tuple[Session, Stalls]) -> None:
+    session, controller = stalled
+    cycle = summarise(session, controller.task, {}, None)["cycle"]
+    assert cycle["overruns"] == pytest.approx(cycle["cycles"] / EVERY, rel=0.15)  # none while bringing up and stopping
+    lost = 2 * cycle["overruns"]  # the stall swallows the rest of its own period and two more
+    assert cycle["rate_hz"] == pytest.approx(400.0 * cycle["cycles"] / (cycle["cycles"] + lost), rel=0.01)
+    assert cycle["missed_pdos"] == 0
+
+
+def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Stalls]) -> None:
+    session, controller = stalled
+    assert controller.task.scan_cycles is not None
+    first, last = controller.task.scan_cycles
+    contact = summarise(session, controller.task, {}, None)["contact"]
+    assert contact["contact_fraction"] == 1.0
+    assert contact["force_max_n"] < 3.0
+    t, points = session.truth["t_s"], session.truth["contact_point"]
+    steady = slice(first + 60, last - 60)
+    path = np.linalg.norm(np.diff(points[steady], axis=0), axis=1).sum()
+    assert path / (t[steady][-1] - t[steady][0]) == pytest.approx(0.025, rel=0.02)
