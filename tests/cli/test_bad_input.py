@@ -156,18 +156,6 @@ def test_a_folder_that_cannot_be_made(tmp_path):
     assert line == "canprobe: file/results: Not a directory"
 
 
-def test_a_stopped_run_still_prints_its_summary(tmp_path):
-    scene = (SCENES / "press.toml").read_text()
-    (tmp_path / "gentle.toml").write_text(f"{scene}\n[limits]\nforce_max_n = 1.5\n")
-    process = start(tmp_path, "run", "gentle.toml", "--json", "--out", "results")
-    out, err = process.communicate()
-    assert process.returncode == 1
-    assert "above the limit of 1.50 N" in err
-    summary = json.loads(out)
-    assert summary["stop_reason"] == err.strip().removeprefix("canprobe: ")
-    assert summary == json.loads((tmp_path / "results" / "summary.json").read_text())
-
-
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, tmp_path):
     process = start(tmp_path, "run", "cylinder", "--out", "results")

@@ -188,6 +188,19 @@ def test_run_json_is_one_document(calls, capsys):
     assert captured.err == ""
 
 
+def test_a_stopped_run_still_prints_its_summary(monkeypatch, capsys):
+    def stop(*_, **__):
+        error = SafetyStop("contact lost")
+        error.summary = {"completed": False}
+        raise error
+
+    monkeypatch.setattr(api, "run", stop)
+    assert main(["run", "free", "--json"]) == 1
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"completed": False}
+    assert captured.err == "canprobe: contact lost\n"
+
+
 def test_json_refuses_what_is_no_number():
     with pytest.raises(ValueError, match="Out of range"):
         print_json({"value": float("nan")})

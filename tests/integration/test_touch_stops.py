@@ -90,3 +90,12 @@ def test_joint_at_its_stop():
 
     with pytest.raises(SafetyStop, match=r"joint \d at .* deg, its stop"), session:
         session.run(step)
+
+
+def test_a_run_that_is_stopped_leaves_its_summary_with_the_error():
+    scene = canprobe.load_scene("press")
+    scene = replace(scene, limits=replace(scene.limits, force_max_n=1.5))
+    with pytest.raises(SafetyStop) as stopped:
+        canprobe.run(scene, files=False)
+    summary = stopped.value.summary
+    assert (summary["completed"], summary["stop_reason"]) == (False, stopped.value.reason)
