@@ -63,7 +63,10 @@ class Exchange:
     def __init__(self, nodes: Sequence[Participant]) -> None:
         self._seats = tuple(_Seat(node) for node in nodes)
         self._kinds = tuple(tuple(seats) for _, seats in groupby(self._seats, key=_kind))
+        self._witnesses = tuple(seat for seat in self._seats if getattr(seat.node, "witness", False))
         self._audiences: dict[int, tuple[_Seat, ...]] = {}
+        self.skipped = 0
+        """SYNCs that were left unanswered because the next one had come already."""
         self.rerouted = True
         """Set when a node has changed what it listens to; whoever acts on that clears it."""
         for node in nodes:
@@ -111,10 +114,21 @@ class Exchange:
         return [frame for batch in self.batches(frames, t_ns) for frame in batch]
 
     def batches(self, frames: Sequence[TimedFrame], t_ns: int) -> Iterator[list[Frame]]:
-        """As `step`, but each batch is computed only when the one before it has been sent."""
+        """As `step`, but each batch is computed only when the one before it has been sent.
+
+        Of several SYNCs only the last is answered: nodes that are behind miss SYNCs, as busy devices do, instead of
+        answering old ones ever later. Witnesses hear them all.
+        """
+        syncs = sum(can_id == SYNC_ID for can_id, _, _ in frames)
         for can_id, data, received_ns in frames:
             heard_ns = min(received_ns, t_ns)
             if can_id == SYNC_ID:
+                syncs -= 1
+                if syncs:
+                    self.skipped += 1
+                    for seat in self._witnesses:
+                        seat.hear(SYNC_ID, data, heard_ns)
+                    continue
                 yield from self._synchronise(data, heard_ns)
                 continue
             for seat in self._audience(can_id):

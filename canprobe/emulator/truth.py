@@ -32,6 +32,7 @@ class TruthRecorder:
     """
 
     name = "truth recorder"
+    witness = True
     listens = frozenset((SYNC_ID,))
 
     def __init__(self, plant: TruePlant) -> None:

@@ -57,6 +57,17 @@ def test_due_nodes_are_advanced_after_the_frames():
     assert exchange.next_deadline_ns is None
 
 
+def test_of_several_syncs_the_last_is_answered_and_witnesses_hear_all():
+    late, witness = Scripted([], {0x80: [(0x181, b"")]}), Scripted([])
+    witness.witness = True
+    exchange = Exchange([late, witness])
+    frames = [(0x80, b"\1", 1), (0x201, b"", 2), (0x80, b"\2", 3), (0x80, b"\3", 4), (0x202, b"", 5)]
+    assert exchange.step(frames, 9) == [(0x181, b"")]
+    assert late.heard == [0x201, 0x80, 0x202]
+    assert witness.heard == [0x80, 0x201, 0x80, 0x80, 0x181, 0x202]
+    assert exchange.skipped == 2
+
+
 def test_nodes_that_answer_each_other_for_ever_are_caught():
     a, b = Scripted([(1, b"")], {2: [(1, b"")]}), Scripted([], {1: [(2, b"")]})
     with pytest.raises(BusError, match="without an end"):
