@@ -47,7 +47,8 @@ def full_scan(bench: Any) -> Any:
     """The results of a scan that the machine did not interrupt; a second attempt is allowed.
 
     What rate was held is recorded and never asserted: the guest's one processor carries master, six drives and sensor,
-    with no say on its host. Cycles it could not keep are counted, and the path's time goes on. A drive that hears no SYNC for its time stops by itself, as it must, and the run has to end safely all the same.
+    with no say on its host. Cycles it could not keep are counted, and the path's time goes on. A drive that hears no
+    SYNC for its time stops by itself, as it must, and the run has to end safely all the same.
     """
     for attempt in range(ATTEMPTS):
         name = f"results-{attempt}"
