@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.crossings import ChiSquared, Crossing, compare
 from canprobe.touch.surface_map import SurfaceMap
@@ -18,7 +20,25 @@ MEMORIES = 3.0
 
 With forgetting by exp(−s/memory) two answers s apart share exp(−s/memory) of their data: 5 % at three."""
 LEVEL = 0.05
+PARTS = ("curvature", "normal", "height", "joint")
 _FACING = 0.5
+
+
+class Verdict(NamedTuple):
+    """One part of the tests over all crossings.
+
+    Attributes:
+        tested: crossings where it could be tested.
+        share_below: share of the p-values below 0.05; 0.05 is expected of one surface and right covariances. Crossings
+            share patches' data, so they are no independent trials. NaN where nothing was tested.
+        chi2_per_dof: Σ χ² / Σ dof; 1 where the covariances are right, less where they are generous. NaN likewise.
+        pooled: Fisher's χ² over the p-values of independent crossings, −2 Σ ln p with 2 n degrees of freedom.
+    """
+
+    tested: int
+    share_below: float
+    chi2_per_dof: float
+    pooled: ChiSquared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,29 +47,43 @@ class Consistency:
 
     Attributes:
         crossings: every crossing, by its place along the path.
-        share_below: share of the joint p-values below 0.05; 0.05 is expected of one surface and right covariances.
-            Crossings share patches' data, so they are no independent trials. NaN without crossings.
         independent: indices of crossings no two of which share data.
-        pooled: Fisher's χ² over the joint p-values of the independent ones, −2 Σ ln p with 2 n degrees of freedom.
-        chi2_per_dof: over all crossings, Σ χ² / Σ dof of the joint tests; 1 where the covariances are right, less where
-            they are generous. NaN without crossings.
     """
 
     crossings: tuple[Crossing, ...]
-    share_below: float
     independent: tuple[int, ...]
-    pooled: ChiSquared
-    chi2_per_dof: float
 
-    @property
-    def p_values(self) -> Array:
-        """(n,) of the joint tests."""
-        return np.array([crossing.joint.p for crossing in self.crossings])
+    def verdict(self, part: str = "joint", angles: tuple[float, float] = (0.0, math.inf)) -> Verdict:
+        """The tests of one part, over the crossings whose passes differ in direction by an angle in a range.
+
+        Args:
+            part: "curvature", "normal", "height" or "joint".
+            angles: from, up to (rad); crossings whose angle is not known count only in the whole range.
+
+        Raises:
+            UsageError: on an unknown part.
+        """
+        if part not in PARTS:
+            raise UsageError(f"part: expected one of {', '.join(PARTS)}, got {part!r}")
+        whole = angles == (0.0, math.inf)
+        chosen = [i for i, c in enumerate(self.crossings) if whole or angles[0] <= c.angle < angles[1]]
+        tests = {i: getattr(self.crossings[i], part) for i in chosen}
+        tests = {i: test for i, test in tests.items() if test.dof}
+        dof = sum(test.dof for test in tests.values())
+        if not dof:
+            return Verdict(0, math.nan, math.nan, fisher([]))
+        return Verdict(
+            len(tests),
+            sum(test.p < LEVEL for test in tests.values()) / len(tests),
+            sum(test.chi2 for test in tests.values()) / dof,
+            fisher([tests[i].p for i in self.independent if i in tests]),
+        )
 
     @property
     def consistent(self) -> bool | None:
-        """The pooled test does not reject one surface at 5 %; None where there was nothing to test."""
-        return None if self.pooled.dof == 0 else self.pooled.p >= LEVEL
+        """The pooled joint test does not reject one surface at 5 %; None where there was nothing to test."""
+        pooled = self.verdict().pooled
+        return None if pooled.dof == 0 else pooled.p >= LEVEL
 
 
 def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> list[Crossing]:
@@ -74,47 +108,50 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
     apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
     facing = surface_map.normals @ surface_map.normals.T > _FACING
     fits = (apart <= limit) & (along[None] - along[:, None] >= least) & facing
-    pairs = np.argwhere(fits)
-    order = np.argsort(apart[fits], kind="stable")
-    taken: list[Array] = []
-    for pair in pairs[order]:
-        here = along[pair]
-        if all(np.abs(here - other).max() > 2.0 * limit for other in taken):
-            taken.append(here)
-    chosen = sorted((int(np.searchsorted(along, s)), int(np.searchsorted(along, t))) for s, t in taken)
-    return [compare(surface_map.patches[i], surface_map.patches[j], i, j) for i, j in chosen]
+    pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
+    chosen: list[tuple[int, int]] = []
+    while len(pairs):
+        chosen.append((int(pairs[0, 0]), int(pairs[0, 1])))
+        pairs = pairs[np.abs(along[pairs] - along[pairs[0]]).max(axis=1) > 2.0 * limit]
+    heading = _headings(surface_map)
+    return [
+        compare(surface_map.patches[i], surface_map.patches[j], i, j, _angle(heading[i], heading[j]))
+        for i, j in sorted(chosen)
+    ]
 
 
-def check_consistency(
-    surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None
-) -> Consistency:
+def _headings(surface_map: SurfaceMap) -> Array:
+    """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
+    steps = np.diff(surface_map.points, axis=0)
+    sizes = np.linalg.norm(steps, axis=1, keepdims=True)
+    headings = np.full((len(surface_map), 3), math.nan)
+    headings[1:] = steps / np.where(sizes > 0.0, sizes, math.nan)
+    headings[:1] = headings[1:2]
+    return headings
+
+
+def _angle(a: Array, b: Array) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+def check_consistency(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> Consistency:
     """Test every crossing of a map and pool the independent ones; see `crossings` for what the test rests on.
 
     Args:
         surface_map, radius, gap: as in `find_crossings`; two crossings are independent where all four patches are at
             least the gap apart along the path.
     """
-    found = find_crossings(surface_map, radius=radius, gap=gap)
     least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
-    tested = [i for i, crossing in enumerate(found) if crossing.joint.dof]
-    p = np.array([found[i].joint.p for i in tested])
-    dof = sum(found[i].joint.dof for i in tested)
-    chosen = _independent(surface_map, found, tested, least)
-    return Consistency(
-        tuple(found),
-        float(np.mean(p < LEVEL)) if len(p) else math.nan,
-        chosen,
-        fisher([found[i].joint.p for i in chosen]),
-        sum(found[i].joint.chi2 for i in tested) / dof if dof else math.nan,
-    )
+    found = find_crossings(surface_map, radius=radius, gap=gap)
+    return Consistency(tuple(found), _independent(surface_map, found, least))
 
 
-def _independent(surface_map: SurfaceMap, found: list[Crossing], tested: list[int], gap: float) -> tuple[int, ...]:
+def _independent(surface_map: SurfaceMap, found: list[Crossing], gap: float) -> tuple[int, ...]:
     """Crossings, taken in the order of their later pass, whose patches are all at least a gap from those before."""
     along = surface_map.travelled
     used: list[float] = []
-    chosen = []
-    for i in sorted(tested, key=lambda i: (found[i].second, -found[i].first)):
+    chosen: list[int] = []
+    for i in sorted(range(len(found)), key=lambda i: (found[i].second, -found[i].first)):
         places = along[[found[i].first, found[i].second]]
         if all(abs(place - other) >= gap for place in places for other in used):
             used += places.tolist()

@@ -62,6 +62,7 @@ class Crossing:
         first, second: indices of the patches in the map, the earlier one first.
         gap_m: path between them, m.
         distance_m: between their contacts, m.
+        angle: between the directions of travel, rad, 0…π; NaN where the path does not tell.
         T_base_common: (4, 4) the frame of the comparison; its z is the inward normal.
         difference: (6,) second − first: height along z (m), slopes of z in x and y, K11, K12, K22 (1/m).
         covariance: (6, 6) of it by the stated noise; what was not observed stands with `local_patch.WIDE`.
@@ -72,6 +73,7 @@ class Crossing:
     second: int
     gap_m: float
     distance_m: float
+    angle: float
     T_base_common: Array
     difference: Array
     covariance: Array
@@ -89,7 +91,7 @@ class _Jet(NamedTuple):
     hidden: Array
 
 
-def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1) -> Crossing:
+def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1, angle: float = math.nan) -> Crossing:
     """Test whether two patches describe one surface.
 
     The local models must hold between the two contacts: keep them within a few mm.
@@ -97,6 +99,7 @@ def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1) -> Cr
     Args:
         a, b: patches from different samples, their normals within 90°.
         first, second: their indices, for the record.
+        angle: between the directions of travel, rad, for the record.
     """
     T = _common_frame(a, b)
     ja, jb = _jet(a, T), _jet(b, T)
@@ -110,6 +113,7 @@ def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1) -> Cr
         second,
         abs(b.travelled_m - a.travelled_m),
         float(np.linalg.norm(b.point - a.point)),
+        angle,
         T,
         d,
         C,

@@ -2,7 +2,7 @@
 
 Each patch within `reach` gives the height of its quadric along one common normal through the query point, and its
 normal there. Patch i weighs `w_i = (1 − r_i²/reach²)² / v_i`, r_i the distance from its contact to the surface point
-and v_i the variance of its height there (from `S_covariance`, so it grows with the fourth power of the distance from the
+and v_i the variance of its height there (from `S_covariance`: it grows with the fourth power of the distance from the
 contact). The first factor vanishes smoothly at `reach`: a patch enters and leaves without a step. The common normal is
 the blend of the patches' normals, iterated, so that the answer is the closest point.
 
@@ -14,11 +14,12 @@ of errors that all patches share (calibration, indentation): neighbours on one p
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from canprobe.touch._arrays import Array, checked, positive
 from canprobe.touch.local_patch import LocalPatch
@@ -52,13 +53,29 @@ class MapPoint:
     patches: int
 
 
+class _Stack(NamedTuple):
+    """Patches as arrays: frames, gradient `B x + h` of f, covariance of S (zeros where the pose is not known)."""
+
+    R: Array
+    origin: Array
+    B: Array
+    h: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, patches: Sequence[LocalPatch]) -> _Stack:
+        T, S = np.array([p.T_base_contact for p in patches]), np.array([p.S for p in patches])
+        covariance = np.array([p.S_covariance * p.pose_known for p in patches])
+        return cls(T[:, :3, :3], T[:, :3, 3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3], covariance)
+
+
 class _Heights(NamedTuple):
-    """What each patch says along one line: height (m), outward normal (base), its variance (m²), distance (m)."""
+    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met."""
 
     height: Array
     normal: Array
     variance: Array
-    distance: Array
+    met: NDArray[np.bool_]
 
 
 def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -> MapPoint:
@@ -72,73 +89,74 @@ def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -
     Raises:
         UsageError: naming the field, what was expected and what was got.
     """
-    p = checked("point", point, (3,))
-    limit = positive("reach", reach)
-    # a foot in reach can belong to a point farther off, but not farther than its own distance from the surface
-    first = surface_map.near(p, math.inf)[:1]
-    if not first:
+    p, limit = checked("point", point, (3,)), positive("reach", reach)
+    chosen = _candidates(surface_map, p, limit)
+    if not len(chosen):
         return _nowhere()
-    lifted = abs(float(first[0].normal @ (p - first[0].point)))
-    patches = [
-        patch
-        for patch in surface_map.near(p, math.hypot(limit, lifted) + 0.5 * limit)
-        if float(patch.normal @ first[0].normal) > _FACING
-    ]
-    if not patches:
-        return _nowhere()
-    normal, foot = first[0].normal, p - first[0].normal * float(first[0].normal @ (p - first[0].point))
+    stack = _Stack.of([surface_map.patches[i] for i in chosen])
+    normal = surface_map.normals[chosen[0]]
+    foot = p - normal * float(normal @ (p - surface_map.points[chosen[0]]))
     for _ in range(_ITERATIONS):
-        said = _heights(patches, p, normal, foot)
-        weight = _weights(said, limit)
+        said = _heights(stack, p, normal)
+        weight = _weights(said, np.linalg.norm(stack.origin - foot, axis=1), limit)
         total = float(weight.sum())
         if not total > 0.0:
             return _nowhere()
         weight = weight / total
-        height = float(weight @ np.where(weight > 0.0, said.height, 0.0))
+        height = float(weight @ said.height)
         foot = p + height * normal
         n = weight @ said.normal
         normal = n / math.sqrt(float(n @ n))
     used = weight > 0.0
-    sigma = float(np.sqrt(said.variance[used]) @ weight[used]) if (said.variance[used] > 0.0).all() else math.nan
+    known = bool((said.variance[used] > 0.0).all())
+    sigma = float(np.sqrt(said.variance[used]) @ weight[used]) if known else math.nan
     return MapPoint(foot, normal, -height, sigma, int(used.sum()))
+
+
+def _candidates(surface_map: SurfaceMap, p: Array, reach: float) -> NDArray[np.intp]:
+    """Indices of the patches whose contact may be in reach of the foot of p, the nearest first."""
+    if not len(surface_map):
+        return np.zeros(0, np.intp)
+    offset = surface_map.points - p
+    distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
+    first = int(np.argmin(distance))
+    lifted = abs(float(surface_map.normals[first] @ offset[first]))
+    facing = surface_map.normals @ surface_map.normals[first] > _FACING
+    # by the triangle inequality, with room for a foot that is not below the point as seen from the nearest patch
+    chosen = np.flatnonzero(facing & (distance <= 1.5 * reach + lifted))
+    return chosen[np.argsort(distance[chosen], kind="stable")]
 
 
 def _nowhere() -> MapPoint:
     return MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
 
 
-def _weights(said: _Heights, reach: float) -> Array:
+def _weights(said: _Heights, distance: Array, reach: float) -> Array:
     """(n,) weights, not yet of sum 1; variances count only where every patch in reach has one."""
-    fade = np.maximum(0.0, 1.0 - (said.distance / reach) ** 2) ** 2
-    fade = np.where(np.isfinite(said.height), fade, 0.0)
+    fade: Array = np.maximum(0.0, 1.0 - (distance / reach) ** 2) ** 2
+    fade[~said.met] = 0.0
     near = fade > 0.0
-    known = bool((said.variance[near] > 0.0).all())
-    return np.where(near, fade / np.where(near, said.variance, 1.0), 0.0) if known else fade
+    if not (said.variance[near] > 0.0).all():
+        return fade
+    fade[near] /= said.variance[near]
+    return fade
 
 
-def _heights(patches: list[LocalPatch], p: Array, normal: Array, foot: Array) -> _Heights:
-    rows = [_height(patch, p, normal) for patch in patches]
-    distance = np.array([np.linalg.norm(patch.point - foot) for patch in patches])
-    return _Heights(
-        np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), np.array([r[2] for r in rows]), distance
-    )
-
-
-def _height(patch: LocalPatch, p: Array, normal: Array) -> tuple[float, Array, float]:
-    """Where the line p + t·normal meets a patch: t, the outward normal there, the variance of t."""
-    R = patch.T_base_contact[:3, :3]
-    x, d = R.T @ (p - patch.point), R.T @ normal
-    B, h = 2.0 * patch.S[:3, :3], 2.0 * patch.S[:3, 3]
+def _heights(stack: _Stack, p: Array, normal: Array) -> _Heights:
+    """Where the line p + t·normal meets each patch."""
+    x, d = (p - stack.origin)[:, None] @ stack.R, normal @ stack.R
+    x = x[:, 0]
+    gx, gd = (x[:, None] @ stack.B)[:, 0] + stack.h, (d[:, None] @ stack.B)[:, 0]
     # f(x + t d) = ½ a t² + b t + c
-    a, b = float(d @ B @ d), float(d @ (B @ x + h))
-    c = 0.5 * float(x @ B @ x) + float(h @ x)
+    a, b = np.einsum("ij,ij->i", d, gd), np.einsum("ij,ij->i", d, gx)
+    c = 0.5 * np.einsum("ij,ij->i", x, gx + stack.h)
     square = b * b - 2.0 * a * c
-    if square < 0.0 or not b + math.sqrt(square) > 0.0:
-        return math.nan, normal, math.nan
-    t = -2.0 * c / (b + math.sqrt(square))
-    at = x + t * d
-    g = B @ at + h
-    slope = float(g @ d)
-    F = value_rows(at[None])[0] / slope
-    variance = float(F @ patch.S_covariance @ F) if patch.pose_known else 0.0
-    return t, R @ (g / math.sqrt(float(g @ g))), variance
+    root = b + np.sqrt(np.maximum(square, 0.0))
+    met = (square >= 0.0) & (root > 0.0)
+    t = np.where(met, -2.0 * c / np.where(met, root, 1.0), 0.0)
+    g = gx + t[:, None] * gd
+    F = value_rows(x + t[:, None] * d)
+    slope = np.where(met, np.einsum("ij,ij->i", g, d), 1.0)
+    variance = np.einsum("ij,ijk,ik->i", F, stack.covariance, F) / slope**2
+    outward = (stack.R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
+    return _Heights(t, outward, variance, met)

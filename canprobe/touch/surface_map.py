@@ -7,7 +7,8 @@ contact frames with their surface matrices.
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,16 +30,28 @@ class SurfaceMap:
         patches: each with its frame, matrix and covariance, by increasing `travelled_m`.
         path: (n, 3) contact points, base frame, m.
         method: estimator that the patches are from.
+        points: (m, 3) contact points of the patches, base frame, m.
+        normals: (m, 3) outward unit normals there.
+        travelled: (m,) path of the contact until each patch, m.
     """
 
     patches: tuple[LocalPatch, ...]
     path: Array
     method: str = ""
+    points: Array = field(init=False, repr=False)
+    normals: Array = field(init=False, repr=False)
+    travelled: Array = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "path", read_only(checked("path", self.path, (None, 3))))
+        def keep(name: str, values: ArrayLike) -> None:
+            object.__setattr__(self, name, read_only(values))
+
+        keep("path", checked("path", self.path, (None, 3)))
+        keep("points", np.array([patch.point for patch in self.patches]).reshape(-1, 3))
+        keep("normals", np.array([patch.normal for patch in self.patches]).reshape(-1, 3))
+        keep("travelled", [patch.travelled_m for patch in self.patches])
         along = [patch.travelled_m for patch in self.patches]
-        for i, (before, after) in enumerate(zip(along, along[1:], strict=False), start=1):
+        for i, (before, after) in enumerate(pairwise(along), start=1):
             if after < before:
                 raise UsageError(
                     f"patches[{i}].travelled_m: expected at least {before} of the one before, got {after}; patches"
@@ -52,21 +65,6 @@ class SurfaceMap:
         return iter(self.patches)
 
     @property
-    def points(self) -> Array:
-        """(n, 3) contact points of the patches, base frame, m."""
-        return np.array([patch.point for patch in self.patches]).reshape(-1, 3)
-
-    @property
-    def normals(self) -> Array:
-        """(n, 3) outward unit normals there."""
-        return np.array([patch.normal for patch in self.patches]).reshape(-1, 3)
-
-    @property
-    def travelled(self) -> Array:
-        """(n,) path of the contact until each patch, m."""
-        return np.array([patch.travelled_m for patch in self.patches])
-
-    @property
     def memory(self) -> float:
         """Longest path that a patch rests on, m; 0 without patches."""
         return max((patch.distance_m for patch in self.patches), default=0.0)
@@ -78,14 +76,6 @@ class SurfaceMap:
             UsageError: when the spacing is not above 0.
         """
         return replace(self, patches=tuple(spaced(self.patches, spacing)))
-
-    def near(self, point: ArrayLike, reach: float) -> tuple[LocalPatch, ...]:
-        """The patches whose contact is within `reach` (m) of a point (3,), nearest first."""
-        if not self.patches:
-            return ()
-        distance = np.linalg.norm(self.points - checked("point", point, (3,)), axis=1)
-        order = np.argsort(distance, kind="stable")
-        return tuple(self.patches[i] for i in order if distance[i] <= reach)
 
     def equals(self, other: SurfaceMap) -> bool:
         """The same patches, path and method, bit by bit."""
