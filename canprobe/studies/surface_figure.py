@@ -71,14 +71,14 @@ def draw_map(surface_map: SurfaceMap, path: Path, *, shape: PlacedShape | None =
         title: first line.
     """
     view = _view(surface_map, shape)
-    figure = Figure(figsize=(13.0, 7.2), dpi=110, layout="constrained")
+    figure = Figure(figsize=(13.0, 7.6), dpi=110, layout="constrained")
     crossings = len(view.consistency.crossings)
     figure.suptitle(
         f"{title}\n{len(surface_map)} patches over {1e3 * surface_map.travelled[-1]:.0f} mm of path by"
         f" {surface_map.method or 'an estimator'}, {crossings} crossings",
         x=0.01, ha="left", fontsize=11, color=INK,
     )  # fmt: skip
-    grid = figure.add_gridspec(2, 5)
+    grid = figure.add_gridspec(2, 5, height_ratios=(1.0, 1.15))
     _draw_tiles(figure.add_subplot(grid[:, 0:3], projection="3d", computed_zorder=False), view)
     _draw_crossings(figure.add_subplot(grid[0, 3:5] if crossings else grid[:, 3:5]), view)
     if crossings:
@@ -118,10 +118,10 @@ def _draw_tiles(axes: Any, view: _View) -> None:
         axes.plot_surface(x, y, z, color=face, linewidth=0, shade=False, antialiased=False, zorder=2)
     axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
     _style_3d(axes)
-    bar = axes.figure.colorbar(ScalarMappable(norm, colours), ax=axes, shrink=0.55, pad=0.01, orientation="horizontal")
-    bar.set_label(
-        "‖K − K true‖ (1/m)" if view.shape is not None else "mean curvature (1/m)", fontsize=9, color=INK
-    )  # fmt: skip
+    place = axes.inset_axes((0.2, 0.1, 0.6, 0.022))
+    bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=place, orientation="horizontal")
+    bar.ax.tick_params(labelsize=8)
+    bar.set_label("‖K − K true‖ (1/m)" if view.shape is not None else "mean curvature (1/m)", fontsize=9, color=INK)
     hidden = int(np.count_nonzero(~np.isfinite(values)))
     note = f" · {hidden} grey: not all curvature observed" if hidden else ""
     true = ", true surface in grey" if view.shape is not None else ""
@@ -179,12 +179,17 @@ def _ghost(view: _View, shape: PlacedShape) -> tuple[Array, Array, Array]:
 def _style_3d(axes: Any) -> None:
     axes.set_xlabel("along the scan (mm)")
     axes.set_ylabel("across (mm)")
-    axes.set_zlabel("outward (mm)")
+    axes.set_zlabel("outward (mm)", labelpad=-2)
     axes.set_aspect("equal")
-    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.2)
-    axes.view_init(elev=32, azim=-62)
+    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.14)
+    axes.view_init(elev=42, azim=-68)
     axes.locator_params(nbins=5)
-    axes.tick_params(labelsize=8)
+    axes.locator_params(axis="z", nbins=3)
+    axes.tick_params(labelsize=8, pad=1)
+    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
+        axis.pane.set_facecolor("white")
+        axis.pane.set_edgecolor(FAINT)
+        axis._axinfo["grid"].update(color=FAINT, linewidth=0.6)
 
 
 # the crossings
@@ -206,9 +211,10 @@ def _draw_crossings(axes: Axes, view: _View) -> None:
                         places[chosen, 0], places[chosen, 1], s=26, marker=marker, color=colour, linewidths=0.4,
                         edgecolors="white", zorder=3 if is_bad else 2, label=f"{where}: {chosen.sum()} {what}",
                     )  # fmt: skip
-        axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.22))
+        axes.legend(frameon=False, fontsize=7.5, ncols=2, loc="lower center", columnspacing=1.0, handletextpad=0.2)
     axes.set_aspect("equal", adjustable="datalim")
-    _style(axes, "path and its crossings, seen from outside", "along the scan (mm)", "across (mm)")
+    axes.margins(y=0.1)
+    _style(axes, "path and its crossings (joint test)", "along the scan (mm)", "across (mm)")
 
 
 def _draw_p_values(axes: Axes, consistency: Consistency) -> None:
@@ -228,7 +234,7 @@ def _draw_p_values(axes: Axes, consistency: Consistency) -> None:
                 )  # fmt: skip
     axes.set_xlim(0, 1)
     axes.set_ylim(0, 1.02)
-    axes.legend(frameon=False, fontsize=7.5, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17), columnspacing=1.2)
     _style(axes, "p-values of the tests at the crossings", "p", "share of crossings below")
 
 
