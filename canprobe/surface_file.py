@@ -108,8 +108,9 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
 
 def _read(file: Path) -> dict[str, NDArray[np.generic]]:
     try:
-        with np.load(file, allow_pickle=False) as saved:
-            if not isinstance(saved, np.lib.npyio.NpzFile):
+        with file.open("rb") as opened:  # numpy leaves a file open that it cannot read
+            saved = np.load(opened, allow_pickle=False)
+            if isinstance(saved, np.ndarray):
                 raise UsageError(f"{file}: expected an npz file with a surface map, got a single array")
             return {name: saved[name] for name in saved.files}
     except FileNotFoundError as error:

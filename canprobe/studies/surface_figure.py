@@ -30,6 +30,8 @@ TILE_M, RINGS, SECTORS = 1.8e-3, 3, 20
 APART_M = 2.9e-3
 """Least distance of two tiles: where passes overlap the best known patch stands for all."""
 MARGIN_M, GRID = 5e-3, 34
+LEAST_DEPTH_MM = 6.0
+"""Least height of the box, for a plane."""
 PARTS = (("curvature", ACCENT), ("normal", SECOND), ("height", THIRD))
 
 
@@ -180,8 +182,11 @@ def _style_3d(axes: Any) -> None:
     axes.set_xlabel("along the scan (mm)")
     axes.set_ylabel("across (mm)")
     axes.set_zlabel("outward (mm)", labelpad=-2)
+    low, high = axes.get_zlim()
+    spare = max(0.0, LEAST_DEPTH_MM - (high - low)) / 2
+    axes.set_zlim(low - spare, high + spare)
     axes.set_aspect("equal")
-    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.14)
+    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.08)
     axes.view_init(elev=42, azim=-68)
     axes.locator_params(nbins=5)
     axes.locator_params(axis="z", nbins=3)

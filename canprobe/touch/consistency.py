@@ -122,11 +122,13 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
 
 def _headings(surface_map: SurfaceMap) -> Array:
     """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
+    if len(surface_map) < 2:
+        return np.full((len(surface_map), 3), math.nan)
     steps = np.diff(surface_map.points, axis=0)
     sizes = np.linalg.norm(steps, axis=1, keepdims=True)
     headings = np.full((len(surface_map), 3), math.nan)
     headings[1:] = steps / np.where(sizes > 0.0, sizes, math.nan)
-    headings[:1] = headings[1:2]
+    headings[0] = headings[1]
     return headings
 
 

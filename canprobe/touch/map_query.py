@@ -28,7 +28,9 @@ from canprobe.touch.surface_map import SurfaceMap
 
 REACH_M = 4e-3
 """Default distance from a contact at which its patch no longer counts, m."""
-_ITERATIONS = 4
+_ITERATIONS = 40
+"""Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
+_SETTLED = 1e-10
 _FACING = 0.5
 """Least cosine between a patch's normal and that of the nearest one: others are another side of a thin body."""
 
@@ -105,8 +107,10 @@ def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -
         weight = weight / total
         height = float(weight @ said.height)
         foot = p + height * normal
-        n = weight @ said.normal
+        before, n = normal, weight @ said.normal
         normal = n / math.sqrt(float(n @ n))
+        if np.abs(normal - before).max() < _SETTLED:
+            break
     used = weight > 0.0
     known = bool((said.variance[used] > 0.0).all())
     sigma = float(np.sqrt(said.variance[used]) @ weight[used]) if known else math.nan
