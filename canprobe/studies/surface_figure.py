@@ -119,6 +119,10 @@ def _draw_tiles(axes: Any, view: _View) -> None:
         x, y, z = view.plane(grid.reshape(-1, 3)).T.reshape(3, *grid.shape[:2])
         axes.plot_surface(x, y, z, color=face, linewidth=0, shade=False, antialiased=False, zorder=2)
     axes.plot(*path.T, color=INK, linewidth=0.5, alpha=0.55, zorder=3)
+    differ = _rejected(view.consistency)
+    if differ.any():
+        places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
+        axes.plot(*view.plane(places).T, "o", color=ACCENT, markersize=3.5, zorder=4)
     _style_3d(axes)
     place = axes.inset_axes((0.2, 0.1, 0.6, 0.022))
     bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=place, orientation="horizontal")
@@ -127,7 +131,10 @@ def _draw_tiles(axes: Any, view: _View) -> None:
     hidden = int(np.count_nonzero(~np.isfinite(values)))
     note = f" · {hidden} grey: not all curvature observed" if hidden else ""
     true = ", true surface in grey" if view.shape is not None else ""
-    axes.set_title(f"patches{true}; where passes overlap, the best known one{note}", loc="left", fontsize=10, color=INK)
+    dots = " · orange: passes differ, p < 0.05" if differ.any() else ""
+    axes.set_title(
+        f"patches{true};\nwhere passes overlap the best known one{dots}{note}", loc="left", fontsize=10, color=INK
+    )
 
 
 def tiles_of(surface_map: SurfaceMap) -> list[LocalPatch]:
@@ -206,7 +213,7 @@ def _draw_crossings(axes: Axes, view: _View) -> None:
     crossings = view.consistency.crossings
     if crossings:
         places = view.plane(np.array([crossing.T_base_common[:3, 3] for crossing in crossings]))
-        rejected = np.array([c.joint.p < LEVEL for c in crossings])
+        rejected = _rejected(view.consistency)
         same = np.array([not c.angle >= SAME_DIRECTION_RAD for c in crossings])
         for is_same, marker, where in ((True, "o", "same direction"), (False, "X", "other direction")):
             for is_bad, colour, what in ((False, SECOND, "agree"), (True, ACCENT, "differ, p < 0.05")):
@@ -220,6 +227,10 @@ def _draw_crossings(axes: Axes, view: _View) -> None:
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(y=0.1)
     _style(axes, "path and its crossings (joint test)", "along the scan (mm)", "across (mm)")
+
+
+def _rejected(consistency: Consistency) -> NDArray[np.bool_]:
+    return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
 
 
 def _draw_p_values(axes: Axes, consistency: Consistency) -> None:
