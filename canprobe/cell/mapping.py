@@ -25,7 +25,7 @@ def map_of_scan(tracker: ShapeTracker, method: str) -> SurfaceMap:
     """
     patches = [LocalPatch.of(r.estimate, t_s=r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
     path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
-    return merge_patches(patches, path, method=method)
+    return merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
 
 
 def summarise_map(surface_map: SurfaceMap) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from canprobe.touch.surface import SurfaceMatrix
 WIDE = 10.0
 """Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
 ±500 1/m for 20 mm, a radius of 2 mm. It only ever widens what is said of heights and normals beside the contact."""
+LEAST_LENGTH_M = 1e-3
+"""A shorter path counts as this long."""
 
 _SHAPES: dict[str, tuple[int | None, ...]] = {
     "T_base_contact": (4, 4),
@@ -35,7 +37,8 @@ class LocalPatch:
         S: (4, 4) in the contact frame, c14 = c24 = c44 = 0, c34 = −½; unobserved combinations nearest to flat.
         K_covariance: (3, 3) of (K11, K12, K22), 1/m²; NaN or infinite where not observed, as in `SurfaceEstimate`.
         S_covariance: (9, 9) of (c14, c24, c44, c13, c23, c33, c11, c12, c22), SI units, always finite: a combination
-            that was not observed stands in it with `WIDE`. c44 is the height, 2 c14 and 2 c24 are the tilt.
+            that the data did not observe stands in it with `WIDE`, whatever a prior said of it. c44 is the height,
+            2 c14 and 2 c24 are the tilt.
         pose_known: the part of `S_covariance` about height and tilt is the estimator's; False from methods that do
             not know it, which leave zeros there.
         observed: (2,) 1 or 0, for each principal curvature.
@@ -123,7 +126,7 @@ class LocalPatch:
 
 def _covariance(estimate: SurfaceEstimate) -> Array:
     """(9, 9) finite covariance of the entries of S, SI units."""
-    length = max(estimate.distance, 1e-9)
+    length = max(estimate.distance, LEAST_LENGTH_M)
     weak = WIDE / length
     V = estimate.combinations.T
     if estimate.model_root is None:

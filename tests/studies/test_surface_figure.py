@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from canprobe.studies.surface_figure import APART_M, TILE_M, draw_map, tile, tiles_of
+from canprobe.studies.surface_figure import draw_map
+from canprobe.studies.surface_tiles import APART_M, TILE_M, tile, tiles_of
 from canprobe.touch.local_patch import LocalPatch
 from canprobe.touch.objects import Sphere
 from canprobe.touch.surface import SurfaceMatrix

@@ -170,6 +170,23 @@ def test_what_a_straight_path_leaves_open_is_wide(truth, method):
     assert beside[1].sigma > 5e-4
 
 
+@pytest.mark.parametrize("method", ["ml", "chord"])
+@pytest.mark.parametrize("still", [0.0, 2e-5])
+def test_a_contact_that_stands_still_makes_a_patch_that_knows_nothing_of_curvature(method, still):
+    """Also with points that are equal: a run never ends in an error for lack of data."""
+    points = still * np.random.default_rng(0).normal(size=(50, 3))
+    estimate = fit_surface(points, np.tile([0.0, 0.0, -1.0], (50, 1)), **SIGMA, method=method)
+    patch = LocalPatch.of(estimate, t_s=0.0, travelled_m=0.0)
+    assert patch.rank == 0
+    assert len(merge_patches([patch], [patch.point])) == 0
+    sigma = np.sqrt(np.diag(patch.S_covariance))
+    assert sigma[6:].min() > 100.0
+    known = sigma > 0.0
+    assert (
+        np.linalg.eigvalsh(patch.S_covariance[np.ix_(known, known)] / np.outer(sigma[known], sigma[known])).min() > 0.0
+    )
+
+
 def _sigma_of_curvature(patch, t):
     row = np.zeros(9)
     row[6:] = 2 * t[0] ** 2, 4 * t[0] * t[1], 2 * t[1] ** 2
