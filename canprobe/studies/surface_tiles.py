@@ -32,9 +32,7 @@ def draw_tiles(axes: Any, view: MapView) -> None:
     patches = tiles_of(view.map)
     values = np.array([_value(patch, view.shape) for patch in patches])
     known = values[np.isfinite(values)]
-    low = 0.0 if view.shape is not None else float(known.min(initial=0.0))
-    norm = Normalize(low, max(float(np.percentile(known, 98)) if len(known) else 1.0, low + 1e-3))
-    colours = colormaps["viridis"]
+    norm, colours = _scale(known, from_zero=view.shape is not None), colormaps["viridis"]
     for patch, value in zip(patches, values, strict=True):
         face = colours(norm(value)) if math.isfinite(value) else GHOST
         grid = tile(patch)
@@ -46,17 +44,32 @@ def draw_tiles(axes: Any, view: MapView) -> None:
         places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
         axes.plot(*view.plane(places).T, "o", color=ACCENT, markersize=3.5, zorder=4)
     _style_3d(axes)
-    place = axes.inset_axes((0.2, 0.05, 0.6, 0.022))
-    bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=place, orientation="horizontal")
-    bar.ax.tick_params(labelsize=8)
-    bar.set_label("‖K − K true‖ (1/m)" if view.shape is not None else "mean curvature (1/m)", fontsize=9, color=INK)
-    hidden = int(np.count_nonzero(~np.isfinite(values)))
-    note = f" · {hidden} grey: not all curvature observed" if hidden else ""
-    true = ", true surface in grey" if view.shape is not None else ""
-    dots = " · orange: passes differ, p < 0.05" if differ.any() else ""
-    axes.set_title(
-        f"patches{true};\nwhere passes overlap, the best known one{dots}{note}", loc="left", fontsize=10, color=INK
-    )
+    if len(known):
+        place = axes.inset_axes((0.2, 0.05, 0.6, 0.022))
+        bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=place, orientation="horizontal")
+        bar.ax.tick_params(labelsize=8)
+        what = "mean curvature" if view.shape is None else "‖K − K true‖"
+        bar.set_label(f"{what} (1/m)", fontsize=9, color=INK)
+    axes.set_title(_title(view, len(patches) - len(known), bool(differ.any())), loc="left", fontsize=10, color=INK)
+
+
+def _scale(values: Array, *, from_zero: bool) -> Normalize:
+    if not len(values):
+        return Normalize(0.0, 1.0)
+    low = 0.0 if from_zero else float(values.min())
+    return Normalize(low, max(float(np.percentile(values, 98)), low + 1e-3))
+
+
+def _title(view: MapView, hidden: int, differ: bool) -> str:
+    first = ["where passes overlap, the best known patch"]
+    if view.shape is not None:
+        first.append("true surface in light grey")
+    second = []
+    if hidden:
+        second.append(f"{hidden} patches in dark grey: not all curvature observed")
+    if differ:
+        second.append("orange: passes differ, p < 0.05")
+    return " · ".join(first) + "\n" + " · ".join(second)
 
 
 def tiles_of(surface_map: SurfaceMap) -> list[LocalPatch]:
