@@ -12,20 +12,24 @@ if TYPE_CHECKING:
     from canprobe.api import RunResult, open_cell, run
     from canprobe.planning import make_plan as plan
     from canprobe.scene_loader import load_scene
+    from canprobe.surface_file import load_surface_map
     from canprobe.touch.bound import cramer_rao
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.fit import fit_surface
     from canprobe.touch.surface import SurfaceMatrix
+    from canprobe.touch.surface_map import SurfaceMap
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "load_scene": ("canprobe.scene_loader", "load_scene"),
+    "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
     "open_cell": ("canprobe.api", "open_cell"),
     "RunResult": ("canprobe.api", "RunResult"),
     "SurfaceMatrix": ("canprobe.touch.surface", "SurfaceMatrix"),
+    "SurfaceMap": ("canprobe.touch.surface_map", "SurfaceMap"),
     "SurfaceEstimate": ("canprobe.touch.estimate", "SurfaceEstimate"),
     "fit_surface": ("canprobe.touch.fit", "fit_surface"),
     "cramer_rao": ("canprobe.touch.bound", "cramer_rao"),
@@ -34,11 +38,13 @@ _EXPORTS = {
 __all__ = [
     "RunResult",
     "SurfaceEstimate",
+    "SurfaceMap",
     "SurfaceMatrix",
     "__version__",
     "cramer_rao",
     "fit_surface",
     "load_scene",
+    "load_surface_map",
     "open_cell",
     "plan",
     "run",

@@ -6,7 +6,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
@@ -16,6 +16,9 @@ from canprobe.rehearsal import rehearse
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
+
+if TYPE_CHECKING:
+    from canprobe.touch.surface_map import SurfaceMap
 
 __all__ = ["Command", "Measurement", "RunResult", "emulate", "open_cell", "run", "scan", "up"]
 
@@ -92,7 +95,8 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
 def _finish(session: Session, controller: object, failure: BaseException | None) -> RunResult:
     estimates = _estimates(session.scene, controller)
     reason = None if failure is None else (str(failure) or "interrupted")
-    summary = summarise(session, controller, estimates, reason)
+    surface_map = _surface_map(session.scene, controller)
+    summary = summarise(session, controller, estimates, reason, surface_map)
     result = RunResult(
         session.plan,
         summary,
@@ -100,6 +104,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None)
         session.truth,
         estimates,
         getattr(controller, "taxels", None),
+        surface_map,
         session.out,
     )
     if session.out is not None:
@@ -123,12 +128,24 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     return estimates
 
 
+def _surface_map(scene: Scene, controller: object) -> SurfaceMap | None:
+    tracker = getattr(controller, "shape", None)
+    if tracker is None or scene.shape is None:
+        return None
+    from canprobe.cell.mapping import map_of_scan
+
+    return map_of_scan(tracker, scene.shape.method)
+
+
 def _draw(result: RunResult, out: Path) -> None:
     try:
         from canprobe.studies.run_figure import draw_run
+        from canprobe.studies.surface_figure import draw_surface
     except ImportError:  # the study extra is not installed
         return
     draw_run(result, out / "report.png")
+    (out / "surface.png").unlink(missing_ok=True)  # of an earlier run
+    draw_surface(result, out / "surface.png")
 
 
 @contextlib.contextmanager

@@ -12,11 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.cell import Cell
+from canprobe.cell.mapping import summarise_map
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.planning import Plan
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
+from canprobe.surface_file import save_surface_map
+from canprobe.touch.surface_map import SurfaceMap
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -33,6 +36,7 @@ class RunResult:
         truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
         estimates: what each estimator said, by name; the online one first.
         taxels: (16, 16) counts of the task's last tactile frame, or None.
+        surface_map: the local patches of the online estimator, or None where no shape was felt.
         out: the folder with the files, or None.
     """
 
@@ -42,6 +46,7 @@ class RunResult:
     truth: dict[str, Array]
     estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
     taxels: NDArray[np.uint8] | None = None
+    surface_map: SurfaceMap | None = None
     out: Path | None = None
 
     def text(self) -> str:
@@ -54,6 +59,7 @@ def summarise(
     controller: object,
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
+    surface_map: SurfaceMap | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
@@ -72,7 +78,7 @@ def summarise(
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
-        "shape": _shape(session, controller, estimates, log),
+        "shape": _shape(session, controller, estimates, log, surface_map),
         "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
@@ -111,7 +117,11 @@ def score_all(
 
 
 def _shape(
-    session: Session, controller: object, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
+    session: Session,
+    controller: object,
+    estimates: dict[str, list[ShapeRecord]],
+    log: dict[str, Array],
+    surface_map: SurfaceMap | None,
 ) -> dict[str, Any]:
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
@@ -123,6 +133,8 @@ def _shape(
     method = next(iter(estimates))
     records = estimates[method]
     shape["method"] = method
+    if surface_map is not None:
+        shape["map"] = summarise_map(surface_map)
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
         shape["kappa_est_per_m"] = _numbers(records[-1].estimate.kappa)
@@ -205,12 +217,15 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
 
 
 def write_files(result: RunResult, out: Path) -> None:
-    """Write ``summary.json``, ``log.npz`` and ``scene.toml`` into ``out``; the other files are there already."""
+    """Write what a run leaves in ``out``, besides the files that are there already and the figures."""
     (out / "summary.json").write_text(
         json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8"
     )
     (out / "scene.toml").write_text(dump_scene(result.plan.scene), encoding="utf-8")
     np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)
+    (out / "surface.npz").unlink(missing_ok=True)  # of an earlier run
+    if result.surface_map is not None:
+        save_surface_map(result.surface_map, out / "surface.npz")
 
 
 def _figure(value: float | None, unit: str, digits: int = 2) -> str:
@@ -260,4 +275,18 @@ def _shape_lines(shape: dict[str, Any]) -> list[str]:
             + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
             f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
         )
+    if (surface := shape.get("map")) is not None:
+        lines.append(
+            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
+        )
     return lines
+
+
+def _crossings(surface: dict[str, Any]) -> str:
+    shares = (
+        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
+        for part in ("curvature", "normal", "height")
+        if surface[part]["share_p_below_0.05"] is not None
+    )
+    text = ", ".join(shares)
+    return f"; p below 0.05 of {text}" if text else ""

@@ -118,6 +118,9 @@ def outputs(scene: Scene) -> tuple[str, ...]:
     files = ["summary.json", "log.npz", "bus.log", "scene.toml"]
     if _no_truth(scene) is None:
         files.append("truth.npz")
+    mapped = _no_shape(scene) is None
+    if mapped:
+        files.append("surface.npz")
     if _no_figure(scene) is None:
-        files.append("report.png")
+        files += ["report.png", "surface.png"] if mapped else ["report.png"]
     return tuple(files)

@@ -157,7 +157,8 @@ def _kappa_sigma(record: ShapeRecord) -> Array:
         d = np.asarray(direction, dtype=float)
         u, v = (axes.T @ d) if d.size == 3 else d
         gradient = np.array((u * u, 2 * u * v, v * v))
-        sigmas.append(float(np.sqrt(max(gradient @ estimate.covariance @ gradient, 0.0))))
+        with np.errstate(invalid="ignore"):  # infinite where nothing was observed
+            sigmas.append(float(np.sqrt(max(gradient @ estimate.covariance @ gradient, 0.0))))
     return np.array(sigmas)
 
 

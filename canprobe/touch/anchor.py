@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, solved
 from canprobe.touch.estimate import Solution
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.quadric import curvature_jacobian, transport
@@ -80,8 +80,9 @@ def solution(a: Anchor, root: Array, decision: Decision, has_prior: bool) -> Sol
         has_prior: the root is regular whatever the data.
     """
     decision = decision._replace(vectors=turned(a.turn) @ decision.vectors)
+    here = solved(a.M.T, root.T).T
     if decision.rank < 3 and not has_prior:
-        return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior)
+        return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior, here)
     D = curvature_jacobian(a.c) @ a.M
     X = np.linalg.solve(root.T, D.T)
-    return Solution(a.c, X.T @ X, decision, has_prior)
+    return Solution(a.c, X.T @ X, decision, has_prior, here)

@@ -54,6 +54,9 @@ class SurfaceEstimate:
         method: name of the estimator.
         prior: name of what was assumed.
         notes: what a reader should know.
+        model_root: (9, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
+            contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
+            known of place and normal. None from the methods of differences, which do not know it.
     """
 
     S: Array
@@ -74,10 +77,13 @@ class SurfaceEstimate:
     method: str
     prior: str
     notes: tuple[str, ...] = ()
+    model_root: Array | None = None
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
             getattr(self, name).flags.writeable = False
+        if self.model_root is not None:
+            self.model_root.flags.writeable = False
 
     @property
     def T_base_contact(self) -> Array:
@@ -132,12 +138,14 @@ class Solution(NamedTuple):
         covariance: (3, 3) of (K11, K12, K22); used as it is where all is observed.
         decision: on the data's information.
         has_prior: a prior makes every combination finite.
+        root: (9, 9) root of the information about c with c14, c24, c44, prior included; None where it is not known.
     """
 
     c: Array
     covariance: Array
     decision: Decision
     has_prior: bool
+    root: Array | None = None
 
 
 def build_estimate(
@@ -187,7 +195,13 @@ def build_estimate(
         method=method,
         prior=prior,
         notes=notes,
+        model_root=None if solution.root is None else solution.root * _units(length),
     )
+
+
+def _units(length: float) -> Array:
+    """(9,) dimensionless entries of S per SI ones."""
+    return np.array([1.0, 1.0, 1.0 / length] + 6 * [length])
 
 
 def _principal(K: Array) -> tuple[Array, Array]:

@@ -1,0 +1,174 @@
+"""All crossings of a map, and one verdict on whether its passes agree."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.errors import UsageError
+from canprobe.touch._arrays import Array, positive
+from canprobe.touch.crossings import ChiSquared, Crossing, compare
+from canprobe.touch.surface_map import SurfaceMap
+
+RADIUS_M = 2e-3
+"""Default largest distance between the contacts of a crossing, m."""
+MEMORIES = 3.0
+"""Default path between the two passes of a crossing over the longest path that a patch rests on.
+
+With forgetting by exp(−s/memory) two answers s apart share exp(−s/memory) of their data: 5 % at three."""
+LEVEL = 0.05
+PARTS = ("curvature", "normal", "height", "joint")
+_FACING = 0.5
+
+
+class Verdict(NamedTuple):
+    """One part of the tests over all crossings.
+
+    Attributes:
+        tested: crossings where it could be tested.
+        share_below: share of the p-values below 0.05; 0.05 is expected of one surface and right covariances. Crossings
+            share patches' data, so they are no independent trials. NaN where nothing was tested.
+        chi2_per_dof: Σ χ² / Σ dof; 1 where the covariances are right, less where they are generous. NaN likewise.
+        pooled: Fisher's χ² over the p-values of independent crossings, −2 Σ ln p with 2 n degrees of freedom.
+    """
+
+    tested: int
+    share_below: float
+    chi2_per_dof: float
+    pooled: ChiSquared
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consistency:
+    """Whether the passes of a map agree where they cross.
+
+    Attributes:
+        crossings: every crossing, by its place along the path.
+        independent: indices of crossings no two of which share data.
+    """
+
+    crossings: tuple[Crossing, ...]
+    independent: tuple[int, ...]
+
+    def verdict(self, part: str = "joint", angles: tuple[float, float] = (0.0, math.inf)) -> Verdict:
+        """The tests of one part, over the crossings whose passes differ in direction by an angle in a range.
+
+        Args:
+            part: "curvature", "normal", "height" or "joint".
+            angles: from, up to (rad); crossings whose angle is not known count only in the whole range.
+
+        Raises:
+            UsageError: on an unknown part.
+        """
+        if part not in PARTS:
+            raise UsageError(f"part: expected one of {', '.join(PARTS)}, got {part!r}")
+        whole = angles == (0.0, math.inf)
+        chosen = [i for i, c in enumerate(self.crossings) if whole or angles[0] <= c.angle < angles[1]]
+        tests = {i: getattr(self.crossings[i], part) for i in chosen}
+        tests = {i: test for i, test in tests.items() if test.dof}
+        dof = sum(test.dof for test in tests.values())
+        if not dof:
+            return Verdict(0, math.nan, math.nan, fisher([]))
+        return Verdict(
+            len(tests),
+            sum(test.p < LEVEL for test in tests.values()) / len(tests),
+            sum(test.chi2 for test in tests.values()) / dof,
+            fisher([tests[i].p for i in self.independent if i in tests]),
+        )
+
+    @property
+    def consistent(self) -> bool | None:
+        """The pooled joint test does not reject one surface at 5 %; None where there was nothing to test."""
+        pooled = self.verdict().pooled
+        return None if pooled.dof == 0 else pooled.p >= LEVEL
+
+
+def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> list[Crossing]:
+    """Places where two passes come close, one pair of patches for each.
+
+    Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
+    contacts along the path are the same crossing. A path that follows itself gives one every two radii.
+
+    Args:
+        surface_map: the map.
+        radius: largest distance between the contacts, m.
+        gap: least path between them, m; None for `MEMORIES` times the longest memory of a patch.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+    """
+    limit = positive("radius", radius)
+    least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
+    if not len(surface_map):
+        return []
+    along = surface_map.travelled
+    apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
+    facing = surface_map.normals @ surface_map.normals.T > _FACING
+    fits = (apart <= limit) & (along[None] - along[:, None] >= least) & facing
+    pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
+    chosen: list[tuple[int, int]] = []
+    while len(pairs):
+        chosen.append((int(pairs[0, 0]), int(pairs[0, 1])))
+        pairs = pairs[np.abs(along[pairs] - along[pairs[0]]).max(axis=1) > 2.0 * limit]
+    heading = _headings(surface_map)
+    return [
+        compare(surface_map.patches[i], surface_map.patches[j], i, j, _angle(heading[i], heading[j]))
+        for i, j in sorted(chosen)
+    ]
+
+
+def _headings(surface_map: SurfaceMap) -> Array:
+    """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
+    if len(surface_map) < 2:
+        return np.full((len(surface_map), 3), math.nan)
+    steps = np.diff(surface_map.points, axis=0)
+    sizes = np.linalg.norm(steps, axis=1, keepdims=True)
+    headings = np.full((len(surface_map), 3), math.nan)
+    headings[1:] = steps / np.where(sizes > 0.0, sizes, math.nan)
+    headings[0] = headings[1]
+    return headings
+
+
+def _angle(a: Array, b: Array) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+def check_consistency(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> Consistency:
+    """Test every crossing of a map and pool the independent ones; see `crossings` for what the test rests on.
+
+    Args:
+        surface_map, radius, gap: as in `find_crossings`; two crossings are independent where all four patches are at
+            least the gap apart along the path.
+    """
+    least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
+    found = find_crossings(surface_map, radius=radius, gap=gap)
+    return Consistency(tuple(found), _independent(surface_map, found, least))
+
+
+def _independent(surface_map: SurfaceMap, found: list[Crossing], gap: float) -> tuple[int, ...]:
+    """Crossings, taken in the order of their later pass, whose patches are all at least a gap from those before."""
+    along = surface_map.travelled
+    used: list[float] = []
+    chosen: list[int] = []
+    for i in sorted(range(len(found)), key=lambda i: (found[i].second, -found[i].first)):
+        places = along[[found[i].first, found[i].second]]
+        if all(abs(place - other) >= gap for place in places for other in used):
+            used += places.tolist()
+            chosen.append(i)
+    return tuple(sorted(chosen))
+
+
+def fisher(p_values: list[float]) -> ChiSquared:
+    """Fisher's pooled χ² of independent p-values, −2 Σ ln p with 2 n degrees of freedom.
+
+    Source: R. A. Fisher, Statistical Methods for Research Workers, 4th ed., 1932, §21.1.
+    """
+    if not p_values:
+        return ChiSquared(0.0, 0, math.nan)
+    from scipy.special import chdtrc
+
+    chi2 = -2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300))))
+    return ChiSquared(chi2, 2 * len(p_values), float(chdtrc(2 * len(p_values), chi2)))
