@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from canprobe.cell.cell import Cell
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.planning import Plan
+from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 
@@ -72,7 +73,7 @@ def summarise(
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
-        "shape": _shape(session, controller, estimates, log),
+        "shape": summarise_shape(scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"]),
         "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
@@ -103,16 +104,22 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
 
 
-def score_all(
-    session: Session, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
-) -> dict[str, ShapeScore]:
-    """Score of every estimator against the truth, by name."""
-    return {name: score_shape(records, session.truth, log["t_s"]) for name, records in estimates.items()}
-
-
-def _shape(
-    session: Session, controller: object, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
+def summarise_shape(
+    scene: Scene,
+    tracker: ShapeTracker | None,
+    estimates: dict[str, list[ShapeRecord]],
+    truth: Mapping[str, Array],
+    sync_times: Array,
 ) -> dict[str, Any]:
+    """The section ``shape`` of ``summary.json``; the first of the estimates is the one that is summed up.
+
+    Args:
+        scene: of the run.
+        tracker: its contacts; None without a shape.
+        estimates: what each estimator said, by name.
+        truth: columns of the plant's truth, one row a SYNC; empty where there is none.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+    """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
         *("normal_rms_deg", "position_rms_mm", "observed", "cramer_rao_ratio"),
@@ -126,9 +133,9 @@ def _shape(
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
         shape["kappa_est_per_m"] = _numbers(records[-1].estimate.kappa)
-    if not session.truth:
+    if not truth:
         return shape
-    scores = score_all(session, estimates, log)
+    scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
     score = scores[method]
     shape |= {
         "kappa_true_per_m": score.kappa_true,
@@ -137,7 +144,7 @@ def _shape(
         "kappa_rms_error_percent": score.kappa_rms_percent,
         "normal_rms_deg": score.normal_rms_deg,
         "position_rms_mm": score.position_rms_mm,
-        "cramer_rao_ratio": _bound_ratio(session, controller, score, log),
+        "cramer_rao_ratio": _bound_ratio(scene, tracker, score, truth, sync_times),
         "methods": {
             name: {
                 "kappa_rms_error_per_m": s.kappa_rms,
@@ -153,17 +160,19 @@ def _shape(
     return shape
 
 
-def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: dict[str, Array]) -> float | None:
+def _bound_ratio(
+    scene: Scene, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise."""
     from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
 
-    tracker, shape = getattr(controller, "shape", None), session.scene.shape
+    shape = scene.shape
     if tracker is None or shape is None or score.kappa_rms is None:
         return None
     bound = bound_of_scan(
         tracker.samples,
-        session.truth,
-        log["t_s"],
+        truth,
+        sync_times,
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,

@@ -1,0 +1,110 @@
+"""A recorded log → the contacts and estimates of the run: by the scene's own task, or from the contacts alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from canprobe.cell.build import make_task
+from canprobe.cell.log_cycles import LogCycle
+from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
+from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.cell.tasks.touch import TouchSettings, TouchTask
+from canprobe.errors import UsageError
+from canprobe.planning.model import Plan
+from canprobe.robot.puma260 import MODELS, joints_to_counts
+from canprobe.touch.contact import ContactSample
+
+TARGET_TOLERANCE = 1
+"""Counts that a replayed target may differ from the recorded one."""
+OTHER_MASTER_COUNTS = 100
+"""Difference of a target at which another controller drove, however short the comparison: 2 mm or 1 deg."""
+OTHER_MASTER_SHARE = 0.5
+"""Share of cycles with other targets from which on another controller drove."""
+GAP_S = 0.1
+"""Time without contact after which an estimator starts afresh."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskReplay:
+    """What the scene's task did on the recorded measurements.
+
+    Attributes:
+        task: the task, at its end.
+        cycles: steps it made.
+        compared: of these, with recorded targets beside them.
+        differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
+        worst_counts: the largest difference.
+    """
+
+    task: TouchTask
+    cycles: int
+    compared: int
+    differing: int
+    worst_counts: int
+
+    @property
+    def drove(self) -> bool:
+        """The recorded targets are this task's own."""
+        return self.compared > 0 and self.worst_counts <= OTHER_MASTER_COUNTS and self.differing <= (
+            OTHER_MASTER_SHARE * self.compared
+        )
+
+
+def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
+    """The cycles in which a cell steps its controller: from the one after all drives are in operation enabled until
+    one leaves it, or the master asks for anything else."""
+    started = False
+    for cycle in cycles:
+        if not started:
+            started = cycle.measurement.q is not None and cycle.measurement.enabled
+        elif cycle.measurement.enabled and cycle.enabled_by_master:
+            yield cycle
+        else:
+            return
+
+
+def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
+    """Step the scene's task through recorded cycles and hold its targets against the recorded ones.
+
+    It ends early where the targets are clearly another controller's.
+    """
+    task = make_task(plan)
+    assert isinstance(task, TouchTask) and plan.scene.arm is not None
+    model = MODELS[plan.scene.arm.model]
+    steps = compared = differing = worst = 0
+    for cycle in controller_cycles(cycles):
+        command = task.step(cycle.measurement)
+        steps += 1
+        if cycle.targets is not None and command.q_target is not None:
+            counts = np.round(joints_to_counts(model, command.q_target))
+            difference = int(np.abs(counts - cycle.targets).max())
+            worst = max(worst, difference)
+            compared += 1
+            differing += difference > TARGET_TOLERANCE
+        if command.done or command.stop_reason is not None or worst > OTHER_MASTER_COUNTS:
+            break
+    return TaskReplay(task, steps, compared, differing, worst)
+
+
+def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:
+    """Feed every contact of a log to the scene's estimator, whoever made it: force above the touch threshold.
+
+    Returns:
+        The tracker; and how many contacts could not be placed for want of the joints of their instant.
+    """
+    sensing = make_sensing(plan.scene)
+    tracker = make_shape_tracker(plan.scene, GAP_S)
+    assert tracker is not None
+    for cycle in cycles:
+        measurement = cycle.measurement
+        patch = sensing.step(measurement)
+        if patch is None or measurement.tactile is None or patch.force <= TouchSettings.touch_force:
+            continue
+        contact = sensing.contact(measurement.tactile, patch)
+        estimate = tracker.add(contact) if contact is not None else None
+        if estimate is not None and bool(np.all(estimate.observed)):
+            sensing.set_kappa(np.asarray(estimate.kappa))
+    return tracker, sensing.dropped
