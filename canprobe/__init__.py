@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from canprobe.api import RunResult, open_cell, run
     from canprobe.planning import make_plan as plan
+    from canprobe.recorded import ReplayResult, replay
     from canprobe.scene_loader import load_scene
     from canprobe.touch.bound import cramer_rao
     from canprobe.touch.estimate import SurfaceEstimate
@@ -24,6 +25,8 @@ _EXPORTS = {
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
     "open_cell": ("canprobe.api", "open_cell"),
+    "replay": ("canprobe.recorded", "replay"),
+    "ReplayResult": ("canprobe.recorded", "ReplayResult"),
     "RunResult": ("canprobe.api", "RunResult"),
     "SurfaceMatrix": ("canprobe.touch.surface", "SurfaceMatrix"),
     "SurfaceEstimate": ("canprobe.touch.estimate", "SurfaceEstimate"),
@@ -32,6 +35,7 @@ _EXPORTS = {
 }
 
 __all__ = [
+    "ReplayResult",
     "RunResult",
     "SurfaceEstimate",
     "SurfaceMatrix",
@@ -41,6 +45,7 @@ __all__ = [
     "load_scene",
     "open_cell",
     "plan",
+    "replay",
     "run",
 ]
 

@@ -250,13 +250,15 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
     if shape["method"] is not None:
-        lines += _shape_lines(shape)
+        lines += shape_lines(shape)
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
 
 
-def _shape_lines(shape: dict[str, Any]) -> list[str]:
+def shape_lines(shape: dict[str, Any]) -> list[str]:
+    """The section ``shape`` of a summary as lines for people."""
+
     def pair(values: Sequence[float | None] | None) -> str:
         return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
 

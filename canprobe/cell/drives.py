@@ -156,11 +156,7 @@ class DriveGroup:
     def set_target(self, q: Vector | None) -> None:
         """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
         if q is not None:
-            self._targets = self.counts_of(q)
-
-    def counts_of(self, q: Vector) -> list[int]:
-        """The target positions, counts, that joint angles (6,), rad, are sent as."""
-        return [round(c) for c in joints_to_counts(self._model, q).tolist()]
+            self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""

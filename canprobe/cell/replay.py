@@ -11,18 +11,14 @@ from canprobe.cell.build import make_task
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
-from canprobe.cell.tasks.touch import TouchSettings, TouchTask
-from canprobe.errors import UsageError
+from canprobe.cell.tasks.touch import TOUCH_FORCE, TouchTask
 from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS, joints_to_counts
-from canprobe.touch.contact import ContactSample
 
 TARGET_TOLERANCE = 1
 """Counts that a replayed target may differ from the recorded one."""
-OTHER_MASTER_COUNTS = 100
-"""Difference of a target at which another controller drove, however short the comparison: 2 mm or 1 deg."""
-OTHER_MASTER_SHARE = 0.5
-"""Share of cycles with other targets from which on another controller drove."""
+PARTED_COUNTS = 100
+"""Difference at which the recorded targets have left the task's: 2 mm or 1 deg."""
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh."""
 
@@ -33,24 +29,22 @@ class TaskReplay:
 
     Attributes:
         task: the task, at its end.
-        cycles: steps it made.
-        compared: of these, with recorded targets beside them.
+        compared: cycles with recorded targets beside its own.
         differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
         worst_counts: the largest difference.
+        parted_s: when the recorded targets left the task's and its replay ended (s); None where they did not.
     """
 
     task: TouchTask
-    cycles: int
     compared: int
     differing: int
     worst_counts: int
+    parted_s: float | None
 
     @property
     def drove(self) -> bool:
-        """The recorded targets are this task's own."""
-        return self.compared > 0 and self.worst_counts <= OTHER_MASTER_COUNTS and self.differing <= (
-            OTHER_MASTER_SHARE * self.compared
-        )
+        """The recorded targets are this task's own, as far as to a contact of its scan and in most cycles."""
+        return self.task.shape is not None and bool(self.task.shape.samples) and 2 * self.differing < self.compared
 
 
 def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
@@ -74,19 +68,21 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     task = make_task(plan)
     assert isinstance(task, TouchTask) and plan.scene.arm is not None
     model = MODELS[plan.scene.arm.model]
-    steps = compared = differing = worst = 0
+    compared = differing = worst = 0
+    parted_s: float | None = None
     for cycle in controller_cycles(cycles):
         command = task.step(cycle.measurement)
-        steps += 1
         if cycle.targets is not None and command.q_target is not None:
             counts = np.round(joints_to_counts(model, command.q_target))
             difference = int(np.abs(counts - cycle.targets).max())
             worst = max(worst, difference)
             compared += 1
             differing += difference > TARGET_TOLERANCE
-        if command.done or command.stop_reason is not None or worst > OTHER_MASTER_COUNTS:
+        if worst > PARTED_COUNTS:
+            parted_s = cycle.measurement.t_ns * 1e-9
+        if command.done or command.stop_reason is not None or parted_s is not None:
             break
-    return TaskReplay(task, steps, compared, differing, worst)
+    return TaskReplay(task, compared, differing, worst, parted_s)
 
 
 def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:
@@ -101,7 +97,7 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
     for cycle in cycles:
         measurement = cycle.measurement
         patch = sensing.step(measurement)
-        if patch is None or measurement.tactile is None or patch.force <= TouchSettings.touch_force:
+        if patch is None or measurement.tactile is None or patch.force <= TOUCH_FORCE:
             continue
         contact = sensing.contact(measurement.tactile, patch)
         estimate = tracker.add(contact) if contact is not None else None

@@ -1,0 +1,242 @@
+"""A recorded run, estimated again from its log alone: candump in, shape out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.log_cycles import LogCycles
+from canprobe.cell.recording import Recording, read_recording
+from canprobe.cell.replay import GAP_S, TaskReplay, replay_contacts, replay_task
+from canprobe.cell.tasks.build import estimates_of
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
+from canprobe.planning import Plan, make_plan
+from canprobe.results import shape_lines, summarise_shape
+from canprobe.scene import Scene
+from canprobe.scene_loader import load_scene
+from canprobe.session import LOCKSTEP
+from canprobe.touch.estimators import METHODS, unknown_method
+
+Array = NDArray[np.float64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class ReplayResult:
+    """One replayed log.
+
+    Attributes:
+        plan: of the scene.
+        summary: ``schema, scene, log, channel, driven_by`` (``task``: the scene's task made the recorded targets and
+            was stepped again; ``other``: every contact was fed), ``targets`` (the comparison), ``cycle`` (what was
+            missed), ``shape`` as in ``summary.json``, ``online`` (difference to the run's own result; None without).
+        estimates: what each estimator said, by name.
+        tracker: the contacts that they were fed.
+    """
+
+    plan: Plan
+    summary: dict[str, Any]
+    estimates: dict[str, list[ShapeRecord]]
+    tracker: ShapeTracker
+
+    def text(self) -> str:
+        """The summary for people."""
+        return _text(self.summary)
+
+    def save(self, path: Path | str) -> None:
+        """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file."""
+        columns: dict[str, Array] = {}
+        for method, records in self.estimates.items():
+            columns |= {f"{method}_{name}": values for name, values in _columns(records).items()}
+        np.savez_compressed(path, allow_pickle=False, **columns)
+
+
+def replay(
+    log: Path | str, *, scene: Scene | str | Path | None = None, method: str | Sequence[str] | None = None
+) -> ReplayResult:
+    """Estimate the shape again from a recorded bus.
+
+    The log of a run of ours gives the online result once more. In a log of the same nodes under another master, every
+    contact is fed to the estimators. Which of the two was done stands in the summary.
+
+    Args:
+        log: folder of a run, or a candump file.
+        scene: what the nodes are and how the estimators are set; by default the ``scene.toml`` beside the log.
+        method: the estimators, one or several; by default the scene's.
+
+    Raises:
+        UsageError: no log or scene, an unknown method, a line that is not candump's, a node that was never heard, no
+            SYNC, or no contact at all.
+    """
+    path, folder = _find_log(Path(log))
+    plan = make_plan(_scene_of(path, folder, scene))
+    methods = _methods(plan.scene, method)
+    as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
+    recording = read_recording(path, plan, as_taken=as_taken)
+    cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
+    task = replay_task(plan, cycles)
+    if task.drove and task.task.shape is not None:
+        tracker, unplaced, gap_s = task.task.shape, task.task.unplaced, np.inf
+    else:
+        cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
+        tracker, unplaced = replay_contacts(plan, cycles)
+        gap_s = GAP_S
+    if not tracker.samples:
+        raise UsageError(f"{path}: nothing was touched in this log: no contact to estimate from")
+    estimates = estimates_of(plan.scene, tracker, methods, gap_s)
+    truth = _arrays(folder / "truth.npz") if folder is not None else {}
+    shape = summarise_shape(plan.scene, tracker, estimates, truth, np.array(cycles.sync_times_s))
+    summary = {
+        "schema": SCHEMA,
+        "scene": plan.scene.name,
+        "log": str(path),
+        "channel": recording.channel,
+        "driven_by": "task" if task.drove else "other",
+        "targets": _targets(task),
+        "cycle": _cycle(cycles, recording, unplaced),
+        "contacts": len(tracker.samples),
+        "shape": shape,
+        "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
+    }
+    return ReplayResult(plan, summary, estimates, tracker)
+
+
+# what to read
+
+
+def _find_log(log: Path) -> tuple[Path, Path | None]:
+    """The candump file; and the run's folder where it is one."""
+    if not log.is_dir():
+        return log, None
+    path = log / "bus.log"
+    if not path.is_file():
+        raise UsageError(f"{log}: no bus.log in this folder; expected the folder of a run, or a candump file")
+    return path, log
+
+
+def _scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
+    if isinstance(scene, Scene):
+        return scene
+    if scene is not None:
+        return load_scene(scene)
+    if folder is None:
+        raise UsageError(f"{path}: a log alone does not tell what its nodes are: name the scene (--scene)")
+    if not (folder / "scene.toml").is_file():
+        raise UsageError(f"{folder}: no scene.toml in this folder: name the scene (--scene)")
+    return load_scene(folder / "scene.toml")
+
+
+def _methods(scene: Scene, method: str | Sequence[str] | None) -> tuple[str, ...]:
+    if scene.shape is None or scene.task.kind != "scan":
+        raise UsageError(f"scene {scene.name}: task {scene.task.kind} estimates no shape; there is nothing to replay")
+    if method is None:
+        return (scene.shape.method, *scene.shape.also)
+    names = (method,) if isinstance(method, str) else tuple(method)
+    for name in names:
+        if name not in METHODS:
+            raise unknown_method(name)
+    return names or (scene.shape.method,)
+
+
+def _arrays(path: Path) -> dict[str, Array]:
+    if not path.is_file():
+        return {}
+    with np.load(path, allow_pickle=False) as file:
+        return {name: file[name] for name in file.files}
+
+
+# what to tell
+
+
+def _targets(task: TaskReplay) -> dict[str, float | None]:
+    return {
+        "compared": task.compared,
+        "differing": task.differing,
+        "worst_counts": task.worst_counts,
+        "parted_s": task.parted_s,
+    }
+
+
+def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, int]:
+    assert cycles.drives is not None and cycles.tactile is not None
+    assembler = cycles.tactile.assembler
+    return {
+        "cycles": len(cycles.sync_times_s),
+        "lost_syncs": cycles.lost_syncs,
+        "missed_pdos": cycles.drives.missed,
+        "late_pdos": cycles.drives.late,
+        "malformed_pdos": recording.malformed,
+        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans,
+        "lost_frames": assembler.lost,
+        "stale_frames": cycles.tactile.stale,
+        "unplaced_contacts": unplaced,
+        "error_frames": recording.error_frames,
+    }
+
+
+def _online(folder: Path, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
+    """How far the replayed curvature of the estimator in the loop is from what the run logged, number by number."""
+    logged = _arrays(folder / "log.npz").get("K_per_m")
+    if logged is None:
+        return None
+    online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
+    replayed = _changes(np.array([r.estimate.K for r in records if np.isfinite(r.estimate.K).all()]).reshape(-1, 2, 2))
+    same = len(online) == len(replayed) > 0
+    return {
+        "estimates": len(online),
+        "replayed": len(replayed),
+        "K_max_difference_per_m": float(np.abs(online - replayed).max()) if same else None,
+    }
+
+
+def _changes(K: Array) -> Array:
+    """The rows (m, 2, 2) of (n, 2, 2) that differ from the row before."""
+    new = np.ones(len(K), bool)
+    new[1:] = (K[1:] != K[:-1]).any(axis=(1, 2))
+    return K[new]
+
+
+def _columns(records: Sequence[ShapeRecord]) -> dict[str, Array]:
+    return {
+        "t_s": np.array([r.t_s for r in records]),
+        "travelled_m": np.array([r.travelled_m for r in records]),
+        "K_per_m": np.array([r.estimate.K for r in records]).reshape(-1, 2, 2),
+        "K_covariance_per_m2": np.array([r.estimate.covariance for r in records]).reshape(-1, 3, 3),
+        "kappa_per_m": np.array([r.estimate.kappa for r in records]).reshape(-1, 2),
+        "observed": np.array([r.estimate.observed for r in records], bool).reshape(-1, 2),
+        "T_base_contact_m": np.array([r.estimate.T_frame_contact for r in records]).reshape(-1, 4, 4),
+    }
+
+
+def _text(summary: dict[str, Any]) -> str:
+    cycle, targets, online = summary["cycle"], summary["targets"], summary["online"]
+    if summary["driven_by"] == "task":
+        how = "the scene's task drove: its scan is replayed"
+        if targets["parted_s"] is not None:
+            how += f" up to {targets['parted_s']:.3f} s, where the recorded targets leave it"
+        elif targets["differing"]:
+            how += f" ({targets['differing']} of {targets['compared']} targets differ)"
+    elif targets["compared"]:
+        how = "another controller drove: every contact is fed to the estimators"
+    else:
+        how = "no targets are in the log: every contact is fed to the estimators"
+    lines = [
+        f"{summary['log']}, {summary['channel']}: scene {summary['scene']}",
+        f"  replay     {how}",
+        f"  cycle      {cycle['cycles']}, {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames,"
+        f" {cycle['lost_syncs']} lost SYNCs; {summary['contacts']} contacts",
+        *shape_lines(summary["shape"]),
+    ]
+    if online is not None:
+        difference = online["K_max_difference_per_m"]
+        lines.append(
+            f"  online     {online['replayed']} of {online['estimates']} estimates"
+            + (f", largest difference {difference:.3g} 1/m" if difference is not None else "")
+        )
+    return "\n".join(lines)
