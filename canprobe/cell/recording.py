@@ -17,6 +17,8 @@ from canprobe.protocol.frames import SYNC_ID
 
 RATE_TOLERANCE = 0.2
 """Share by which the recorded SYNC period may differ from the scene's."""
+STAMP_JITTER_NS = 300_000
+"""Lines out of the order of their stamps by no more are in the order of the bus, and the stamps are wrong."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,8 +75,8 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
     Args:
         path: the log; it may hold other nodes, other channels and error frames.
         plan: which identifiers and lengths to expect.
-        as_taken: keep the order of the lines, which in a log of a cell on a real bus is that in which it took them in;
-            False sorts them by stamp.
+        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order in which it
+            took the frames in. False puts them into the order of the bus.
 
     Raises:
         UsageError: no such file, a torn line, a node that was never heard, no SYNC, or SYNCs of another rate.
@@ -83,7 +85,7 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
     name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
     chosen = channels.get(name, _Channel())
     _check_heard(path, plan, name, chosen)
-    frames = chosen.frames if as_taken else sorted(chosen.frames, key=lambda frame: frame[2])
+    frames = chosen.frames if as_taken else _in_bus_order(chosen.frames)
     syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
     times = np.array([frame[2] for frame in frames], np.int64)
     recording = Recording(
@@ -115,6 +117,15 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
                 channel.heard.add(can_id)
                 channel.answers += 1
     return channels, error_frames
+
+
+def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
+    """Frames with stamps that never go back: a logger's small jitter is evened out, anything more is sorted."""
+    stamps = np.array([frame[2] for frame in frames], np.int64)
+    latest = np.maximum.accumulate(stamps)
+    if int((latest - stamps).max(initial=0)) > STAMP_JITTER_NS:
+        return sorted(frames, key=lambda frame: frame[2])
+    return [(can_id, data, t_ns) for (can_id, data, _), t_ns in zip(frames, latest.tolist(), strict=True)]
 
 
 def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -16,9 +17,13 @@ from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS, joints_to_counts
 
 TARGET_TOLERANCE = 1
-"""Counts that a replayed target may differ from the recorded one."""
+"""Counts that a replayed target may differ from the recorded one by rounding."""
+OWN_COUNTS = 20
+"""Median difference up to which the task drove: 0.5 mm or 0.2 deg. One lost line is a few counts for a while."""
 PARTED_COUNTS = 100
-"""Difference at which the recorded targets have left the task's: 2 mm or 1 deg."""
+"""Difference at which the recorded targets are not the task's: 2 mm or 1 deg."""
+PARTED_S = 0.1
+"""Time at that difference after which they never will be again: what a lost line sets off, the servo has mended."""
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh."""
 
@@ -31,20 +36,21 @@ class TaskReplay:
         task: the task, at its end.
         compared: cycles with recorded targets beside its own.
         differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
-        worst_counts: the largest difference.
+        median_counts, worst_counts: the usual and the largest difference.
         parted_s: when the recorded targets left the task's and its replay ended (s); None where they did not.
     """
 
     task: TouchTask
     compared: int
     differing: int
+    median_counts: float
     worst_counts: int
     parted_s: float | None
 
     @property
     def drove(self) -> bool:
-        """The recorded targets are this task's own, as far as to a contact of its scan and in most cycles."""
-        return self.task.shape is not None and bool(self.task.shape.samples) and 2 * self.differing < self.compared
+        """The recorded targets are this task's own in most cycles, and it came as far as to a contact of its scan."""
+        return self.task.shape is not None and bool(self.task.shape.samples) and self.median_counts <= OWN_COUNTS
 
 
 def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
@@ -68,21 +74,25 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     task = make_task(plan)
     assert isinstance(task, TouchTask) and plan.scene.arm is not None
     model = MODELS[plan.scene.arm.model]
-    compared = differing = worst = 0
-    parted_s: float | None = None
+    patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
+    differences: list[int] = []
+    away = 0
     for cycle in controller_cycles(cycles):
         command = task.step(cycle.measurement)
         if cycle.targets is not None and command.q_target is not None:
             counts = np.round(joints_to_counts(model, command.q_target))
-            difference = int(np.abs(counts - cycle.targets).max())
-            worst = max(worst, difference)
-            compared += 1
-            differing += difference > TARGET_TOLERANCE
-        if worst > PARTED_COUNTS:
-            parted_s = cycle.measurement.t_ns * 1e-9
-        if command.done or command.stop_reason is not None or parted_s is not None:
+            differences.append(int(np.abs(counts - cycle.targets).max()))
+            away = away + 1 if differences[-1] > PARTED_COUNTS else 0
+        if command.done or command.stop_reason is not None or away > patience:
             break
-    return TaskReplay(task, compared, differing, worst, parted_s)
+    return TaskReplay(
+        task,
+        compared=len(differences),
+        differing=sum(d > TARGET_TOLERANCE for d in differences),
+        median_counts=float(np.median(differences)) if differences else math.inf,
+        worst_counts=max(differences, default=0),
+        parted_s=cycle.measurement.t_ns * 1e-9 if away > patience else None,
+    )
 
 
 def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:
