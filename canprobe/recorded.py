@@ -17,7 +17,7 @@ from canprobe.cell.tasks.build import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.results import shape_lines, summarise_shape
+from canprobe.results import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene import Scene
 from canprobe.scene_loader import load_scene
 from canprobe.session import LOCKSTEP
@@ -33,9 +33,10 @@ class ReplayResult:
 
     Attributes:
         plan: of the scene.
-        summary: ``schema, scene, log, channel, driven_by`` (``task``: the scene's task made the recorded targets and
-            was stepped again; ``other``: every contact was fed), ``targets`` (the comparison), ``cycle`` (what was
-            missed), ``shape`` as in ``summary.json``, ``online`` (difference to the run's own result; None without).
+        summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the recorded targets
+            and was stepped again; ``other``: every contact was fed) with the comparison of ``targets``; ``cycle`` (what
+            was missed); ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``;
+            ``online`` (the difference to what the run logged, None where there is nothing to compare).
         estimates: what each estimator said, by name.
         tracker: the contacts that they were fed.
     """
@@ -101,6 +102,7 @@ def replay(
         "targets": _targets(task),
         "cycle": _cycle(cycles, recording, unplaced),
         "contacts": len(tracker.samples),
+        "estimates": {name: _last(records) for name, records in estimates.items()},
         "shape": shape,
         "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
     }
@@ -180,6 +182,19 @@ def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, 
     }
 
 
+def _last(records: Sequence[ShapeRecord]) -> dict[str, Any]:
+    """How many answers an estimator gave, and its last one."""
+    if not records:
+        return {"count": 0, "t_s": None, "kappa_per_m": None, "observed": None}
+    record = records[-1]
+    return {
+        "count": len(records),
+        "t_s": record.t_s,
+        "kappa_per_m": finite_or_none(record.estimate.kappa),
+        "observed": [bool(o) for o in record.estimate.observed],
+    }
+
+
 def _online(folder: Path, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
     """How far the replayed curvature of the estimator in the loop is from what the run logged, number by number."""
     logged = _arrays(folder / "log.npz").get("K_per_m")
@@ -231,7 +246,7 @@ def _text(summary: dict[str, Any]) -> str:
         f"  replay     {how}",
         f"  cycle      {cycle['cycles']}, {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames,"
         f" {cycle['lost_syncs']} lost SYNCs; {summary['contacts']} contacts",
-        *shape_lines(summary["shape"]),
+        *_estimate_lines(summary),
     ]
     if online is not None:
         difference = online["K_max_difference_per_m"]
@@ -240,3 +255,12 @@ def _text(summary: dict[str, Any]) -> str:
             + (f", largest difference {difference:.3g} 1/m" if difference is not None else "")
         )
     return "\n".join(lines)
+
+
+def _estimate_lines(summary: dict[str, Any]) -> list[str]:
+    if summary["shape"]["kappa_true_per_m"] is not None:
+        return shape_lines(summary["shape"])
+    return [
+        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])} 1/m, the last of {last['count']} estimates"
+        for name, last in summary["estimates"].items()
+    ]

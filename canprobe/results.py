@@ -132,7 +132,7 @@ def summarise_shape(
     shape["method"] = method
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
-        shape["kappa_est_per_m"] = _numbers(records[-1].estimate.kappa)
+        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
     if not truth:
         return shape
     scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
@@ -180,7 +180,7 @@ def _bound_ratio(
     return None if bound is None else score.kappa_rms / bound
 
 
-def _numbers(values: Sequence[float] | Array) -> list[float | None]:
+def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
     """Floats for JSON: what is not finite was not observed, and is None."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
@@ -256,13 +256,17 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     return "\n".join(lines)
 
 
+def curvature_text(values: Sequence[float | None] | None) -> str:
+    """Principal curvatures as people read them."""
+    return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
+
+
 def shape_lines(shape: dict[str, Any]) -> list[str]:
     """The section ``shape`` of a summary as lines for people."""
 
-    def pair(values: Sequence[float | None] | None) -> str:
-        return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
-
-    lines = [f"  curvature  {pair(shape['kappa_est_per_m'])} 1/m, true {pair(shape['kappa_true_per_m'])} 1/m"]
+    lines = [
+        f"  curvature  {curvature_text(shape['kappa_est_per_m'])} 1/m, true {curvature_text(shape['kappa_true_per_m'])} 1/m"
+    ]
     for name, score in shape.get("methods", {}).items():
         percent = score["kappa_rms_error_percent"]
         lines.append(

@@ -13,7 +13,7 @@ def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None)
     """The deadline of each SYNC.
 
     A SYNC goes out at its deadline or less than a period later, and never two for one deadline. The phase of the
-    deadlines is the one that obeys this with the least lateness in all; stamps may be a microsecond early.
+    deadlines is the one that obeys this with the least lateness; stamps may be a microsecond early.
 
     Args:
         stamps_ns: when each SYNC went out (n,), ns, increasing.
@@ -47,5 +47,11 @@ def _phase(stamps_ns: Numbers, period_ns: int) -> int:
     candidates, passed = np.unique(residues, return_index=True)
     lateness = period_ns * passed.astype(float) - float(len(residues)) * candidates
     order = np.argsort(lateness, kind="stable")[:_TRIALS]
-    clashes = [int(np.count_nonzero(np.diff((stamps_ns - c) // period_ns) < 1)) for c in candidates[order]]
-    return int(candidates[order[int(np.argmin(clashes))]])
+    trials: list[int] = candidates[order].tolist()
+    return min(trials, key=lambda phase: _implausibility(stamps_ns, phase, period_ns))
+
+
+def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:
+    """Deadlines with two SYNCs; and the lateness, by its root: many in time and one late, not all a little late."""
+    numbers, lateness = np.divmod(stamps_ns - phase, period_ns)
+    return int(np.count_nonzero(np.diff(numbers) < 1)), float(np.sqrt(lateness).sum())

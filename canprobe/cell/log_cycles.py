@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -53,8 +54,9 @@ class LogCycles:
         plan: of the cell.
         recording: the log, in the order that ``as_taken`` wants.
         as_taken: see above.
-        on_deadlines: a measurement's time is its cycle's deadline, as a cell has it; False: the stamp of its SYNC,
-            which is all there is to know of another master.
+        on_deadlines: a measurement's time is its cycle's deadline, as a cell has it. False, for another master, of
+            whom neither deadlines nor looks are known: it is the stamp of its SYNC, and what came before the next SYNC
+            belongs to it.
         drifts: the stamps are another clock's than the master's.
     """
 
@@ -74,7 +76,8 @@ class LogCycles:
         stamps = recording.sync_stamps
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
-        self._looks = _looks(recording, deadlines, plan.sync.period_ns)
+        looks = LOOKS if on_deadlines else (math.inf,)
+        self._looks = _looks(recording, deadlines, [share * plan.sync.period_ns for share in looks])
         axes = self.drives.axes if self.drives is not None else ()
         self._commands = {frame.cob_id: frame for frame in command_frames(axes)}
         self._targets: list[int | None] = [None] * len(axes)
@@ -149,12 +152,16 @@ class LogCycles:
         return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
 
 
-def _looks(recording: Recording, deadlines: NDArray[np.int64], period_ns: int) -> list[list[int]]:
+def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: list[float]) -> list[list[int]]:
     """Where each look of each cycle ends among the frames; a late SYNC's looks come at once."""
     stamps, syncs = recording.sync_stamps, recording.syncs
-    shares = np.array([int(period_ns * share) for share in LOOKS])
-    instants = np.maximum(deadlines[:, None] + shares, stamps[:, None])
-    ends = np.searchsorted(recording.times, instants, side="right")
     following = np.append(syncs[1:], len(recording.frames))
-    ends = np.clip(ends, syncs[:, None] + 1, following[:, None])
-    return [[int(end) for end in row] for row in ends]
+    ends = []
+    for delay in delays_ns:
+        if math.isinf(delay):
+            ends.append(following)
+        else:
+            instants = np.maximum(deadlines + int(delay), stamps)
+            ends.append(np.searchsorted(recording.times, instants, side="right"))
+    clipped = np.clip(np.stack(ends, axis=1), syncs[:, None] + 1, following[:, None])
+    return [[int(end) for end in row] for row in clipped]

@@ -1,4 +1,4 @@
-"""Recorded runs to replay: in lockstep, on a bus with delays under a cell that oversleeps, and by another controller."""
+"""Recorded runs to replay: in lockstep, on a bus with delays under a sleepy cell, and by another controller."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from canprobe.emulator.build import make_world
 from canprobe.scene_writer import dump_scene
 from canprobe.session import resolve_scene
 
-DURATION_S = 1.2
+DURATION_S = 1.1
 
 
 def short_scan(**task):

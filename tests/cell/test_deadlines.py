@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.cell.deadlines import find_deadlines
@@ -24,6 +24,7 @@ def syncs_of(delays, start, period=PERIOD):
     return np.array(stamps), np.array(numbers)
 
 
+@settings(max_examples=50)
 @given(
     seed=st.integers(0, 2**32 - 1),
     start=st.integers(0, 10**10),
