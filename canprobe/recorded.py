@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +16,7 @@ from canprobe.cell.recording import Recording, read_recording
 from canprobe.cell.replay import GAP_S, TaskReplay, replay_contacts, replay_task
 from canprobe.cell.tasks.build import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.errors import UsageError
+from canprobe.errors import ProtocolError, UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.results import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene import Scene
@@ -80,14 +81,15 @@ def replay(
     methods = _methods(plan.scene, method)
     as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
     recording = read_recording(path, plan, as_taken=as_taken)
-    cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
-    task = replay_task(plan, cycles)
-    if task.drove and task.task.shape is not None:
-        tracker, unplaced, gap_s = task.task.shape, task.task.unplaced, np.inf
-    else:
-        cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
-        tracker, unplaced = replay_contacts(plan, cycles)
-        gap_s = GAP_S
+    try:
+        cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
+        task = replay_task(plan, cycles)
+        tracker, unplaced, gap_s = task.task.shape, task.task.unplaced, math.inf
+        if not task.drove or tracker is None:
+            cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
+            (tracker, unplaced), gap_s = replay_contacts(plan, cycles), GAP_S
+    except ProtocolError as error:
+        raise UsageError(f"{path}: on {recording.channel}: {error}") from error
     if not tracker.samples:
         raise UsageError(f"{path}: nothing was touched in this log: no contact to estimate from")
     estimates = estimates_of(plan.scene, tracker, methods, gap_s)
@@ -233,12 +235,11 @@ def _text(summary: dict[str, Any]) -> str:
     cycle, targets, online = summary["cycle"], summary["targets"], summary["online"]
     if summary["driven_by"] == "task":
         how = "the scene's task drove: its scan is replayed"
-        if targets["parted_s"] is not None:
-            how += f" up to {targets['parted_s']:.3f} s, where the recorded targets leave it"
-        elif targets["differing"]:
+        if targets["differing"]:
             how += f" ({targets['differing']} of {targets['compared']} targets differ)"
     elif targets["compared"]:
-        how = "another controller drove: every contact is fed to the estimators"
+        since = "" if targets["parted_s"] is None else f" (since {targets['parted_s']:.2f} s)"
+        how = f"another controller drove{since}: every contact is fed to the estimators"
     else:
         how = "no targets are in the log: every contact is fed to the estimators"
     lines = [

@@ -264,9 +264,8 @@ def curvature_text(values: Sequence[float | None] | None) -> str:
 def shape_lines(shape: dict[str, Any]) -> list[str]:
     """The section ``shape`` of a summary as lines for people."""
 
-    lines = [
-        f"  curvature  {curvature_text(shape['kappa_est_per_m'])} 1/m, true {curvature_text(shape['kappa_true_per_m'])} 1/m"
-    ]
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    lines = [f"  curvature  {estimated} 1/m, true {true} 1/m"]
     for name, score in shape.get("methods", {}).items():
         percent = score["kappa_rms_error_percent"]
         lines.append(

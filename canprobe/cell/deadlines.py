@@ -37,7 +37,7 @@ def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None)
         numbers[first : first + len(part)] = (part - phase) // period_ns
         deadlines[first : first + len(part)] = part - (part - phase) % period_ns
     place = np.arange(len(numbers))
-    numbers = np.maximum.accumulate(numbers - place) + place
+    numbers = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place  # of two at one deadline the first is late
     return np.asarray(numbers - numbers[:1], dtype=np.int64), deadlines
 
 
@@ -52,6 +52,12 @@ def _phase(stamps_ns: Numbers, period_ns: int) -> int:
 
 
 def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:
-    """Deadlines with two SYNCs; and the lateness, by its root: many in time and one late, not all a little late."""
+    """Contradictions of a phase; and the lateness, by its root: many in time and one late, not all a little late.
+
+    Two SYNCs at one deadline contradict it, and so does a first SYNC that is nearly a period late, unless it is: for
+    want of one before it nothing else tells an early one from a late one.
+    """
     numbers, lateness = np.divmod(stamps_ns - phase, period_ns)
-    return int(np.count_nonzero(np.diff(numbers) < 1)), float(np.sqrt(lateness).sum())
+    steps, waits = np.diff(numbers), np.diff(stamps_ns)
+    first = bool(len(steps)) and steps[0] > 1 and 2 * waits[0] < 3 * period_ns
+    return int(np.count_nonzero(steps < 1)) + int(first), float(np.sqrt(lateness).sum())

@@ -37,7 +37,7 @@ class TaskReplay:
         compared: cycles with recorded targets beside its own.
         differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
         median_counts, worst_counts: the usual and the largest difference.
-        parted_s: when the recorded targets left the task's and its replay ended (s); None where they did not.
+        parted_s: when the recorded targets had left the task's for good, which ended its replay (s); else None.
     """
 
     task: TouchTask
@@ -49,8 +49,9 @@ class TaskReplay:
 
     @property
     def drove(self) -> bool:
-        """The recorded targets are this task's own in most cycles, and it came as far as to a contact of its scan."""
-        return self.task.shape is not None and bool(self.task.shape.samples) and self.median_counts <= OWN_COUNTS
+        """The recorded targets are this task's own, mostly and to the end, and it came to a contact of its scan."""
+        came_to_scan = self.task.shape is not None and bool(self.task.shape.samples)
+        return came_to_scan and self.parted_s is None and self.median_counts <= OWN_COUNTS
 
 
 def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:

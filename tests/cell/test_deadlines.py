@@ -53,6 +53,12 @@ def test_another_loggers_clock_may_drift(ppm):
     np.testing.assert_array_equal(found, numbers)
 
 
+def test_a_first_sync_that_is_earlier_than_all_others_is_no_late_one():
+    stamps = PERIOD * np.arange(3000) + np.random.default_rng(1).integers(60_000, 200_000, 3000)
+    stamps[0] = 5_000
+    np.testing.assert_array_equal(find_deadlines(stamps, PERIOD)[0], np.arange(3000))
+
+
 def test_a_period_that_is_no_whole_number_of_microseconds():
     period = 3_333_333
     stamps, numbers = syncs_of([0] * 3000, 305_001_234, period)

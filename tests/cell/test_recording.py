@@ -44,8 +44,12 @@ def test_pdos_of_another_mapping_are_told(lockstep_run, copy_of):
         (lambda lines: [], "no frame at all; node 1 "),
         (lambda lines: [restamped(x, 2 * stamp_us(x)) for x in lines], "a SYNC every 5.000 ms, but .* every 2.500 ms"),
         (lambda lines: lines[: len(lines) // 4], "nothing was touched"),
+        (
+            lambda lines: [x.replace("183#37", "183#FF") for x in lines],
+            r"bus\.log: on can0: statusword 0x..ff is no CiA 402 state",
+        ),
     ],
-    ids=["no sync", "torn line", "empty", "other rate", "no contact"],
+    ids=["no sync", "torn line", "empty", "other rate", "no contact", "no state"],
 )
 def test_a_log_that_cannot_be_replayed(lockstep_run, copy_of, change, message):
     with pytest.raises(UsageError, match=message):
