@@ -16,7 +16,7 @@ def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None)
     deadlines is the one that obeys this with the least lateness; stamps may be a microsecond early.
 
     Args:
-        stamps_ns: when each SYNC went out (n,), ns, increasing.
+        stamps_ns: when each SYNC went out (n,), ns, increasing, in whole microseconds as candump has them.
         period_ns: of the cycle.
         block: SYNCs after which the phase is looked for again, where the stamps are another clock's than the
             producer's and drift against it; None where they are the same clock's.
