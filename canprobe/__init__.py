@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from canprobe.api import RunResult, open_cell, run
     from canprobe.planning import make_plan as plan
+    from canprobe.recorded import ReplayResult, replay
     from canprobe.scene_loader import load_scene
     from canprobe.surface_file import load_surface_map
     from canprobe.touch.bound import cramer_rao
@@ -27,6 +28,8 @@ _EXPORTS = {
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
     "open_cell": ("canprobe.api", "open_cell"),
+    "replay": ("canprobe.recorded", "replay"),
+    "ReplayResult": ("canprobe.recorded", "ReplayResult"),
     "RunResult": ("canprobe.api", "RunResult"),
     "SurfaceMatrix": ("canprobe.touch.surface", "SurfaceMatrix"),
     "SurfaceMap": ("canprobe.touch.surface_map", "SurfaceMap"),
@@ -36,6 +39,7 @@ _EXPORTS = {
 }
 
 __all__ = [
+    "ReplayResult",
     "RunResult",
     "SurfaceEstimate",
     "SurfaceMap",
@@ -47,6 +51,7 @@ __all__ = [
     "load_surface_map",
     "open_cell",
     "plan",
+    "replay",
     "run",
 ]
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
-from canprobe.cell.tasks.shape import ShapeRecord, replay_samples
+from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.rehearsal import rehearse
 from canprobe.results import RunResult, summarise, write_files
@@ -118,14 +118,9 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
         return {}
-    from canprobe.cell.tasks.build import make_shape_estimator
+    from canprobe.cell.tasks.build import estimates_of
 
-    every = max(1, round(0.1 * scene.sensor.rate_hz)) if scene.sensor is not None else 1
-    estimates: dict[str, list[ShapeRecord]] = {scene.shape.method: tracker.records}
-    for method in scene.shape.also:
-        if method != scene.shape.method:
-            estimates[method] = replay_samples(make_shape_estimator(scene, method), tracker.samples, every)
-    return estimates
+    return estimates_of(scene, tracker, (scene.shape.method, *scene.shape.also))
 
 
 def _surface_map(scene: Scene, controller: object) -> SurfaceMap | None:

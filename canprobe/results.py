@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from canprobe.cell.cell import Cell
 from canprobe.cell.mapping import summarise_map
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.planning import Plan
+from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
@@ -78,7 +79,9 @@ def summarise(
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
-        "shape": _shape(session, controller, estimates, log, surface_map),
+        "shape": summarise_shape(
+            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], surface_map=surface_map
+        ),
         "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
@@ -109,20 +112,25 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
 
 
-def score_all(
-    session: Session, estimates: dict[str, list[ShapeRecord]], log: dict[str, Array]
-) -> dict[str, ShapeScore]:
-    """Score of every estimator against the truth, by name."""
-    return {name: score_shape(records, session.truth, log["t_s"]) for name, records in estimates.items()}
-
-
-def _shape(
-    session: Session,
-    controller: object,
+def summarise_shape(
+    scene: Scene,
+    tracker: ShapeTracker | None,
     estimates: dict[str, list[ShapeRecord]],
-    log: dict[str, Array],
-    surface_map: SurfaceMap | None,
+    truth: Mapping[str, Array],
+    sync_times: Array,
+    *,
+    surface_map: SurfaceMap | None = None,
 ) -> dict[str, Any]:
+    """The section ``shape`` of ``summary.json``; the first of the estimates is the one that is summed up.
+
+    Args:
+        scene: of the run.
+        tracker: its contacts; None without a shape.
+        estimates: what each estimator said, by name.
+        truth: columns of the plant's truth, one row a SYNC; empty where there is none.
+        sync_times: time of each SYNC on the master's clock (n,), s.
+        surface_map: of the scan, to be summed up.
+    """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
         *("normal_rms_deg", "position_rms_mm", "observed", "cramer_rao_ratio"),
@@ -137,10 +145,10 @@ def _shape(
         shape["map"] = summarise_map(surface_map)
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
-        shape["kappa_est_per_m"] = _numbers(records[-1].estimate.kappa)
-    if not session.truth:
+        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
+    if not truth:
         return shape
-    scores = score_all(session, estimates, log)
+    scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
     score = scores[method]
     shape |= {
         "kappa_true_per_m": score.kappa_true,
@@ -149,7 +157,7 @@ def _shape(
         "kappa_rms_error_percent": score.kappa_rms_percent,
         "normal_rms_deg": score.normal_rms_deg,
         "position_rms_mm": score.position_rms_mm,
-        "cramer_rao_ratio": _bound_ratio(session, controller, score, log),
+        "cramer_rao_ratio": _bound_ratio(scene, tracker, score, truth, sync_times),
         "methods": {
             name: {
                 "kappa_rms_error_per_m": s.kappa_rms,
@@ -165,17 +173,19 @@ def _shape(
     return shape
 
 
-def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: dict[str, Array]) -> float | None:
+def _bound_ratio(
+    scene: Scene, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise."""
     from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
 
-    tracker, shape = getattr(controller, "shape", None), session.scene.shape
+    shape = scene.shape
     if tracker is None or shape is None or score.kappa_rms is None:
         return None
     bound = bound_of_scan(
         tracker.samples,
-        session.truth,
-        log["t_s"],
+        truth,
+        sync_times,
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
@@ -183,7 +193,7 @@ def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: d
     return None if bound is None else score.kappa_rms / bound
 
 
-def _numbers(values: Sequence[float] | Array) -> list[float | None]:
+def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
     """Floats for JSON: what is not finite was not observed, and is None."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
@@ -256,17 +266,22 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
     if shape["method"] is not None:
-        lines += _shape_lines(shape)
+        lines += shape_lines(shape)
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
 
 
-def _shape_lines(shape: dict[str, Any]) -> list[str]:
-    def pair(values: Sequence[float | None] | None) -> str:
-        return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
+def curvature_text(values: Sequence[float | None] | None) -> str:
+    """Principal curvatures as people read them."""
+    return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
 
-    lines = [f"  curvature  {pair(shape['kappa_est_per_m'])} 1/m, true {pair(shape['kappa_true_per_m'])} 1/m"]
+
+def shape_lines(shape: dict[str, Any]) -> list[str]:
+    """The section ``shape`` of a summary as lines for people."""
+
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    lines = [f"  curvature  {estimated} 1/m, true {true} 1/m"]
     for name, score in shape.get("methods", {}).items():
         percent = score["kappa_rms_error_percent"]
         lines.append(

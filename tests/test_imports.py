@@ -37,14 +37,8 @@ ALLOWED = {
     "bridge": EDGE | {"cell", "emulator", "plant", "api", "studies"},
     "package": {*EDGE, "api", "cli"},
 }
-COMPOSITION = {
-    "api",
-    "results",
-    "session",
-    "child",
-    "rehearsal",
-    "surface_file",
-}  # top-level modules that join cell and emulator
+# top-level modules that join cell and emulator
+COMPOSITION = {"api", "results", "session", "child", "rehearsal", "recorded", "recorded_summary", "surface_file"}
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
 NEVER_IN_PURE = EDGE_ONLY | {

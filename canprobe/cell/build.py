@@ -44,8 +44,8 @@ def make_cell(
         port,
         make_setups(plan),
         settings,
-        drives=_drives(plan),
-        tactile=_tactile(plan),
+        drives=make_drives(plan),
+        tactile=make_tactile(plan),
         heartbeat_timeout_ns=HEARTBEAT_CONSUMED_MS * 1_000_000,
         missed_limit=arm.missed_syncs if (arm := plan.scene.arm) is not None else 0,
         say=say,
@@ -53,7 +53,8 @@ def make_cell(
     )
 
 
-def _drives(plan: Plan) -> DriveGroup | None:
+def make_drives(plan: Plan) -> DriveGroup | None:
+    """The plan's drives as one; None without an arm."""
     arm = plan.scene.arm
     if arm is None:
         return None
@@ -65,14 +66,15 @@ def _drives(plan: Plan) -> DriveGroup | None:
     return DriveGroup(axes, MODELS[arm.model], repeat)
 
 
-def _tactile(plan: Plan) -> TactileReceiver | None:
+def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceiver | None:
+    """The receiver of the plan's sensor, None without one; ``sync_overflow`` where it is not the plan's."""
     sensor = plan.scene.sensor
     if sensor is None:
         return None
     cob_ids = [pdo.cob_id for pdo in plan.pdos_of(sensor.node_id, "tpdo")]
     deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
     assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline)
-    return TactileReceiver(assembler, cob_ids, plan.sync.overflow)
+    return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
 
 
 def tactile_timeout(scene: Scene) -> int:

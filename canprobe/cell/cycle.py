@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from canprobe.bus.clock import elapsed_ns
 from canprobe.bus.port import Port, TimedFrame
 from canprobe.cell.drives import DriveGroup
+from canprobe.cell.intake import Intake
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
-from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState, pack_heartbeat
 from canprobe.protocol.sync import SyncCounter, pack_sync
 
@@ -82,16 +81,13 @@ class Cycle:
         self._port = port
         self._s = settings
         self._drives = drives
-        self._tactile = tactile
+        self._intake = Intake(drives, tactile, settings.sync_overflow)
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)
         self._deadline = self.t_first_ns
         self._looks = tuple(int(settings.period_ns * share) for share in LOOKS)
-        self._feedback = drives.feedback_ids if drives is not None else frozenset()
-        self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
         self._started_ns = 0
-        self._sync_times: deque[int] = deque(maxlen=settings.sync_overflow)
 
     def begin(self) -> Measurement:
         """Sleep to the deadline, send SYNC, collect the answers."""
@@ -105,12 +101,10 @@ class Cycle:
         self._count_lateness()
         self.number += 1
         self.t_ns = self._deadline - self.t_first_ns
-        self._sync_times.append(self.t_ns)
-        if self._drives is not None:
-            self._drives.begin(self.number, self.sync_ns)
+        self._intake.begin(self.number, self.t_ns, self.sync_ns)
         self._collect()
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
-        return self._measure(counter or 0)
+        return self._intake.measure(counter or 0)
 
     def _count_lateness(self) -> None:
         error = self.sync_ns - self._deadline
@@ -120,47 +114,19 @@ class Cycle:
             self._deadline += error // self._s.period_ns * self._s.period_ns
 
     def _collect(self) -> None:
-        port, clock, drives = self._port, self._port.clock, self._drives
+        port, clock, intake = self._port, self._port.clock, self._intake
         for look_ns in self._looks:
             clock.sleep_until_ns(self._deadline + look_ns)
             self._route(port.drain())
-            if drives is None or drives.complete:
+            if intake.complete:
                 break
-        if drives is None:
-            return
-        drives.end_collect()
+        intake.end()
 
     def _route(self, frames: list[TimedFrame]) -> None:
-        rest: list[TimedFrame] = []
-        for frame in frames:
-            can_id, data, t_ns = frame
-            if can_id in self._feedback:
-                self._drives.push(can_id, data, t_ns)  # type: ignore[union-attr]
-            elif can_id in self._taxels:
-                self._tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
-            elif not self._watch.push(can_id, data, t_ns):
-                rest.append(frame)
+        watch = self._watch
+        rest = [frame for frame in self._intake.route(frames) if not watch.push(*frame)]
         if rest:
             self._other(rest)
-
-    def _measure(self, counter: int) -> Measurement:
-        drives, tactile = self._drives, self._tactile
-        sample = tactile.take(self.number, counter, self._sync_times) if tactile is not None else None
-        newest = tactile.newest_cycle if tactile is not None else None
-        age = self.number - newest if newest is not None else None
-        if drives is None:
-            return Measurement(self.number, self.t_ns, enabled=True, tactile=sample, tactile_age=age)
-        return Measurement(
-            cycle=self.number,
-            t_ns=self.t_ns,
-            q=drives.joints() if drives.heard_all else None,
-            q_age=drives.ages(),
-            torque_permille=tuple(drives.torque_permille),
-            statuswords=tuple(drives.statuswords),
-            enabled=drives.all_in(DriveState.OPERATION_ENABLED),
-            tactile=sample,
-            tactile_age=age,
-        )
 
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""

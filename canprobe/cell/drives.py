@@ -38,22 +38,29 @@ class DriveAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class _CommandFrame:
-    """One RPDO frame: who has a part in it, and whether it goes in every cycle or on change."""
+class CommandFrame:
+    """One RPDO frame.
+
+    Attributes:
+        cob_id: of the frame.
+        every_cycle: it goes in every cycle; False: on change.
+        parts: who has a part in it: axis, layout, and which of (controlword, target position) each of its values is.
+    """
 
     cob_id: int
     every_cycle: bool
-    parts: tuple[tuple[int, PdoLayout, tuple[int, ...]], ...]  # axis, layout, positions of its values in (word, target)
+    parts: tuple[tuple[int, PdoLayout, tuple[int, ...]], ...]
 
 
-def _command_frames(axes: tuple[DriveAxis, ...]) -> tuple[_CommandFrame, ...]:
+def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
+    """The RPDO frames that the drives take between them, by COB-ID."""
     parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
     for i, axis in enumerate(axes):
         for layout in axis.commands:
             picks = tuple(_COMMAND_OBJECTS.index(entry.index) for entry in layout.entries if not entry.is_dummy)
             parts.setdefault(layout.cob_id, []).append((i, layout, picks))
     return tuple(
-        _CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
+        CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
         for cob_id, group in sorted(parts.items())
     )
 
@@ -81,7 +88,7 @@ class DriveGroup:
         self._targets: list[int] | None = None
         self._words = [0] * len(axes)
         self._steady: tuple[object, ...] | None = None
-        self._frames = _command_frames(axes)
+        self._frames = command_frames(axes)
         self._sent: dict[int, tuple[bytes, int]] = {}
         self._repeat = repeat_cycles
         self._pending = 0

@@ -31,18 +31,22 @@ class TactileReceiver:
         if frame is not None:
             self._complete = frame
 
-    def take(self, cycle: int, sync_counter: int, sync_times: Sequence[int]) -> TactileSample | None:
+    def take(
+        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
+    ) -> TactileSample | None:
         """The frame that becomes usable in ``cycle``, or None.
 
         Args:
             cycle: the present cycle; its SYNC has not been answered by this frame.
-            sync_counter: counter of the present cycle's SYNC.
+            sync_counter: counter of the present cycle's SYNC; 0 where it has none.
             sync_times: times of the last SYNCs (ns), the present one last.
+            sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
+                SYNC before its header.
         """
         frame, self._complete = self._complete, None
         if frame is None:
             return None
-        cycles_ago = (sync_counter - frame.header.sync_counter) % self._overflow
+        cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
         if cycles_ago == 0:
             self._complete = frame
             return None
@@ -53,3 +57,8 @@ class TactileReceiver:
         self.newest_cycle = trigger
         t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
         return TactileSample(frame, t_sample, trigger)
+
+    def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
+        if sync_counter and frame.header.sync_counter:
+            return (sync_counter - frame.header.sync_counter) % self._overflow
+        return next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= frame.t_ns), len(sync_stamps))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from canprobe.cell.tasks.calibration import array_calibration
 from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchSettings, TouchTask
 from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
@@ -30,23 +31,27 @@ CYCLES_TO_EFFECT = 2
 def make_touch_task(plan: Plan, period_s: float, tactile_timeout: int) -> TouchTask:
     """The task of a ``scan`` or ``press`` scene."""
     scene = plan.scene
-    assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
-    model = MODELS[scene.arm.model]
-    flange_probe = T_flange_probe(scene.probe)
-    sensing = ContactSensing(
-        model,
-        flange_probe,
-        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
-        scene.probe.radius_mm * 1e-3,
-        scene.probe.stiffness_n_m3,
-    )
+    sensing = make_sensing(scene)
+    model, flange_probe = sensing.model, sensing.flange_probe
     margin = math.radians(scene.limits.joint_margin_deg)
     return TouchTask(
         _settings(scene, period_s, tactile_timeout),
         sensing,
         lambda q: ProbeMotion(model, flange_probe, q, period_s, margin),
         _strategy(scene.task),
-        _shape(scene),
+        make_shape_tracker(scene),
+    )
+
+
+def make_sensing(scene: Scene) -> ContactSensing:
+    """Contacts from measurements, as the scene's arm, probe and sensor give them."""
+    assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
+    return ContactSensing(
+        MODELS[scene.arm.model],
+        T_flange_probe(scene.probe),
+        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
+        scene.probe.radius_mm * 1e-3,
+        scene.probe.stiffness_n_m3,
     )
 
 
@@ -100,7 +105,22 @@ def samples_between_estimates(scene: Scene) -> int:
     return max(1, round(scene.shape.every_ms * 1e-3 * scene.sensor.rate_hz))
 
 
-def _shape(scene: Scene) -> ShapeTracker | None:
+def make_shape_tracker(scene: Scene, gap_s: float = math.inf) -> ShapeTracker | None:
+    """The estimator of a scene that asks for a shape, None of one that does not."""
     if scene.shape is None or scene.task.kind != "scan":
         return None
-    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene))
+    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene), gap_s)
+
+
+def estimates_of(
+    scene: Scene, tracker: ShapeTracker, methods: Iterable[str], gap_s: float = math.inf
+) -> dict[str, list[ShapeRecord]]:
+    """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
+    assert scene.shape is not None and scene.sensor is not None
+    every = max(1, round(0.1 * scene.sensor.rate_hz))
+    return {
+        method: tracker.records
+        if method == scene.shape.method
+        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every, gap_s)
+        for method in dict.fromkeys(methods)
+    }

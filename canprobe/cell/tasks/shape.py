@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from canprobe.touch.contact import ContactSample
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.estimators import Estimator
-
-Vector = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,21 +36,27 @@ class ShapeTracker:
     Args:
         estimator: the online estimator.
         every: samples between two answers.
+        gap_s: time without a contact after which the estimator starts afresh; by default it never does, as a loop
+            that loses contact is at its end.
     """
 
-    def __init__(self, estimator: Estimator, every: int) -> None:
+    def __init__(self, estimator: Estimator, every: int, gap_s: float = math.inf) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
         self._estimator = estimator
         self._every = max(1, every)
-        self._last: Vector | None = None
+        self._gap_s = gap_s
+        self._last: ContactSample | None = None
 
     def add(self, sample: ContactSample) -> SurfaceEstimate | None:
         """Take one contact; the new estimate where one was due and can be given."""
         if self._last is not None:
-            self.travelled_m += float(np.linalg.norm(sample.p_base - self._last))
-        self._last = sample.p_base
+            if sample.t_s - self._last.t_s > self._gap_s:
+                self._estimator.reset()
+            else:
+                self.travelled_m += float(np.linalg.norm(sample.p_base - self._last.p_base))
+        self._last = sample
         self.samples.append(sample)
         self._estimator.add(sample)
         if len(self.samples) % self._every:
@@ -63,9 +67,11 @@ class ShapeTracker:
         return estimate
 
 
-def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:
+def replay_samples(
+    estimator: Estimator, samples: Sequence[ContactSample], every: int, gap_s: float = math.inf
+) -> list[ShapeRecord]:
     """Feed recorded contacts to another estimator, as the loop would have."""
-    tracker = ShapeTracker(estimator, every)
+    tracker = ShapeTracker(estimator, every, gap_s)
     for sample in samples:
         tracker.add(sample)
     return tracker.records

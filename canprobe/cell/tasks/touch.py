@@ -22,6 +22,9 @@ Vector = NDArray[np.float64]
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
+TOUCH_FORCE = 0.15
+"""N; contact is made above it."""
+
 
 class Phase(IntEnum):
     """Phases of a touch task, in their order."""
@@ -67,7 +70,7 @@ class TouchSettings:
     rolling_share: float
     lead_s: float
     gains: SurfaceGains = field(default_factory=SurfaceGains)
-    touch_force: float = 0.15
+    touch_force: float = TOUCH_FORCE
     approach_speed: float = 4e-3
     retreat_speed: float = 20e-3
     clearance: float = 3e-3

@@ -1,0 +1,153 @@
+"""A recorded bus as the cell needs it: the frames of the planned nodes, in order, checked to be there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.candump import read_candump
+from canprobe.bus.port import ERR_FLAG, TimedFrame
+from canprobe.errors import UsageError
+from canprobe.planning.model import Plan
+from canprobe.protocol.frames import SYNC_ID
+
+RATE_TOLERANCE = 0.2
+"""Share by which the recorded SYNC period may differ from the scene's."""
+STAMP_JITTER_NS = 300_000
+"""Lines out of the order of their stamps by no more are in the order of the bus, and the stamps are wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """The frames of one channel that the cell takes or sends.
+
+    Attributes:
+        path: the log.
+        channel: the one of its channels on which the nodes are.
+        frames: SYNC, TPDOs and RPDOs of the planned nodes, (can_id, data, t_ns).
+        times: their stamps (n,), ns.
+        syncs: which of them are SYNCs.
+        other: frames of this channel that are none of these.
+        malformed: PDOs of a wrong length, left out.
+        error_frames: of all channels.
+    """
+
+    path: Path
+    channel: str
+    frames: list[TimedFrame]
+    times: NDArray[np.int64]
+    syncs: NDArray[np.int64]
+    other: int
+    malformed: int
+    error_frames: int
+
+    @property
+    def sync_stamps(self) -> NDArray[np.int64]:
+        """When each SYNC went out, ns."""
+        return self.times[self.syncs]
+
+    @property
+    def sync_overflow(self) -> int | None:
+        """At which the SYNC counter starts again; None where it did not twice, or there is no counter."""
+        counters = [data[0] for _, data, _ in map(self.frames.__getitem__, self.syncs) if data]
+        last = [a for a, b in pairwise(counters) if b < a]
+        return max(counters) if last and last.count(max(counters)) >= 2 else None
+
+
+@dataclass(slots=True)
+class _Channel:
+    """What was read of one channel so far."""
+
+    frames: list[TimedFrame] = field(default_factory=list)
+    heard: set[int] = field(default_factory=set)
+    answers: int = 0
+    other: int = 0
+    malformed: int = 0
+
+
+def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
+    """Read the frames of a plan's nodes from a candump log.
+
+    Args:
+        path: the log; it may hold other nodes, other channels and error frames.
+        plan: which identifiers and lengths to expect.
+        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order in which it
+            took the frames in. False puts them into the order of the bus.
+
+    Raises:
+        UsageError: no such file, a torn line, a node that was never heard, no SYNC, or SYNCs of another rate.
+    """
+    channels, error_frames = _read(path, plan)
+    name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
+    chosen = channels.get(name, _Channel())
+    _check_heard(path, plan, name, chosen)
+    frames = chosen.frames if as_taken else _in_bus_order(chosen.frames)
+    syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
+    times = np.array([frame[2] for frame in frames], np.int64)
+    recording = Recording(
+        path, name, frames, times, np.array(syncs, np.int64), chosen.other, chosen.malformed, error_frames
+    )
+    _check_syncs(recording, plan)
+    return recording
+
+
+def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
+    lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
+    answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
+    channels: dict[str, _Channel] = {}
+    error_frames = 0
+    for t_ns, name, can_id, data in read_candump(path):
+        channel = channels.get(name)
+        if channel is None:
+            channel = channels[name] = _Channel()
+        if can_id == SYNC_ID and len(data) <= 1:
+            channel.frames.append((can_id, data, t_ns))
+        elif (length := lengths.get(can_id)) is None:
+            channel.other += 1
+            error_frames += bool(can_id & ERR_FLAG)
+        elif len(data) != length:
+            channel.malformed += 1
+        else:
+            channel.frames.append((can_id, data, t_ns))
+            if can_id in answers:
+                channel.heard.add(can_id)
+                channel.answers += 1
+    return channels, error_frames
+
+
+def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
+    """Frames with stamps that never go back: a logger's small jitter is evened out, anything more is sorted."""
+    stamps = np.array([frame[2] for frame in frames], np.int64)
+    latest = np.maximum.accumulate(stamps)
+    if int((latest - stamps).max(initial=0)) > STAMP_JITTER_NS:
+        return sorted(frames, key=lambda frame: frame[2])
+    return [(can_id, data, t_ns) for (can_id, data, _), t_ns in zip(frames, latest.tolist(), strict=True)]
+
+
+def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:
+    silent = []
+    for node in plan.nodes:
+        missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if pdo.cob_id not in channel.heard]
+        if missing:
+            ids = ", ".join(f"{pdo.cob_id:03X}h" for pdo in missing)
+            silent.append(f"node {node.node_id} ({node.role}) was never heard: no TPDO {ids}")
+    if silent:
+        where = f"{path}: on {name}" if name else f"{path}: no frame at all;"
+        wrong = f" ({channel.malformed} PDOs of a wrong length)" if channel.malformed else ""
+        raise UsageError("\n".join(f"{where} {line}{wrong}" for line in silent))
+
+
+def _check_syncs(recording: Recording, plan: Plan) -> None:
+    where = f"{recording.path}: on {recording.channel}"
+    if len(recording.syncs) < 2:
+        raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h); a replay goes from SYNC to SYNC")
+    period = float(np.median(np.diff(recording.sync_stamps)))
+    if abs(period - plan.sync.period_ns) > RATE_TOLERANCE * plan.sync.period_ns:
+        raise UsageError(
+            f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.scene.name} has one every"
+            f" {plan.sync.period_ns * 1e-6:.3f} ms; set cycle.rate_hz"
+        )

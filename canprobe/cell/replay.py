@@ -1,0 +1,117 @@
+"""A recorded log → the contacts and estimates of the run: by the scene's own task, or from the contacts alone."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from canprobe.cell.build import make_task
+from canprobe.cell.log_cycles import LogCycle
+from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
+from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.cell.tasks.touch import TOUCH_FORCE, TouchTask
+from canprobe.planning.model import Plan
+from canprobe.robot.puma260 import MODELS, joints_to_counts
+
+TARGET_TOLERANCE = 1
+"""Counts that a replayed target may differ from the recorded one by rounding."""
+OWN_COUNTS = 20
+"""Median difference up to which the task drove: 0.5 mm or 0.2 deg. One lost line is a few counts for a while."""
+PARTED_COUNTS = 100
+"""Difference at which the recorded targets are not the task's: 2 mm or 1 deg."""
+PARTED_S = 0.1
+"""Time at that difference after which they never will be again: what a lost line sets off, the servo has mended."""
+GAP_S = 0.1
+"""Time without contact after which an estimator starts afresh."""
+
+
+@dataclass(frozen=True, slots=True)
+class TaskReplay:
+    """What the scene's task did on the recorded measurements.
+
+    Attributes:
+        task: the task, at its end.
+        compared: cycles with recorded targets beside its own.
+        differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
+        median_counts, worst_counts: the usual and the largest difference.
+        parted_s: when the recorded targets had left the task's for good, which ended its replay (s); else None.
+    """
+
+    task: TouchTask
+    compared: int
+    differing: int
+    median_counts: float
+    worst_counts: int
+    parted_s: float | None
+
+    @property
+    def drove(self) -> bool:
+        """The recorded targets are this task's own, mostly and to the end, and it came to a contact of its scan."""
+        came_to_scan = self.task.shape is not None and bool(self.task.shape.samples)
+        return came_to_scan and self.parted_s is None and self.median_counts <= OWN_COUNTS
+
+
+def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
+    """The cycles in which a cell steps its controller: from the one after all drives are in operation enabled until
+    one leaves it, or the master asks for anything else."""
+    started = False
+    for cycle in cycles:
+        if not started:
+            started = cycle.measurement.q is not None and cycle.measurement.enabled
+        elif cycle.measurement.enabled and cycle.enabled_by_master:
+            yield cycle
+        else:
+            return
+
+
+def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
+    """Step the scene's task through recorded cycles and hold its targets against the recorded ones.
+
+    It ends early where the targets are clearly another controller's.
+    """
+    task = make_task(plan)
+    assert isinstance(task, TouchTask) and plan.scene.arm is not None
+    model = MODELS[plan.scene.arm.model]
+    patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
+    differences: list[int] = []
+    away = 0
+    for cycle in controller_cycles(cycles):
+        command = task.step(cycle.measurement)
+        if cycle.targets is not None and command.q_target is not None:
+            counts = np.round(joints_to_counts(model, command.q_target))
+            differences.append(int(np.abs(counts - cycle.targets).max()))
+            away = away + 1 if differences[-1] > PARTED_COUNTS else 0
+        if command.done or command.stop_reason is not None or away > patience:
+            break
+    return TaskReplay(
+        task,
+        compared=len(differences),
+        differing=sum(d > TARGET_TOLERANCE for d in differences),
+        median_counts=float(np.median(differences)) if differences else math.inf,
+        worst_counts=max(differences, default=0),
+        parted_s=cycle.measurement.t_ns * 1e-9 if away > patience else None,
+    )
+
+
+def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:
+    """Feed every contact of a log to the scene's estimator, whoever made it: force above the touch threshold.
+
+    Returns:
+        The tracker; and how many contacts could not be placed for want of the joints of their instant.
+    """
+    sensing = make_sensing(plan.scene)
+    tracker = make_shape_tracker(plan.scene, GAP_S)
+    assert tracker is not None
+    for cycle in cycles:
+        measurement = cycle.measurement
+        patch = sensing.step(measurement)
+        if patch is None or measurement.tactile is None or patch.force <= TOUCH_FORCE:
+            continue
+        contact = sensing.contact(measurement.tactile, patch)
+        estimate = tracker.add(contact) if contact is not None else None
+        if estimate is not None and bool(np.all(estimate.observed)):
+            sensing.set_kappa(np.asarray(estimate.kappa))
+    return tracker, sensing.dropped

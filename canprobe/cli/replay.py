@@ -1,0 +1,49 @@
+"""`canprobe replay`: estimate the shape again from a recorded bus."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import Commands, Parser, add_json
+
+_EXAMPLE = """\
+The log of a run gives its online result once more. In any other candump of the same nodes every contact is used.
+
+examples:
+  canprobe replay runs/cylinder-20260101-120000
+  canprobe replay runs/cylinder-20260101-120000 --method ml --method chen1996 --out estimates.npz
+  canprobe replay candump.log --scene cylinder --json
+"""
+
+
+def add_parser(commands: Commands[Parser]) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "replay", help="estimate the shape again from a recorded bus", description=__doc__, epilog=_EXAMPLE
+    )
+    parser.add_argument("log", metavar="LOG", type=Path, help="folder of a run, or a candump file")
+    parser.add_argument(
+        "--scene", metavar="SCENE", help="a packaged scene or the path of a TOML file [the scene.toml of the run]"
+    )
+    parser.add_argument(
+        "--method", metavar="M", action="append", help="estimator; may be repeated [those of the scene]"
+    )
+    parser.add_argument("--out", metavar="FILE", type=Path, help="write every estimate into this npz file")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Replay the log and print what the estimators say."""
+    from canprobe import recorded
+
+    result = recorded.replay(args.log, scene=args.scene, method=args.method)
+    if args.out is not None:
+        result.save(args.out)
+    if args.json:
+        print_json(result.summary)
+    else:
+        print(result.text())
+    return 0

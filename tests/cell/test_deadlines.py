@@ -1,0 +1,70 @@
+"""Deadlines behind SYNC stamps, against the rule by which the cycle sets them."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from canprobe.cell.deadlines import find_deadlines
+
+PERIOD = 2_500_000
+
+
+def syncs_of(delays, start, period=PERIOD):
+    """Stamps and deadline numbers of a cycle that is `delays[k]` ns late to wake up or at its work, cut to 1 µs."""
+    deadline, now, stamps, numbers = start, 0, [], []
+    for delay in delays:
+        now = max(now, deadline) + delay
+        stamps.append(now // 1000 * 1000)
+        error = now - deadline
+        if error > period // 2:
+            deadline += error // period * period
+        numbers.append((deadline - start) // period)
+        deadline += period
+    return np.array(stamps), np.array(numbers)
+
+
+@settings(max_examples=50)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    start=st.integers(0, 10**10),
+    worst=st.sampled_from([0.5, 0.95, 3.7]),
+    often=st.sampled_from([0.0, 0.02, 0.1]),
+)
+def test_late_and_skipped_syncs_get_their_deadlines_back(seed, start, worst, often):
+    rng = np.random.default_rng(seed)
+    delays = rng.gamma(2.0, 30e3, 400) + (rng.random(400) < often) * rng.uniform(0, worst * PERIOD, 400)
+    delays[rng.integers(1, 400, 20)] = 0.0  # now and then it wakes up in time, as every clock of ours does
+    stamps, numbers = syncs_of(delays.astype(int).tolist(), start)
+    found, deadlines = find_deadlines(stamps, PERIOD)
+    np.testing.assert_array_equal(found - found[-1], numbers - numbers[-1])
+    lateness = stamps - deadlines
+    assert np.all((lateness >= 0) & (lateness < PERIOD))
+
+
+@pytest.mark.parametrize("ppm", [-150, 0, 150])
+def test_another_loggers_clock_may_drift(ppm):
+    rng = np.random.default_rng(7)
+    n = 24_000  # a minute: 150 ppm are 9 ms, more than three periods
+    delays = np.where(rng.random(n) < 0.01, 0.9 * PERIOD, rng.uniform(0, 1e5, n)).astype(int)
+    stamps, numbers = syncs_of(delays.tolist(), 5_000_000_000)
+    drifted = 1_700_000_000_000_000_000 + stamps + (stamps * ppm) // 1_000_000
+    found, _ = find_deadlines(drifted, PERIOD, block=400)
+    np.testing.assert_array_equal(found, numbers)
+
+
+def test_a_first_sync_that_is_earlier_than_all_others_is_no_late_one():
+    stamps = PERIOD * np.arange(3000) + 1000 * np.random.default_rng(1).integers(60, 200, 3000)
+    stamps[0] = 5_000
+    np.testing.assert_array_equal(find_deadlines(stamps, PERIOD)[0], np.arange(3000))
+
+
+def test_a_period_that_is_no_whole_number_of_microseconds():
+    period = 3_333_333
+    stamps, numbers = syncs_of([0] * 3000, 305_001_234, period)
+    np.testing.assert_array_equal(find_deadlines(stamps, period)[0], numbers)
+
+
+def test_one_sync_and_none():
+    assert find_deadlines(np.array([7]), PERIOD)[0].tolist() == [0]
+    assert find_deadlines(np.array([], dtype=np.int64), PERIOD)[0].tolist() == []

@@ -1,0 +1,215 @@
+"""Replay: a recorded log gives the online result again, and any log of the same nodes gives a shape."""
+
+from __future__ import annotations
+
+import json
+import random
+import re
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cli import main
+
+DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
+TRUE_KAPPA = np.array([1 / 0.036, 0.0])
+
+
+def can_id_of(line):
+    return line.split()[2].split("#")[0]
+
+
+def stamp_us(line):
+    seconds, us = line[1 : line.index(")")].split(".")
+    return int(seconds) * 1_000_000 + int(us)
+
+
+def restamped(line, us):
+    return f"({us // 1_000_000:010d}.{us % 1_000_000:06d}){line[line.index(')') + 1 :]}"
+
+
+def assert_same(records, online):
+    """Number by number, to the last bit."""
+    assert len(records) == len(online) >= 20
+    for a, b in zip(records, online, strict=True):
+        assert (a.t_s, a.travelled_m) == (b.t_s, b.travelled_m)
+        np.testing.assert_array_equal(a.estimate.K, b.estimate.K)
+        np.testing.assert_array_equal(a.estimate.covariance, b.estimate.covariance)
+        np.testing.assert_array_equal(a.estimate.T_frame_contact, b.estimate.T_frame_contact)
+
+
+def settled(records):
+    """Times and curvature tensors in base (n, 3, 3) of the estimates after 10 mm."""
+    late = [r for r in records if r.travelled_m > 0.010]
+    return np.array([r.t_s for r in late]), np.array([r.estimate.curvature_tensor_base() for r in late])
+
+
+def largest_deviation(records, reference):
+    """Of the curvature, relative, at the reference's instants; the last may be before the replay's first or last."""
+    times, K = settled(records)
+    t_ref, K_ref = settled(reference)
+    nearest = np.abs(times[:, None] - t_ref).argmin(axis=0)
+    near = np.abs(times[nearest] - t_ref) < 0.021  # half of the time between two estimates
+    assert np.count_nonzero(~near) <= 1 and len(near) > 10
+    deviation = np.linalg.norm(K[nearest] - K_ref, axis=(1, 2)) / np.linalg.norm(K_ref, axis=(1, 2))
+    return float(deviation[near].max())
+
+
+def test_the_log_alone_gives_the_online_result_to_the_last_bit(lockstep_run):
+    result = canprobe.replay(lockstep_run.out)
+    assert result.summary["driven_by"] == "task"
+    assert result.summary["targets"]["worst_counts"] == 0
+    assert result.summary["targets"]["compared"] > 900
+    assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+    online = json.loads((lockstep_run.out / "summary.json").read_text())
+    assert json.loads(json.dumps(result.summary["shape"])) == online["shape"]
+    assert "the scene's task drove: its scan is replayed\n" in result.text()
+    assert result.summary["online"]["K_max_difference_per_m"] == 0.0
+    assert result.summary["online"]["replayed"] == 20
+
+
+def test_a_log_whose_lines_are_in_another_order_is_sorted_by_its_stamps(lockstep_run, copy_of):
+    def later(lines):
+        rng = random.Random(1)
+        shift = {stamp_us(line): rng.randrange(4000) for line in lines}
+        return sorted(lines, key=lambda line: stamp_us(line) + shift[stamp_us(line)])
+
+    result = canprobe.replay(copy_of(lockstep_run.out, later))
+    assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+
+
+def test_a_real_bus_with_overruns_is_replayed_to_the_last_bit(delayed_run):
+    folder, task, cell = delayed_run
+    assert cell.cycle.statistics.overruns > 3 and cell.drives.missed > 0 and cell.drives.late > 0
+    result = canprobe.replay(folder)
+    assert result.summary["targets"]["worst_counts"] == 0
+    assert_same(result.estimates["recursive"], task.shape.records)
+
+
+def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path):
+    """Its stamps are off by up to 100 µs, on a clock of its own; SYNCs are late, periods are skipped."""
+    folder, task, _ = delayed_run
+    rng = random.Random(2)
+    lines = []
+    for line in sorted((folder / "bus.log").read_text().splitlines(), key=stamp_us):
+        us, jitter = stamp_us(line), rng.randint(-100, 100)
+        lines.append(restamped(line, 1_763_000_000_000_000 + us + us * 60 // 1_000_000 + jitter))
+    log = tmp_path / "candump-2025-11-13.log"
+    log.write_text("\n".join(lines) + "\n")
+    result = canprobe.replay(log, scene=folder / "scene.toml")
+    assert result.summary["driven_by"] == "task"
+    assert largest_deviation(result.estimates["recursive"], task.shape.records) < 0.01
+    assert result.summary["shape"]["kappa_true_per_m"] is None
+
+
+def test_lost_lines_are_counted_and_cost_little(lockstep_run, copy_of):
+    lost = {"tpdo": 0, "taxels": 0}
+
+    def drop(lines):
+        rng = random.Random(3)
+        middle = len(lines) * 4 // 5
+        for i, line in enumerate(lines):
+            if can_id_of(line) in DRIVES and rng.random() < 0.005:
+                lost["tpdo"] += 1
+            elif can_id_of(line) == "514" and i > middle and not lost["taxels"]:
+                lost["taxels"] += 1
+            else:
+                yield line
+
+    result = canprobe.replay(copy_of(lockstep_run.out, drop))
+    cycle = result.summary["cycle"]
+    assert lost["tpdo"] > 10 and cycle["missed_pdos"] <= lost["tpdo"] < cycle["missed_pdos"] + 5  # a few at the end
+    assert cycle["torn_frames"] == cycle["lost_frames"] == lost["taxels"] == 1
+    assert result.summary["driven_by"] == "task" and result.summary["targets"]["differing"] > 0
+    assert largest_deviation(result.estimates["recursive"], lockstep_run.estimates["recursive"]) < 0.03
+
+
+def test_lost_syncs_are_known_from_the_counter(lockstep_run, copy_of):
+    lost = []
+
+    def drop(lines):
+        syncs = 0
+        for line in lines:
+            syncs += can_id_of(line) == "080"
+            if can_id_of(line) == "080" and syncs % 97 == 0:
+                lost.append(line)
+            else:
+                yield line
+
+    result = canprobe.replay(copy_of(lockstep_run.out, drop))
+    assert len(lost) - 1 <= result.summary["cycle"]["lost_syncs"] <= len(lost)
+    assert result.summary["shape"]["position_rms_mm"] < 0.15  # against the truth's row of the right SYNC
+    assert largest_deviation(result.estimates["recursive"], lockstep_run.estimates["recursive"]) < 0.02
+
+
+def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_run, copy_of):
+    def bare(lines):
+        return [re.sub(r" 080#..$", " 080#", line) for line in lines]
+
+    result = canprobe.replay(copy_of(lockstep_run.out, bare))
+    assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+
+
+def test_another_controllers_log(other_run, tmp_path):
+    """No counter, another channel beside it, error frames, remote requests, other nodes, another epoch and pace."""
+    lines = []
+    for recorded in (other_run / "bus.log").read_text().splitlines():
+        line = restamped(recorded, 1_700_000_000_123_456 + stamp_us(recorded) * 26 // 25).replace(
+            " can0 ", " can_left "
+        )
+        lines.append(re.sub(r" 080#..$", " 080#", line))
+        if can_id_of(line) == "080":
+            lines.append(restamped(f"() can_right {can_id_of(line)}#", stamp_us(line)))
+        if can_id_of(line) == "181" and len(lines) % 40 == 0:
+            lines += [restamped(f"() can_left {frame}", stamp_us(line)) for frame in ("20000004#00", "701#R", "3A0#01")]
+    log = tmp_path / "other.log"
+    log.write_text("\n".join(lines) + "\n")
+    result = canprobe.replay(log, scene="cylinder", method=("recursive", "ml"))
+    summary = result.summary
+    assert (summary["driven_by"], summary["channel"]) == ("other", "can_left")
+    assert summary["cycle"]["error_frames"] > 10 and summary["cycle"]["torn_frames"] == 0
+    assert "another controller" in result.text()
+    for records in result.estimates.values():
+        np.testing.assert_allclose(records[-1].estimate.kappa, TRUE_KAPPA, atol=0.1 * TRUE_KAPPA[0])
+
+
+def test_no_targets_in_the_log_means_every_contact(lockstep_run, copy_of):
+    result = canprobe.replay(
+        copy_of(lockstep_run.out, lambda lines: [x for x in lines if not can_id_of(x).startswith("20")])
+    )
+    assert result.summary["driven_by"] == "other" and result.summary["targets"]["compared"] == 0
+    assert "no targets are in the log" in result.text()
+    assert result.tracker.samples[0].t_s < lockstep_run.estimates["recursive"][0].t_s - 0.4  # from the touch-down on
+    np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
+
+
+def test_a_run_of_another_length_parts_from_the_scenes_task(lockstep_run):
+    result = canprobe.replay(lockstep_run.out, scene="cylinder", method="recursive")  # which scans for 20 s
+    assert result.summary["driven_by"] == "other" and result.summary["online"] is None
+    assert result.summary["targets"]["parted_s"] == pytest.approx(lockstep_run.log["t_s"][-1], abs=0.3)
+    assert len(result.tracker.samples) > 200
+    np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
+
+
+def test_other_methods_get_the_same_contacts(lockstep_run, tmp_path):
+    result = canprobe.replay(lockstep_run.out, method=["chen1996", "chord", "ml"])
+    assert list(result.estimates) == ["chen1996", "chord", "ml"]
+    assert result.summary["shape"]["method"] == "chen1996"
+    assert set(result.summary["shape"]["methods"]) == {"chen1996", "chord", "ml"}
+    contacts = result.tracker.samples
+    for records in result.estimates.values():
+        assert records[-1].t_s <= contacts[-1].t_s
+        np.testing.assert_allclose(records[-1].estimate.kappa, TRUE_KAPPA, atol=0.2 * TRUE_KAPPA[0])
+    result.save(tmp_path / "estimates.npz")
+    with np.load(tmp_path / "estimates.npz") as saved:
+        np.testing.assert_array_equal(saved["ml_K_per_m"][-1], result.estimates["ml"][-1].estimate.K)
+        assert saved["chord_T_base_contact_m"].shape[1:] == (4, 4)
+
+
+def test_the_command(lockstep_run, tmp_path, capsys):
+    out = tmp_path / "estimates.npz"
+    assert main(["replay", str(lockstep_run.out), "--method", "recursive", "--json", "--out", str(out)]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["online"]["K_max_difference_per_m"] == 0.0
+    assert document["shape"]["method"] == "recursive" and out.is_file()
