@@ -19,7 +19,8 @@ import numpy as np
 
 from canprobe.touch._arrays import Array
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.frames import tangent_rotation, transported_rotation
+from canprobe.touch.frames import tangent_rotation
+from canprobe.touch.patch_image import Moments
 from canprobe.touch.patch_moments import MomentModel
 from canprobe.touch.rank import turned
 
@@ -27,8 +28,10 @@ LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
 MOST_FRAMES = 64
 """Frames that the running mean reaches back: 0.3 s at 200 Hz, 8 mm at 25 mm/s."""
-ROUNDS = 4
-"""Gauss–Newton steps: the third changes K by less than 1e-3 of itself."""
+MOST_ROUNDS = 6
+"""Gauss–Newton steps; from the last answer one or two do."""
+SETTLED, UNSETTLED = 0.002, 0.05
+"""Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
 _ROOT2 = math.sqrt(2.0)
 _TO_Q = np.array([1.0, _ROOT2, 1.0])
 
@@ -65,7 +68,8 @@ class PatchCurvature:
         """Forget all images: contact was lost."""
         self.frames = 0
         self.force = 0.0
-        self._R = np.eye(3)
+        self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+        self._last: tuple[float, float, float] | None = None
         self._xx = self._xy = self._yy = 0.0
 
     def add(self, sample: ContactSample) -> None:
@@ -73,26 +77,40 @@ class PatchCurvature:
         if sample.moments is None:
             self.refused += 1
             return
-        inward = -sample.n_base
-        self._R = transported_rotation(self._R, inward) if self.frames else tangent_rotation(inward)
+        self._carry(*(-sample.n_base).tolist())
         self.frames = min(self.frames + 1, MOST_FRAMES)
         share = 1.0 / self.frames
-        c, s = self._pad_axis(sample)
-        xx, xy, yy = _turned(*sample.moments, c, s)
+        xx, xy, yy = _turned(*sample.moments, *self._pad_axis(sample))
         self._xx += share * (xx - self._xx)
         self._xy += share * (xy - self._xy)
         self._yy += share * (yy - self._yy)
         self.force += share * (sample.force_n - self.force)
+
+    def _carry(self, zx: float, zy: float, zz: float) -> None:
+        """Turn the axes the shortest way so that z is the inward normal."""
+        if not self.frames:
+            self._x, self._y, _ = tangent_rotation(np.array([zx, zy, zz])).T.tolist()
+            return
+        x, y, z = self._x
+        along = x * zx + y * zy + z * zz
+        x, y, z = x - along * zx, y - along * zy, z - along * zz
+        size = 1.0 / math.sqrt(x * x + y * y + z * z)
+        x, y, z = size * x, size * y, size * z
+        self._x, self._y = [x, y, z], [zy * z - zz * y, zz * x - zx * z, zx * y - zy * x]
 
     def _pad_axis(self, sample: ContactSample) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
         x, y, z = sample.r_probe.tolist()
         k = 1.0 / math.sqrt(x * x + y * y + z * z)
         x, y, z = k * x, k * y, k * z
-        # the pad's u axis, turned from the pole to the contact the shortest way
-        bend = x / (1.0 + z)
-        u = sample.T_base_probe[:3, :3] @ np.array([1.0 - bend * x, -bend * y, -x])
-        cx, cy, _ = (u @ self._R).tolist()
+        bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
+        ux, uy, uz = 1.0 - bend * x, -bend * y, -x
+        u = [a * ux + b * uy + c * uz for a, b, c, _ in sample.T_base_probe[:3].tolist()]
+        return self._in_axes(u)
+
+    def _in_axes(self, u: list[float]) -> tuple[float, float]:
+        """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
+        cx, cy = (a[0] * u[0] + a[1] * u[1] + a[2] * u[2] for a in (self._x, self._y))
         size = 1.0 / math.hypot(cx, cy)
         return cx * size, cy * size
 
@@ -110,31 +128,38 @@ class PatchCurvature:
         """
         if self.frames < LEAST_FRAMES:
             return None
-        x = self._R.T @ T_base_contact[:3, 0]
-        size = math.hypot(x[0], x[1])
-        xx, xy, yy = _turned(self._xx, self._xy, self._yy, x[0] / size, -x[1] / size)
+        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
+        xx, xy, yy = _turned(self._xx, self._xy, self._yy, c, -s)
         angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
-        principal = (mean + half, 0.0, mean - half)
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = None if motion is None else CurvatureInformation(turn @ motion.q, turn @ motion.information @ turn.T)
-        found = self._solve(principal, known)
+        found = self._solve((mean + half, 0.0, mean - half), known)
         return None if found is None else CurvatureInformation(turn.T @ found.q, turn.T @ found.information @ turn)
 
-    def _solve(self, v: tuple[float, float, float], motion: CurvatureInformation | None) -> CurvatureInformation | None:
-        start = self.model.start(v, self.force / self.model.fit.force_ratio)
+    def _solve(self, v: Moments, motion: CurvatureInformation | None) -> CurvatureInformation | None:
+        start = self._last if self._last is not None else self.model.start(v, self.force)
+        self._last = None
         if start is None:
             return None
-        q = np.array(start) * _TO_Q
+        k, step = start, math.inf
         try:
-            for _ in range(ROUNDS):
-                J, r = self.model.linearised(v, self.force, self.frames, _entries(q))
-                own = CurvatureInformation(q + np.linalg.solve(J, r), J.T @ J)
-                used = own if motion is None else own._replace(information=_better(own.information, motion.information))
-                q = own.q if motion is None else mean_of(motion, used)
+            for _ in range(MOST_ROUNDS):
+                J, r, W = self.model.linearised(v, self.force, self.frames, k)
+                used = CurvatureInformation(_TO_Q * k + np.linalg.solve(J, r), J.T @ W @ J)
+                if motion is not None:
+                    used = CurvatureInformation(used.q, _better(used.information, motion.information))
+                q = used.q if motion is None else mean_of(motion, used)
+                before, k = k, _entries(q)
+                step = max(abs(a - b) for a, b in zip(k, before, strict=True))
+                if step < SETTLED / self.model.radius:
+                    break
         except (ValueError, np.linalg.LinAlgError):
             return None
-        return used if self.model.covers(_entries(q), self.force / self.model.fit.force_ratio) else None
+        if step > UNSETTLED / self.model.radius or not self.model.covers(k, self.force):
+            return None
+        self._last = k
+        return used
 
 
 def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:
@@ -151,16 +176,14 @@ def _entries(q: Array) -> tuple[float, float, float]:
 def _better(own: Array, motion: Array) -> Array:
     """The part of a definite information (3, 3) about combinations that the motion knows less well."""
     L = np.linalg.cholesky(own)
-    half = np.linalg.solve(L, motion)
-    ratio, W = np.linalg.eigh(np.linalg.solve(L, half.T))
+    inverse = np.linalg.inv(L)
+    ratio, W = np.linalg.eigh(inverse @ motion @ inverse.T)
     kept = L @ W[:, ratio < 1.0]
     result: Array = kept @ kept.T
     return result
 
 
 def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
-    """(3,) the value nearest to both; combinations that neither knows stay at 0."""
-    result: Array = np.linalg.lstsq(
-        a.information + b.information, a.information @ a.q + b.information @ b.q, rcond=1e-12
-    )[0]
+    """(3,) the mean weighted with the information of both, which together must be definite."""
+    result: Array = np.linalg.solve(a.information + b.information, a.information @ a.q + b.information @ b.q)
     return result

@@ -107,9 +107,9 @@ class MomentModel:
         return alpha, c1 - c2 + (c4 - c7) * trace + c6 * t
 
     def covers(self, k: Moments, force: float) -> bool:
-        """Whether the calibration pressed such patches; outside it the model is no more than a guess."""
+        """Whether the calibration pressed such patches (measured force, N); outside the model is no more than a guess."""
         try:
-            (xx, xy, yy), t = self.ideal(k, force)
+            (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
         except ValueError:
             return False
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
@@ -117,7 +117,7 @@ class MomentModel:
         return m0 <= mean - half and mean + half <= m1 and t0 <= t <= t1
 
     def start(self, v: Moments, force: float) -> Moments | None:
-        """K (1/m) from moments (m²) and force by the ideal layer alone, to begin with; None where blur is all there is.
+        """K (1/m) from moments (m²) and measured force by the ideal layer alone, to begin with; None where blur is all there is.
 
         The moments must be given in their principal axes: the second is taken as 0.
         """
@@ -125,12 +125,13 @@ class MomentModel:
         x, y = ((m / self.pitch**2 - c0) / c1 * self.pitch**2 for m in (v[0], v[2]))
         if x <= 0.0 or y <= 0.0:
             return None
+        force = force / self.fit.force_ratio
         root_det = 2.0 * force / (36.0 * math.pi * self.stiffness * x * y)
         depth = math.sqrt(2.0 * force * root_det / (math.pi * self.stiffness))
         return 2.0 * depth / (6.0 * x) - 1.0 / self.radius, 0.0, 2.0 * depth / (6.0 * y) - 1.0 / self.radius
 
-    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Array, Array]:
-        """Whitened Jacobian (3, 3) on q = (K11, √2 K12, K22) and whitened residual (3,) at K.
+    def linearised(self, v: Moments, force: float, frames: float, k: Moments) -> tuple[Array, Array, Array]:
+        """Relative residual at K, its Jacobian, and the information of the residual.
 
         Args:
             v: measured moments (m²) in their principal axes, so that the second is 0.
@@ -138,31 +139,42 @@ class MomentModel:
             frames: how many were averaged.
             k: K11, K12, K22 in the same axes, 1/m.
 
+        Returns:
+            J (3, 3) on q = (K11, √2 K12, K22), m; residual (3,); its inverse covariance (3, 3).
+
         Raises:
             ValueError: where the surface is as hollow as the probe.
         """
-        true_force = force / self.fit.force_ratio
+        f, h = force / self.fit.force_ratio, _STEP / self.radius
         scale = (1.0 / v[0], 1.0 / math.sqrt(v[0] * v[2]), 1.0 / v[2])
+        here = self.moments(k, f)
 
-        def relative(k: Moments, f: float) -> Array:
-            return np.array([s * m for s, m in zip(scale, self.moments(k, f), strict=True)])
+        def slope(moved: Moments, step: float) -> list[float]:
+            return [s * (m - m0) / step for s, m, m0 in zip(scale, moved, here, strict=True)]
 
-        here, h = relative(k, true_force), _STEP / self.radius
-        J = np.empty((3, 3))
-        J[:, 0] = (relative((k[0] + h, k[1], k[2]), true_force) - here) / h
-        J[:, 1] = (relative((k[0], k[1] + h, k[2]), true_force) - here) / (h * _ROOT2)
-        J[:, 2] = (relative((k[0], k[1], k[2] + h), true_force) - here) / h
-        by_force = (relative(k, true_force * (1.0 + _STEP)) - here) / _STEP
-        residual = np.array([1.0, v[1] * scale[1], 1.0]) - here
-        L = np.linalg.cholesky(self._covariance(by_force, frames))
-        white = np.linalg.solve(L, np.column_stack([J, residual]))
-        return white[:, :3], white[:, 3]
+        k11, k12, k22 = k
+        J = np.array(
+            [
+                slope(self.moments((k11 + h, k12, k22), f), h),
+                slope(self.moments((k11, k12 + h, k22), f), _ROOT2 * h),
+                slope(self.moments((k11, k12, k22 + h), f), h),
+            ]
+        ).T
+        residual = np.array([s * (m - m0) for s, m, m0 in zip(scale, v, here, strict=True)])
+        by_force = slope(self.moments(k, f * (1.0 + _STEP)), _STEP)
+        return J, residual, np.linalg.inv(self._covariance(by_force, frames))
 
-    def _covariance(self, by_force: Array, frames: float) -> Array:
+    def _covariance(self, by_force: list[float], frames: float) -> Array:
         """(3, 3) of the relative residuals of V11, V12, V22: an error of the force moves the prediction with it."""
-        spread = np.zeros((3, 4))
-        spread[0, 0] = spread[2, 1] = spread[1, 2] = 1.0
-        spread[:, 3] = -by_force
+        floor = self.fit.floor
         noise = self.fit.frame_sigma**2 / max(frames, 1.0)
-        C: Array = spread @ np.array(self.fit.floor) @ spread.T + noise * np.eye(3)
-        return C
+        order = (0, 2, 1)
+        return np.array(
+            [
+                [
+                    floor[i][j] + noise * (i == j) - b * floor[j][3] - a * floor[i][3] + a * b * floor[3][3]
+                    for j, a in zip(order, by_force, strict=True)
+                ]
+                for i, b in zip(order, by_force, strict=True)
+            ]
+        )
