@@ -1,7 +1,8 @@
 """Calibrate the second moments of the array's images: press known curvatures, roll or stand, fit eight numbers.
 
 Every press has an array of its own (gains), principal curvatures, a direction on the pad, a force and a place by
-chance; half of them stand still, half roll slowly over the pad. The fit is of the form that
+chance, and lasts some seconds under a force that is a little restless; half of them stand still, half roll slowly over
+the pad. The fit is of the form that
 `canprobe.touch.patch_moments` states; its floor is what remains of single presses, so it holds gains, hysteresis,
 creep and the form of the model, and shrinks with no averaging.
 """
@@ -30,8 +31,10 @@ OFFSET_M = 2e-3
 ROLL_M = 1.5e-3
 ROLL_HZ = (0.35, 1.0)
 LOADING_S = 0.5
-PRESS_S = 3.5
+PRESS_S = (2.5, 12.0)
 AVERAGE_S = 1.0
+UNREST, UNREST_S = 0.03, 0.1
+"""The force wanders under a servo: relative standard deviation, and correlation time."""
 FRAME_S = 0.04
 LONGEST = {True: 3.2, False: 5.0}
 """Largest ideal moment over the squared pitch that is used, with the 8×8 window and with the whole pad."""
@@ -73,7 +76,8 @@ def random_presses(n: int, seed: int, full_scale_pa: float, *, windowed: bool) -
         force, angle = float(rng.uniform(*FORCE_N)), float(rng.uniform(0.0, np.pi))
         axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         array = TaxelArray(TaxelConfig(full_scale_pa=full_scale_pa), rng)
-        images = list(_images(array, rng, kappa, force, axes, full_scale_pa, rolling=bool(i % 2), windowed=windowed))
+        pressed = list(_images(array, rng, kappa, force, axes, full_scale_pa, rolling=bool(i % 2), windowed=windowed))
+        images, forces = zip(*pressed, strict=True)
         patches = [compute_patch(image, calibration) for image in images]
         if any(p.saturated or p.cut_by_pad for p in patches):
             continue
@@ -81,7 +85,11 @@ def random_presses(n: int, seed: int, full_scale_pa: float, *, windowed: bool) -
         V = axes @ seen[:, [[0, 1], [1, 2]]] @ axes.T
         spread = np.diagonal(np.diff(V, axis=0), axis1=1, axis2=2) / np.diagonal(V.mean(axis=0))
         yield Press(
-            kappa, force, V.mean(axis=0), float(np.mean([p.force for p in patches])), float(spread.std() / np.sqrt(2))
+            kappa,
+            float(np.mean(forces)),
+            V.mean(axis=0),
+            float(np.mean([p.force for p in patches])),
+            float(spread.std() / np.sqrt(2.0)),
         )
 
 
@@ -95,27 +103,30 @@ def _images(  # noqa: PLR0917
     *,
     rolling: bool,
     windowed: bool,
-) -> Iterator[Image]:
-    """Images of the last second of one press."""
+) -> Iterator[tuple[Image, float]]:
+    """Images of the last second of one press, each with the force (N)."""
     calibration = array_calibration(full_scale_pa)
     k = (float(kappa[0]), float(kappa[1]))
     depth = depth_for_force(force, k, calibration.radius_m, 1.27e8)
     place, heading = rng.uniform(-OFFSET_M, OFFSET_M, 2), float(rng.uniform(0.0, 2.0 * np.pi))
     hz, roll, origin = float(rng.choice(ROLL_HZ)), ROLL_M if rolling else 0.0, (4, 4)
     c, s = np.cos(heading), np.sin(heading)
-    for t in np.arange(0.0, PRESS_S, FRAME_S).tolist():
+    duration, unrest, kept = float(rng.uniform(*PRESS_S)), 0.0, float(np.exp(-FRAME_S / UNREST_S))
+    for t in np.arange(0.0, duration, FRAME_S).tolist():
+        unrest = kept * unrest + UNREST * np.sqrt(1.0 - kept**2) * float(rng.standard_normal())
         phase = 2.0 * np.pi * hz * max(0.0, t - LOADING_S)
         x, y = roll * np.sin(phase), 0.4 * roll * np.sin(2.0 * phase)
         uv = (float(place[0] + c * x - s * y), float(place[1] + s * x + c * y))
-        image = array.image(uv, depth * min(1.0, t / LOADING_S), k, axes, t)
+        now = force * min(1.0, t / LOADING_S) * (1.0 + unrest)
+        image = array.image(uv, depth * float(np.sqrt(now / force)), k, axes, t)
         if windowed:
             origin = follow(image, origin)
             seen = np.zeros_like(image)
             part = np.s_[origin[0] : origin[0] + 8, origin[1] : origin[1] + 8]
             seen[part] = image[part]
             image = seen
-        if t >= PRESS_S - AVERAGE_S:
-            yield image
+        if t >= duration - AVERAGE_S:
+            yield image, now
 
 
 def sensor(full_scale_pa: float, fit: MomentFit = _FLAT) -> MomentModel:

@@ -37,7 +37,7 @@ class ContactSample:
         force_n: contact force, N.
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
-        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch_image`); None where there are none.
+        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch_image`); None for none.
     """
 
     t_s: float

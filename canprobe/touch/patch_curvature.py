@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, solved
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.frames import tangent_rotation
 from canprobe.touch.patch_image import Moments
@@ -146,7 +146,7 @@ class PatchCurvature:
         try:
             for _ in range(MOST_ROUNDS):
                 J, r, W = self.model.linearised(v, self.force, self.frames, k)
-                used = CurvatureInformation(_TO_Q * k + np.linalg.solve(J, r), J.T @ W @ J)
+                used = CurvatureInformation(_TO_Q * k + solved(J, r), J.T @ W @ J)
                 if motion is not None:
                     used = CurvatureInformation(used.q, _better(used.information, motion.information))
                 q = used.q if motion is None else mean_of(motion, used)
@@ -176,7 +176,7 @@ def _entries(q: Array) -> tuple[float, float, float]:
 def _better(own: Array, motion: Array) -> Array:
     """The part of a definite information (3, 3) about combinations that the motion knows less well."""
     L = np.linalg.cholesky(own)
-    inverse = np.linalg.inv(L)
+    inverse = solved(L, np.eye(3))
     ratio, W = np.linalg.eigh(inverse @ motion @ inverse.T)
     kept = L @ W[:, ratio < 1.0]
     result: Array = kept @ kept.T
@@ -185,5 +185,4 @@ def _better(own: Array, motion: Array) -> Array:
 
 def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
     """(3,) the mean weighted with the information of both, which together must be definite."""
-    result: Array = np.linalg.solve(a.information + b.information, a.information @ a.q + b.information @ b.q)
-    return result
+    return solved(a.information + b.information, a.information @ a.q + b.information @ b.q)

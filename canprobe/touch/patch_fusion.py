@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, solved
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.frames import homogeneous, tangent_rotation
@@ -90,7 +90,7 @@ def _known(motion: SurfaceEstimate, data: Array) -> CurvatureInformation:
     """Everything that the motion estimate says about q, its prior included."""
     q = 2.0 * _TO_Q * motion.S[[0, 0, 1], [0, 1, 1]]
     if np.isfinite(motion.covariance).all():
-        return CurvatureInformation(q, np.linalg.inv(motion.covariance * np.outer(_TO_Q, _TO_Q)))
+        return CurvatureInformation(q, solved(motion.covariance * np.outer(_TO_Q, _TO_Q), np.eye(3)))
     return CurvatureInformation(q, data)
 
 
@@ -98,7 +98,8 @@ def _decide(information: Array, q: Array, length: float) -> Decision:
     """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
     values, vectors = np.linalg.eigh(information)
     size = max(math.sqrt(float(q @ q)), 1.0 / length)
-    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
+    passed: Array = values >= 1.0 / (SIGMA_LIMIT * size) ** 2
+    return Decision(np.maximum(values, 0.0), vectors, passed)
 
 
 def _solution(S: Array, q: Array, information: Array, decision: Decision, has_prior: bool) -> Solution:
@@ -107,4 +108,4 @@ def _solution(S: Array, q: Array, information: Array, decision: Decision, has_pr
     c[6:] = UNIT * (q if has_prior else V @ (V.T @ q))
     if decision.rank < 3 and not has_prior:
         return Solution(c, np.full((3, 3), math.nan), decision, has_prior)
-    return Solution(c, np.linalg.inv(information) / np.outer(_TO_Q, _TO_Q), decision, has_prior)
+    return Solution(c, solved(information, np.eye(3)) / np.outer(_TO_Q, _TO_Q), decision, has_prior)

@@ -2,8 +2,8 @@
 
 On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch on a surface with shape operator K:
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` its second moments are `M = (δ/6) A⁻¹`. A real sensor blurs them,
-loses the rim under the level that is taken off and the ends outside its window, so its moments are a fitted function of the ideal
-ones. That function is isotropic and quadratic in M, hence by Cayley and Hamilton `V = α I + β M`.
+loses the rim under the level that is taken off and the ends outside its window, so its moments are a fitted function of
+the ideal ones. That function is isotropic and quadratic in M, hence by Cayley and Hamilton `V = α I + β M`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, positive
+from canprobe.touch._arrays import Array, positive, solved
 from canprobe.touch.patch_image import Moments
 
 _ROOT2 = math.sqrt(2.0)
@@ -107,7 +107,7 @@ class MomentModel:
         return alpha, c1 - c2 + (c4 - c7) * trace + c6 * t
 
     def covers(self, k: Moments, force: float) -> bool:
-        """Whether the calibration pressed such patches (measured force, N); outside the model is no more than a guess."""
+        """Whether the calibration pressed such patches (K in 1/m, measured force in N); beyond, the model is a guess."""
         try:
             (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
         except ValueError:
@@ -117,9 +117,9 @@ class MomentModel:
         return m0 <= mean - half and mean + half <= m1 and t0 <= t <= t1
 
     def start(self, v: Moments, force: float) -> Moments | None:
-        """K (1/m) from moments (m²) and measured force by the ideal layer alone, to begin with; None where blur is all there is.
+        """K (1/m) from moments (m²) and measured force (N) by the ideal layer and two of the coefficients, to begin with.
 
-        The moments must be given in their principal axes: the second is taken as 0.
+        The moments must be given in their principal axes: the second is taken as 0. None where blur is all there is.
         """
         c0, c1 = self.fit.coefficients[:2]
         x, y = ((m / self.pitch**2 - c0) / c1 * self.pitch**2 for m in (v[0], v[2]))
@@ -162,7 +162,7 @@ class MomentModel:
         ).T
         residual = np.array([s * (m - m0) for s, m, m0 in zip(scale, v, here, strict=True)])
         by_force = slope(self.moments(k, f * (1.0 + _STEP)), _STEP)
-        return J, residual, np.linalg.inv(self._covariance(by_force, frames))
+        return J, residual, solved(self._covariance(by_force, frames), np.eye(3))
 
     def _covariance(self, by_force: list[float], frames: float) -> Array:
         """(3, 3) of the relative residuals of V11, V12, V22: an error of the force moves the prediction with it."""
