@@ -115,7 +115,7 @@ def _shape(
 ) -> dict[str, Any]:
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
-        *("normal_rms_deg", "position_rms_mm", "observed", "cramer_rao_ratio"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
     )
     shape: dict[str, Any] = dict.fromkeys(names)
     if not estimates:
@@ -137,6 +137,7 @@ def _shape(
         "kappa_rms_error_percent": score.kappa_rms_percent,
         "normal_rms_deg": score.normal_rms_deg,
         "position_rms_mm": score.position_rms_mm,
+        "patch_fraction": score.patch_fraction,
         "cramer_rao_ratio": _bound_ratio(session, controller, score, log),
         "methods": {
             name: {
@@ -146,6 +147,7 @@ def _shape(
                 "position_rms_mm": s.position_rms_mm,
                 "estimates": s.estimates,
                 "observed_fraction": s.observed_fraction,
+                "patch_fraction": s.patch_fraction,
             }
             for name, s in scores.items()
         },
@@ -154,11 +156,14 @@ def _shape(
 
 
 def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: dict[str, Array]) -> float | None:
-    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise."""
+    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
+
+    None where the contact patch helped: the bound is that of points and normals.
+    """
     from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
 
     tracker, shape = getattr(controller, "shape", None), session.scene.shape
-    if tracker is None or shape is None or score.kappa_rms is None:
+    if tracker is None or shape is None or score.kappa_rms is None or score.patch_fraction:
         return None
     bound = bound_of_scan(
         tracker.samples,
@@ -259,5 +264,6 @@ def _shape_lines(shape: dict[str, Any]) -> list[str]:
             + (f" ({percent:.1f} %)" if percent is not None else "")
             + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
             f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
         )
     return lines

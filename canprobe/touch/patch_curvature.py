@@ -175,7 +175,7 @@ def _entries(q: Array) -> tuple[float, float, float]:
 
 def _better(own: Array, motion: Array) -> Array:
     """The part of a definite information (3, 3) about combinations that the motion knows less well."""
-    L = np.linalg.cholesky(own)
+    L: Array = np.linalg.cholesky(own).astype(np.float64, copy=False)
     inverse = solved(L, np.eye(3))
     ratio, W = np.linalg.eigh(inverse @ motion @ inverse.T)
     kept = L @ W[:, ratio < 1.0]

@@ -98,8 +98,7 @@ def _decide(information: Array, q: Array, length: float) -> Decision:
     """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
     values, vectors = np.linalg.eigh(information)
     size = max(math.sqrt(float(q @ q)), 1.0 / length)
-    passed: Array = values >= 1.0 / (SIGMA_LIMIT * size) ** 2
-    return Decision(np.maximum(values, 0.0), vectors, passed)
+    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
 
 
 def _solution(S: Array, q: Array, information: Array, decision: Decision, has_prior: bool) -> Solution:

@@ -107,7 +107,7 @@ class MomentModel:
         return alpha, c1 - c2 + (c4 - c7) * trace + c6 * t
 
     def covers(self, k: Moments, force: float) -> bool:
-        """Whether the calibration pressed such patches (K in 1/m, measured force in N); beyond, the model is a guess."""
+        """Whether the calibration pressed such patches (K in 1/m, measured force in N); beyond them it is a guess."""
         try:
             (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
         except ValueError:
@@ -117,7 +117,7 @@ class MomentModel:
         return m0 <= mean - half and mean + half <= m1 and t0 <= t <= t1
 
     def start(self, v: Moments, force: float) -> Moments | None:
-        """K (1/m) from moments (m²) and measured force (N) by the ideal layer and two of the coefficients, to begin with.
+        """K (1/m) to begin with, from moments (m²) and measured force (N), by the ideal layer and two coefficients.
 
         The moments must be given in their principal axes: the second is taken as 0. None where blur is all there is.
         """

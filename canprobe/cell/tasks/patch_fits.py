@@ -54,8 +54,8 @@ MOMENT_FITS = {
     ),
 }
 """By full scale (Pa) and whether only the 8×8 window is seen: 600 presses each (seed 1), every one on an array of its
-own, κ −12 … 60 1/m, 0.7–3.2 N, 2.5–12 s at rest or rolling. Single presses are off by 1.3 % (100 kPa) and 1.8 % (300 kPa)
-RMS in a moment and by 1.5 and 2 % in the force: that is the floor."""
+own, κ −12 … 60 1/m, 0.7–3.2 N, 2.5–12 s at rest or rolling. Single presses are off by 1.3 % (100 kPa) and 1.8 %
+(300 kPa) RMS in a moment and by 1.5 and 2 % in the force: that is the floor."""
 
 
 def moment_model(calibration: PatchCalibration, stiffness_n_m3: float, *, windowed: bool) -> MomentModel:
