@@ -28,6 +28,8 @@ LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
 MOST_FRAMES = 64
 """Frames that the running mean reaches back: 0.3 s at 200 Hz, 8 mm at 25 mm/s."""
+GROSS = 0.2
+"""Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
 MOST_ROUNDS = 6
 """Gauss–Newton steps; from the last answer one or two do."""
 SETTLED, UNSETTLED = 0.002, 0.05
@@ -81,9 +83,12 @@ class PatchCurvature:
         self.frames = min(self.frames + 1, MOST_FRAMES)
         share = 1.0 / self.frames
         xx, xy, yy = _turned(*sample.moments, *self._pad_axis(sample))
-        self._xx += share * (xx - self._xx)
-        self._xy += share * (xy - self._xy)
-        self._yy += share * (yy - self._yy)
+        dxx, dxy, dyy = xx - self._xx, xy - self._xy, yy - self._yy
+        if self.frames > LEAST_FRAMES:
+            share *= min(1.0, GROSS * (self._xx + self._yy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
+        self._xx += share * dxx
+        self._xy += share * dxy
+        self._yy += share * dyy
         self.force += share * (sample.force_n - self.force)
 
     def _carry(self, zx: float, zy: float, zz: float) -> None:
@@ -138,11 +143,16 @@ class PatchCurvature:
         return None if found is None else CurvatureInformation(turn.T @ found.q, turn.T @ found.information @ turn)
 
     def _solve(self, v: Moments, motion: CurvatureInformation | None) -> CurvatureInformation | None:
-        start = self._last if self._last is not None else self.model.start(v, self.force)
-        self._last = None
-        if start is None:
-            return None
-        k, step = start, math.inf
+        """From the last answer, and where that fails from the ideal layer."""
+        last, self._last = self._last, None
+        found = None if last is None else self._iterated(last, v, motion)
+        if found is None and (start := self.model.start(v, self.force)) is not None:
+            found = self._iterated(start, v, motion)
+        return found
+
+    def _iterated(self, k: Moments, v: Moments, motion: CurvatureInformation | None) -> CurvatureInformation | None:
+        """Gauss–Newton from K; None where it does not settle inside the calibration."""
+        step = math.inf
         try:
             for _ in range(MOST_ROUNDS):
                 J, r, W = self.model.linearised(v, self.force, self.frames, k)

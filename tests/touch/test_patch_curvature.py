@@ -1,6 +1,7 @@
 """Curvature from second moments: an integrated Winkler patch and rotations of scipy as truth."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -230,6 +231,24 @@ def test_contacts_without_moments_are_counted_and_change_nothing():
         patch.add(touch)
     assert patch.refused == 3
     np.testing.assert_allclose(patch_estimate(touches[-1], patch, 0.02).K, before, atol=1e-2)
+
+
+def test_one_image_in_twenty_that_is_far_off_moves_the_answer_by_little():
+    touches = samples(base_tensor(tensor(27.8, 0.0, 0.3)), NORMAL, FORCE, exact, 200)
+    patch = PatchCurvature(model())
+    for i, touch in enumerate(touches):
+        far_off = tuple(3.0 * m for m in touch.moments)
+        patch.add(replace(touch, moments=far_off) if i % 20 == 10 else touch)
+    assert patch_estimate(touches[-1], patch, 0.02).kappa == pytest.approx([27.8, 0.0], abs=2.0)
+
+
+def test_a_change_of_the_surface_is_followed_within_the_reach_of_the_mean():
+    patch = PatchCurvature(model())
+    for k1 in (27.8, 5.0):
+        touches = samples(base_tensor(tensor(k1, 0.0, 0.3)), NORMAL, FORCE, exact, 400)
+        for touch in touches:
+            patch.add(touch)
+        assert patch_estimate(touches[-1], patch, 0.02).kappa == pytest.approx([k1, 0.0], abs=0.3)
 
 
 def test_outside_the_calibration_the_patch_says_nothing():
