@@ -158,12 +158,12 @@ def _shape(
 def _bound_ratio(session: Session, controller: object, score: ShapeScore, log: dict[str, Array]) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
 
-    None where the contact patch helped: the bound is that of points and normals.
+    None where the contact patch helped most answers: the bound is that of points and normals.
     """
     from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
 
     tracker, shape = getattr(controller, "shape", None), session.scene.shape
-    if tracker is None or shape is None or score.kappa_rms is None or score.patch_fraction:
+    if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,

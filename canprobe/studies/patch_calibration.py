@@ -2,9 +2,8 @@
 
 Every press has an array of its own (gains), principal curvatures, a direction on the pad, a force and a place by
 chance, and lasts some seconds under a force that is a little restless; half of them stand still, half roll slowly over
-the pad. The fit is of the form that
-`canprobe.touch.patch_moments` states; its floor is what remains of single presses, so it holds gains, hysteresis,
-creep and the form of the model, and shrinks with no averaging.
+the pad. The fit is of the form that `canprobe.touch.patch_moments` states; its floor is what remains of single presses,
+so it holds gains, hysteresis, creep and the form of the model, and no averaging makes it smaller.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ however many are averaged, the patch never knows more than the calibration's flo
 In the fusion the patch speaks where it knows more than the motion does, combination by combination of K; elsewhere it
 is not asked. A point-and-normal estimate along a path that excites all of K is better than any image.
 
-Source: ESTIMATION §3; Winkler layer, see `patch_moments`.
+The layer's model is stated in `patch_moments`.
 """
 
 from __future__ import annotations
