@@ -18,6 +18,7 @@ from canprobe.touch.patch_curvature import LEAST_FRAMES, PatchCurvature
 from canprobe.touch.patch_fusion import fuse, patch_estimate
 from canprobe.touch.patch_image import LEVEL_COUNTS, MomentImage
 from canprobe.touch.patch_moments import MomentFit, MomentModel
+from canprobe.touch.prior import Prior
 
 RADIUS, STIFFNESS, PITCH, LEVEL_PA = 0.040, 1.27e8, 1.5875e-3, 2350.0
 FLOOR = (
@@ -414,3 +415,20 @@ def test_a_sample_that_the_motion_drops_is_not_taken_from_the_patch_either():
     one.add(cylinder_touch(0.0, 0.0, 1.0, True))
     assert one.dropped.repeated == 1
     assert one.patch.frames == 1
+
+
+def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
+    motion = make_estimator(
+        "ml", sigma_point=3e-5, sigma_normal=2e-3, probe_radius=RADIUS, prior=Prior.flat(0.02, 10.0)
+    )
+    one = PatchedEstimator(motion, PatchCurvature(model()), 0.02)
+    for i, (x, y) in enumerate(AXIAL[:160]):
+        one.add(cylinder_touch(x, y, i * 5e-3, True))
+    before, both = motion.estimate(), one.estimate()
+    assert before.rank < 3
+    assert both.rank == 3
+    assert both.prior == before.prior
+    # the prior pulls 27.8 towards 0 by the ratio of its information to that of the patch and its own
+    pull = both.covariance.trace() / 10.0**2
+    assert 0.0 < pull < 0.03
+    assert both.kappa[0] == pytest.approx((1 / 0.036) * (1.0 - pull), abs=0.25)
