@@ -133,7 +133,7 @@ def summarise_shape(
     """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
-        *("normal_rms_deg", "position_rms_mm", "observed", "cramer_rao_ratio"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
     )
     shape: dict[str, Any] = dict.fromkeys(names)
     if not estimates:
@@ -157,6 +157,7 @@ def summarise_shape(
         "kappa_rms_error_percent": score.kappa_rms_percent,
         "normal_rms_deg": score.normal_rms_deg,
         "position_rms_mm": score.position_rms_mm,
+        "patch_fraction": score.patch_fraction,
         "cramer_rao_ratio": _bound_ratio(scene, tracker, score, truth, sync_times),
         "methods": {
             name: {
@@ -166,6 +167,7 @@ def summarise_shape(
                 "position_rms_mm": s.position_rms_mm,
                 "estimates": s.estimates,
                 "observed_fraction": s.observed_fraction,
+                "patch_fraction": s.patch_fraction,
             }
             for name, s in scores.items()
         },
@@ -176,11 +178,14 @@ def summarise_shape(
 def _bound_ratio(
     scene: Scene, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
 ) -> float | None:
-    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise."""
+    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
+
+    None where the contact patch helped most answers: the bound is that of points and normals.
+    """
     from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
 
     shape = scene.shape
-    if tracker is None or shape is None or score.kappa_rms is None:
+    if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,
@@ -289,6 +294,7 @@ def shape_lines(shape: dict[str, Any]) -> list[str]:
             + (f" ({percent:.1f} %)" if percent is not None else "")
             + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
             f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
         )
     if (surface := shape.get("map")) is not None:
         lines.append(

@@ -147,6 +147,7 @@ class ShapeSettings:
     method: ShapeMethod = "recursive"
     memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0  # of path, whatever the time
     also: Annotated[tuple[ShapeMethod, ...], Distinct()] = ("ml", "chen1996")  # on the same data, for the report
+    patch: bool = True  # complete what the path leaves open by the second moments of the images
     every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0  # between two answers; every sample is taken in
 
 

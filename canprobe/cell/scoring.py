@@ -57,6 +57,7 @@ class ShapeScore:
         normal_rms_deg, position_rms_mm: of the estimated contact frame.
         estimates: how many were scored.
         observed_fraction: share of the answers after the run-in that observed all curvature.
+        patch_fraction: share of the scored answers to which the contact patch contributed.
     """
 
     kappa_true: tuple[float, float] | None
@@ -67,6 +68,7 @@ class ShapeScore:
     position_rms_mm: float | None
     estimates: int
     observed_fraction: float | None
+    patch_fraction: float | None = None
 
 
 def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync_times: Array) -> ShapeScore:
@@ -103,6 +105,7 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
         position_rms_mm=float(np.sqrt(np.mean(offsets)) * 1e3),
         estimates=len(seen),
         observed_fraction=len(seen) / len(late),
+        patch_fraction=sum(r.estimate.method.endswith("patch") for r in seen) / len(seen),
     )
 
 

@@ -43,6 +43,12 @@ def _no_shape(scene: Scene) -> str | None:
     return why.get(scene.task.kind, "no [shape]")
 
 
+def _no_patch(scene: Scene) -> str | None:
+    if scene.shape is None:
+        return None
+    return "shape.patch = false" if not scene.shape.patch else _by_sensor(scene)
+
+
 def _no_strategy(scene: Scene) -> str | None:
     why = {
         "press": "the probe holds still",
@@ -92,6 +98,7 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
     ("window (8 PDOs)", _no_window),
     ("taxels and patch features in the master", _by_sensor),
     ("surface estimator", _no_shape),
+    ("curvature from the patch", _no_patch),
     ("exploration strategy", _no_strategy),
     ("tactile servo", _no_servo),
     ("emulator", _no_emulator),

@@ -37,6 +37,7 @@ class ContactSample:
         force_n: contact force, N.
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
+        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch_image`); None for none.
     """
 
     t_s: float
@@ -47,6 +48,7 @@ class ContactSample:
     force_n: float
     sigma_point: float | None = None
     sigma_normal: float | None = None
+    moments: tuple[float, float, float] | None = None
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Array:
@@ -96,7 +98,14 @@ def contact_on_object(T_base_probe: Array, direction: Array, radius: float, dept
 
 
 def contact_sample(
-    *, t_s: float, T_base_probe: Array, uv: ArrayLike, depth: float, radius: float, force_n: float
+    *,
+    t_s: float,
+    T_base_probe: Array,
+    uv: ArrayLike,
+    depth: float,
+    radius: float,
+    force_n: float,
+    moments: tuple[float, float, float] | None = None,
 ) -> ContactSample:
     """A sample from the centroid on the pad: the whole way from taxels to base.
 
@@ -107,11 +116,13 @@ def contact_sample(
         depth: indentation, m (`indentation_from_force`).
         radius: R_p, m.
         force_n: N.
+        moments: of the patch, m².
     """
     u, v = np.asarray(uv, dtype=np.float64).tolist()
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
-    return ContactSample(t_s, point, normal, T_base_probe, (radius - depth) * direction, force_n)
+    arm = (radius - depth) * direction
+    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments)
 
 
 def point_in_object(T_base_object: Array, p_base: Array) -> Array:

@@ -20,6 +20,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.touch._arrays import Array
 
@@ -41,7 +42,7 @@ class Decision(NamedTuple):
 
     information: Array
     vectors: Array
-    passed: Array
+    passed: NDArray[np.bool_]
 
     @property
     def rank(self) -> int:

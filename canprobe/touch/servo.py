@@ -111,6 +111,10 @@ class LocalSurface:
         self._normal = _unit([mi + (ni - mi) * tilt for mi, ni in zip(m, n, strict=True)])
         return error
 
+    def raise_by(self, height: float) -> None:
+        """Move the model outward along its normal by a height, m: what was measured so far lies that much higher."""
+        self._point = tuple([a + height * m for a, m in zip(self._point, self._normal, strict=True)])
+
     def set_curvature(self, tensor: Vector) -> None:
         """Take the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
         self._curvature = tensor.tolist()

@@ -43,6 +43,15 @@ def test_features_map_no_taxels():
     assert {"full image (32 PDOs)", "window (8 PDOs)", "taxels and patch features in the master"} <= set(left)
 
 
+def test_the_patch_is_left_out_where_it_is_switched_off_or_no_taxels_are_sent():
+    axial = load_scene("axial")
+    off = dataclasses.replace(axial, shape=dataclasses.replace(axial.shape, patch=False))
+    features = dataclasses.replace(axial, sensor=dataclasses.replace(axial.sensor, mode="features"))
+    assert "curvature from the patch" not in dict(make_plan(axial).left_out)
+    assert dict(make_plan(off).left_out)["curvature from the patch"] == "shape.patch = false"
+    assert "features" in dict(make_plan(features).left_out)["curvature from the patch"]
+
+
 def test_switches_of_the_plant_are_listed():
     cylinder = load_scene("cylinder")
     quiet = dataclasses.replace(cylinder, plant=dataclasses.replace(cylinder.plant, noise=False, creep=False))

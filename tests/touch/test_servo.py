@@ -128,3 +128,11 @@ def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
     local.correct(np.zeros(3), np.array((np.sin(0.1), 0.0, np.cos(0.1))), dt=1e6)
     pole = servo.step(0.0, DEPTH, DT).pole
     assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))
+
+
+def test_raising_the_model_moves_it_outward_and_leaves_its_normal():
+    n = np.array((0.6, 0.0, 0.8))
+    surface = LocalSurface(np.array((0.01, 0.02, 0.03)), n, SurfaceGains())
+    surface.raise_by(1e-3)
+    np.testing.assert_allclose(surface.point, (0.0106, 0.02, 0.0308), atol=1e-12)
+    np.testing.assert_allclose(surface.normal, n, atol=1e-12)

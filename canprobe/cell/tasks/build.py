@@ -17,6 +17,7 @@ from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene, ServoSettings, TaskSettings
 from canprobe.scene_geometry import T_flange_probe, scan_axes
+from canprobe.touch.patch_image import MomentImage
 from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import Strategy, make_strategy
 
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 SIGMA_POINT_M = 0.1e-3
 SIGMA_NORMAL_RAD = 4e-3
 CYCLES_TO_EFFECT = 2
+WITH_PATCH = ("recursive", "ml")
+"""Estimators whose answers the patch completes; the others stay what they are in the literature."""
 
 
 def make_touch_task(plan: Plan, period_s: float, tactile_timeout: int) -> TouchTask:
@@ -46,12 +49,14 @@ def make_touch_task(plan: Plan, period_s: float, tactile_timeout: int) -> TouchT
 def make_sensing(scene: Scene) -> ContactSensing:
     """Contacts from measurements, as the scene's arm, probe and sensor give them."""
     assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
+    calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3)
     return ContactSensing(
         MODELS[scene.arm.model],
         T_flange_probe(scene.probe),
-        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
+        calibration,
         scene.probe.radius_mm * 1e-3,
         scene.probe.stiffness_n_m3,
+        moment_image=MomentImage(calibration) if _uses_patch(scene) else None,
     )
 
 
@@ -89,13 +94,32 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
     assert scene.shape is not None and scene.probe is not None and scene.sensor is not None
     memory = scene.shape.memory_mm * 1e-3
     window = max(8, round(memory / (scene.task.speed_mm_s * 1e-3) * scene.sensor.rate_hz))
-    return make_estimator(
+    estimator = make_estimator(
         method,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
         probe_radius=scene.probe.radius_mm * 1e-3,
         memory_m=memory,
         window=window,
+    )
+    if method not in WITH_PATCH or not _uses_patch(scene):
+        return estimator
+    from canprobe.cell.tasks.patch_fits import moment_model
+    from canprobe.touch.estimators.patched import PatchedEstimator
+    from canprobe.touch.patch_curvature import PatchCurvature
+
+    model = moment_model(
+        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
+        scene.probe.stiffness_n_m3,
+        windowed=scene.sensor.mode == "window",
+    )
+    return PatchedEstimator(estimator, PatchCurvature(model), memory)
+
+
+def _uses_patch(scene: Scene) -> bool:
+    """Whether images are asked for curvature: features carry none."""
+    return (
+        scene.shape is not None and scene.shape.patch and scene.sensor is not None and scene.sensor.mode != "features"
     )
 
 

@@ -13,6 +13,7 @@ from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import PumaModel
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
+from canprobe.touch.patch_image import MomentImage, Moments
 
 Vector = NDArray[np.float64]
 HOLLOWEST = 0.9
@@ -54,10 +55,18 @@ class ContactSensing:
         calibration: of the array.
         radius: of the probe, m.
         stiffness: K/h of the layer, N/m³.
+        moment_image: gives the contacts the second moments of their images; None leaves them out.
     """
 
     def __init__(
-        self, model: PumaModel, flange_probe: Vector, calibration: PatchCalibration, radius: float, stiffness: float
+        self,
+        model: PumaModel,
+        flange_probe: Vector,
+        calibration: PatchCalibration,
+        radius: float,
+        stiffness: float,
+        *,
+        moment_image: MomentImage | None = None,
     ) -> None:
         self.model = model
         self.flange_probe = flange_probe
@@ -67,6 +76,7 @@ class ContactSensing:
         self.patch: Patch | None = None
         self.dropped = 0
         self._calibration = calibration
+        self._moment_image = moment_image
         self._history = JointHistory()
 
     def step(self, measurement: Measurement) -> Patch | None:
@@ -104,7 +114,14 @@ class ContactSensing:
             depth=self.depth(patch.force),
             radius=self.radius,
             force_n=patch.force,
+            moments=self._moments(sample, patch),
         )
+
+    def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
+        """Second moments of the image; None where nobody asked, or they are not those of the whole patch."""
+        if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
+            return None
+        return self._moment_image.moments(sample.frame.taxels)
 
 
 def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:

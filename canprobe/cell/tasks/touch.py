@@ -205,7 +205,10 @@ class TouchTask:
         }
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
+            before = self.sensing.depth(contact.force_n)
             self.sensing.set_kappa(np.asarray(estimate.kappa))
+            # the depth that is aimed at has changed as much: without this the force would jump with the first answer
+            self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
 
     def _columns_of(
         self, measurement: Measurement, patch: Patch, contact: ContactSample | None

@@ -1,0 +1,179 @@
+"""Calibrate the second moments of the array's images: press known curvatures, roll or stand, fit eight numbers.
+
+Every press has an array of its own (gains), principal curvatures, a direction on the pad, a force and a place by
+chance, and lasts some seconds under a force that is a little restless; half of them stand still, half roll slowly over
+the pad. The fit is of the form that `canprobe.touch.patch_moments` states; its floor is what remains of single presses,
+so it holds gains, hysteresis, creep and the form of the model, and no averaging makes it smaller.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.tasks.calibration import array_calibration
+from canprobe.emulator.plant.contact import depth_for_force
+from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
+from canprobe.emulator.tactile_image import follow
+from canprobe.touch.patch import compute_patch
+from canprobe.touch.patch_image import MomentImage
+from canprobe.touch.patch_moments import MomentFit, MomentModel
+
+Array = NDArray[np.float64]
+KAPPA = (-12.0, 60.0)
+"""Range of both principal curvatures, 1/m."""
+FORCE_N = (0.7, 3.2)
+OFFSET_M = 2e-3
+ROLL_M = 1.5e-3
+ROLL_HZ = (0.35, 1.0)
+LOADING_S = 0.5
+PRESS_S = (2.5, 12.0)
+AVERAGE_S = 1.0
+UNREST, UNREST_S = 0.03, 0.1
+"""The force wanders under a servo: relative standard deviation, and correlation time."""
+FRAME_S = 0.04
+LONGEST = {True: 3.2, False: 5.0}
+"""Largest ideal moment over the squared pitch that is used, with the 8×8 window and with the whole pad."""
+_FLAT = MomentFit((0.0,) * 8, 1.0, tuple(map(tuple, np.eye(4).tolist())), 0.0, (0.0, np.inf), (0.0, np.inf))
+
+
+class Press(NamedTuple):
+    """One press: what was true and what the images said.
+
+    Attributes:
+        kappa: (2,) principal curvatures, 1/m.
+        force: N.
+        moments: (2, 2) mean of the second moments in the principal axes, m².
+        measured_force: mean, N.
+        frame_sigma: relative standard deviation of the moments of single frames.
+    """
+
+    kappa: Array
+    force: float
+    moments: Array
+    measured_force: float
+    frame_sigma: float
+
+
+def random_presses(n: int, seed: int, full_scale_pa: float, *, windowed: bool) -> Iterator[Press]:
+    """Presses of n arrays.
+
+    Args:
+        n: how many.
+        seed: of everything.
+        full_scale_pa: of the arrays.
+        windowed: only the 8×8 window that follows the contact is seen.
+    """
+    rng = np.random.default_rng(seed)
+    calibration = array_calibration(full_scale_pa)
+    moment_image = MomentImage(calibration)
+    for i in range(n):
+        kappa = np.sort(rng.uniform(*KAPPA, 2))[::-1]
+        force, angle = float(rng.uniform(*FORCE_N)), float(rng.uniform(0.0, np.pi))
+        axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+        array = TaxelArray(TaxelConfig(full_scale_pa=full_scale_pa), rng)
+        pressed = list(_images(array, rng, kappa, force, axes, full_scale_pa, rolling=bool(i % 2), windowed=windowed))
+        images, forces = zip(*pressed, strict=True)
+        patches = [compute_patch(image, calibration) for image in images]
+        if any(p.saturated or p.cut_by_pad for p in patches):
+            continue
+        seen = np.array([moment_image.moments(image) for image in images])
+        V = axes @ seen[:, [[0, 1], [1, 2]]] @ axes.T
+        spread = np.diagonal(np.diff(V, axis=0), axis1=1, axis2=2) / np.diagonal(V.mean(axis=0))
+        yield Press(
+            kappa,
+            float(np.mean(forces)),
+            V.mean(axis=0),
+            float(np.mean([p.force for p in patches])),
+            float(spread.std() / np.sqrt(2.0)),
+        )
+
+
+def _images(  # noqa: PLR0917
+    array: TaxelArray,
+    rng: np.random.Generator,
+    kappa: Array,
+    force: float,
+    axes: Array,
+    full_scale_pa: float,
+    *,
+    rolling: bool,
+    windowed: bool,
+) -> Iterator[tuple[Image, float]]:
+    """Images of the last second of one press, each with the force (N)."""
+    calibration = array_calibration(full_scale_pa)
+    k = (float(kappa[0]), float(kappa[1]))
+    depth = depth_for_force(force, k, calibration.radius_m, 1.27e8)
+    place, heading = rng.uniform(-OFFSET_M, OFFSET_M, 2), float(rng.uniform(0.0, 2.0 * np.pi))
+    hz, roll, origin = float(rng.choice(ROLL_HZ)), ROLL_M if rolling else 0.0, (4, 4)
+    c, s = np.cos(heading), np.sin(heading)
+    duration, unrest, kept = float(rng.uniform(*PRESS_S)), 0.0, float(np.exp(-FRAME_S / UNREST_S))
+    for t in np.arange(0.0, duration, FRAME_S).tolist():
+        unrest = kept * unrest + UNREST * np.sqrt(1.0 - kept**2) * float(rng.standard_normal())
+        phase = 2.0 * np.pi * hz * max(0.0, t - LOADING_S)
+        x, y = roll * np.sin(phase), 0.4 * roll * np.sin(2.0 * phase)
+        uv = (float(place[0] + c * x - s * y), float(place[1] + s * x + c * y))
+        now = force * min(1.0, t / LOADING_S) * (1.0 + unrest)
+        image = array.image(uv, depth * float(np.sqrt(now / force)), k, axes, t)
+        if windowed:
+            origin = follow(image, origin)
+            seen = np.zeros_like(image)
+            part = np.s_[origin[0] : origin[0] + 8, origin[1] : origin[1] + 8]
+            seen[part] = image[part]
+            image = seen
+        if t >= duration - AVERAGE_S:
+            yield image, now
+
+
+def sensor(full_scale_pa: float, fit: MomentFit = _FLAT) -> MomentModel:
+    """The model of such an array on the standard probe."""
+    calibration = array_calibration(full_scale_pa)
+    return MomentModel(fit, calibration.radius_m, 1.27e8, MomentImage(calibration).level_pa)
+
+
+def ideal_moments(presses: Sequence[Press], model: MomentModel) -> tuple[Array, Array]:
+    """(n, 2) moments of the ideal layer over the squared pitch, and (n,) level over peak pressure."""
+    ideal = [model.ideal((p.kappa[0], 0.0, p.kappa[1]), p.force) for p in presses]
+    return np.array([[m[0], m[2]] for m, _ in ideal]), np.array([t for _, t in ideal])
+
+
+def fit_moments(presses: Sequence[Press], full_scale_pa: float, *, windowed: bool) -> MomentFit:
+    """The calibration that these presses make, in least squares of relative errors."""
+    model = sensor(full_scale_pa)
+    m, t = ideal_moments(presses, model)
+    used = m.max(axis=1) <= LONGEST[windowed]
+    m, t = m[used], t[used]
+    V = np.array([p.moments for p in presses])[used] / model.pitch**2
+    seen = np.diagonal(V, axis1=1, axis2=2)
+    basis = np.stack([_basis(m[:, 0], m[:, 1], t), _basis(m[:, 1], m[:, 0], t)], axis=1)
+    rows = (basis / seen[:, :, None]).reshape(-1, 8)
+    c, *_ = np.linalg.lstsq(rows, np.ones(len(rows)), rcond=None)
+    errors = seen / (basis @ c) - 1.0
+    shear = V[:, 0, 1] / np.sqrt(seen.prod(axis=1))
+    ratio = np.array([p.measured_force / p.force for p in presses])[used]
+    return MomentFit(
+        tuple(c.tolist()),
+        float(ratio.mean()),
+        tuple(map(tuple, _floor(errors, shear, ratio / ratio.mean() - 1.0).tolist())),
+        float(np.median([p.frame_sigma for p in presses])),
+        (float(m.min()), float(m.max())),
+        (float(t.min()), float(t.max())),
+    )
+
+
+def _basis(mi: Array, mj: Array, t: Array) -> Array:
+    return np.stack([np.ones_like(t), mi, mj, t, mi * mi, mi * mj, t * mi, mj * mj], axis=1)
+
+
+def _floor(errors: Array, shear: Array, force: Array) -> Array:
+    """(4, 4) covariance, the same for both axes of the patch."""
+    C = np.zeros((4, 4))
+    C[0, 0] = C[1, 1] = np.mean(errors**2)
+    C[0, 1] = C[1, 0] = np.mean(errors[:, 0] * errors[:, 1])
+    C[2, 2] = np.mean(shear**2)
+    C[3, 3] = np.mean(force**2)
+    C[0, 3] = C[3, 0] = C[1, 3] = C[3, 1] = np.mean(errors * force[:, None])
+    return C

@@ -1,0 +1,71 @@
+"""The patch as a second sensor in the whole cell: a path along the axis of a cylinder, full sensor pipeline."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.build import make_task
+from canprobe.cell.scoring import score_shape
+from canprobe.cell.tasks.build import make_shape_estimator
+from canprobe.cell.tasks.shape import replay_samples
+from canprobe.session import Session, resolve_scene
+
+
+@pytest.fixture(scope="module")
+def axial():
+    """The session and its controller after 2 s (50 mm) on the axial scene."""
+    session = Session(resolve_scene(canprobe.load_scene("axial"), duration_s=2.0))
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    return session, controller
+
+
+def score(session, records):
+    return score_shape(records, session.truth, session.cell.log.arrays()["t_s"])
+
+
+def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
+    session, controller = axial
+    found = score(session, controller.shape.records)
+    assert found.estimates >= 20
+    assert found.observed_fraction == 1.0
+    assert found.patch_fraction == 1.0
+    assert found.kappa_true == pytest.approx((1 / 0.036, 0.0), abs=1e-6)
+    assert found.kappa_rms_percent < 10.0
+    last = controller.shape.records[-1].estimate
+    assert last.method == "recursive+patch"
+    truth = session.truth["direction1"][-1]
+    assert abs(last.directions[0] @ truth) > 0.99
+
+
+def test_the_first_answer_gives_the_force_no_knock(axial):
+    """The patch tells the curvature, and with it the depth for 2 N, in one instant."""
+    session, controller = axial
+    first, last = controller.scan_cycles
+    assert session.truth["force"][first:last].max() < 2.35
+
+
+def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
+    session, controller = axial
+    scene = session.scene
+    off = replace(scene, shape=replace(scene.shape, patch=False))
+    records = replay_samples(make_shape_estimator(off, "recursive"), controller.shape.samples, 8)
+    found = score(session, records)
+    assert found.observed_fraction == 0.0
+    assert list(records[-1].estimate.observed) == [True, False]
+    assert records[-1].estimate.kappa[0] == pytest.approx(0.0, abs=1.0)
+    assert np.isnan(records[-1].estimate.kappa[1])
+
+
+def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
+    session, controller = axial
+    samples = controller.shape.samples
+    ml = replay_samples(make_shape_estimator(session.scene, "ml"), samples, 40)[-1].estimate
+    assert ml.method == "ml+patch"
+    assert ml.kappa == pytest.approx([1 / 0.036, 0.0], abs=2.8)
+    paper = replay_samples(make_shape_estimator(session.scene, "chen1996"), samples, 40)[-1].estimate
+    assert paper.method == "chen1996"
+    assert not paper.observed.all()

@@ -1,0 +1,58 @@
+"""The shipped moment fits are what the procedure finds, and their regions hold on arrays that it never saw."""
+
+import numpy as np
+import pytest
+
+from canprobe.cell.tasks.calibration import array_calibration
+from canprobe.cell.tasks.patch_fits import MOMENT_FITS, moment_model
+from canprobe.studies.patch_calibration import fit_moments, random_presses
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.patch_curvature import PatchCurvature
+from canprobe.touch.patch_fusion import patch_estimate
+
+
+@pytest.fixture(scope="module")
+def unseen():
+    """45 presses of arrays that no fit has seen, full pipeline, 8×8 window."""
+    return list(random_presses(45, 77, 100e3, windowed=True))
+
+
+def test_procedure_finds_the_shipped_fit(unseen):
+    """The eight numbers trade against each other; what counts is the moments, within twice the floor."""
+    found = fit_moments(unseen, 100e3, windowed=True)
+    shipped = MOMENT_FITS[100e3, True]
+    assert found.force_ratio == pytest.approx(shipped.force_ratio, abs=0.01)
+    assert np.sqrt(found.floor[0][0]) == pytest.approx(np.sqrt(shipped.floor[0][0]), rel=0.35)
+    model = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
+    for k in ((27.8, 0.0, 0.0), (20.0, 0.0, 20.0), (0.0, 0.0, 0.0), (45.0, 0.0, 10.0)):
+        again = type(model)(found, model.radius, model.stiffness, model.level_pa, model.pitch)
+        assert again.moments(k, 2.0) == pytest.approx(model.moments(k, 2.0), rel=0.026)
+
+
+def test_regions_of_one_touch_cover_the_truth_on_unseen_arrays(unseen):
+    """Patch alone, blur, gains, hysteresis, creep, crosstalk, noise, 8 bits, threshold and window on."""
+    model = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
+    inside, errors = [], []
+    for press in unseen:
+        V = press.moments
+        T = np.eye(4)
+        T[2, 3] = -0.04
+        touch = ContactSample(
+            0.0, np.zeros(3), np.array([0.0, 0.0, -1.0]), T, np.array([0.0, 0.0, 0.04]), press.measured_force,
+            moments=(V[0, 0], V[0, 1], V[1, 1]),
+        )  # fmt: skip
+        patch = PatchCurvature(model)
+        for _ in range(25):
+            patch.add(touch)
+        found = patch_estimate(touch, patch, 0.02)
+        if found is None:  # outside what was calibrated
+            continue
+        P = found.T_frame_contact[:3, :2]
+        D = found.K - P.T @ np.diag([*press.kappa, 0.0]) @ P
+        d = np.array([D[0, 0], D[0, 1], D[1, 1]])
+        inside.append(d @ np.linalg.solve(found.covariance, d) < 7.815)
+        errors.append(D)
+    assert len(inside) >= 38
+    assert np.mean(inside) >= 0.88
+    assert abs(np.mean([np.trace(D) for D in errors])) < 1.5
+    assert np.sqrt(np.mean(np.square(errors))) < 5.0
