@@ -71,13 +71,13 @@ class Spread:
         self.weight *= kept
         self._sum = self._sum * kept
 
-    def add(self, points: Array, weight: float) -> None:
-        """Take points (n, 3) with one weight each."""
-        added = weight * len(points)
-        mean = points.mean(axis=0)
+    def add(self, points: Array, weights: Array) -> None:
+        """Take points (n, 3) with weights (n,)."""
+        added = float(weights.sum())
+        mean = weights @ points / added
         inner = points - mean
         offset = mean - self._mean
         total = self.weight + added
-        self._sum = self._sum + weight * (inner.T @ inner) + np.outer(offset, offset) * (self.weight * added / total)
+        self._sum = self._sum + (inner.T * weights) @ inner + np.outer(offset, offset) * (self.weight * added / total)
         self._mean = self._mean + offset * (added / total)
         self.weight = total
