@@ -35,6 +35,11 @@ class ChangeTest:
         self.innovation = self._running = self._usual = 1.0
         self.alarms = 0
 
+    @property
+    def usual(self) -> float:
+        """Long-term innovation of the better three quarters, never taken below `LEAST_USUAL`."""
+        return max(LEAST_USUAL, self._usual)
+
     def take(self, d2: Array) -> bool:
         """Take the squared innovations (n,) of a step, χ² of 3 each; whether they say that the surface has changed."""
         capped = np.minimum(d2, CHI2_999)
@@ -43,7 +48,7 @@ class ChangeTest:
         short = min(1.0, RUNNING * n)
         self.innovation += short * (float(capped.mean()) / 3.0 - self.innovation)
         self._running += short * (common - self._running)
-        if self._running < ALARM * max(LEAST_USUAL, self._usual):
+        if self._running < ALARM * self.usual:
             self._usual += min(1.0, LONG_TERM * n) * (common - self._usual)
             return False
         self._running = self._usual

@@ -44,7 +44,7 @@ GROWTH = 1.4
 START_SAMPLES = 128
 
 AGREEING = 11.34
-"""Squared innovation up to which a sample may lie on the surface before a change: the 99 % point of χ² of 3."""
+"""Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
 
 class _Pending(NamedTuple):
@@ -188,8 +188,9 @@ class RecursiveEstimator:
             self._move_frame()
 
     def _drop_agreeing(self, d2: Array) -> None:
-        """Forget the first pending samples, those that still lie on the surface before a change."""
-        for _ in range(min(int(np.argmax(d2 > AGREEING)), len(d2) - 1)):
+        """Forget the pending samples up to the last that still agrees with the surface before a change."""
+        agree = np.flatnonzero(d2[:-1] <= AGREEING * self._change.usual)
+        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
             self._pending.popleft()
 
     def _start_up(self) -> None:
@@ -200,10 +201,13 @@ class RecursiveEstimator:
         travelled = self._travel.total - self._started
         if travelled < self._next_start:
             return
-        self._next_start = travelled * GROWTH
         last = travelled >= START[1] * self._memory
         T = homogeneous(tangent_rotation(-self._start[-1].normal), self._start[-1].point)
-        fitted = fit(self._design(T, self._start), self._prior.rows(self._memory))
+        d = self._design(T, self._start)
+        if not last and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
+            return
+        self._next_start = travelled * GROWTH
+        fitted = fit(d, self._prior.rows(self._memory))
         if fitted.converged and (last or fitted.decision.rank == 3):
             self._T, self._c = T, fitted.c
             self._root = upper_root(np.concatenate([fitted.root, DIFFUSE * np.eye(9)]))
