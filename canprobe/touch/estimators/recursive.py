@@ -163,7 +163,7 @@ class RecursiveEstimator:
         weight = np.ones(len(self._pending))
         if self._settled:
             d2 = _innovations(block, math.sqrt(kept) * self._root)
-            weight = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
+            weight = CHI2_999 / np.maximum(d2, CHI2_999)  # falls with the square: the further off, the less it pulls
             if self._change.take(d2):
                 self._drop_agreeing(d2)
                 self._begin(self._pending[-1])
