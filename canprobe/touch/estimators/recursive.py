@@ -169,7 +169,7 @@ class RecursiveEstimator:
                 self._begin(self._pending[-1])
                 block, weight, kept = self._rows_of_pending(), np.ones(len(self._pending)), 0.0
         crowd = min(1.0, self._crowd * moved / len(self._pending))
-        self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
+        self._doubtful = math.exp(-moved / self._memory) * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)
         self._spread.add(np.array([s.point for s in self._pending]), crowd * weight)
         self._update(kept, block * np.sqrt(crowd * weight).repeat(3)[:, None])
