@@ -1,8 +1,8 @@
 """Batch Gauss–Newton on the nine-parameter local model, robust, with the rank decided on curvature.
 
 Source: ESTIMATION of local shape as an errors-in-variables problem; the whitening `σ_n² I + K² σ_p²` keeps it at the
-Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of
-freedom residuals lose weight with their square, measured against the median residual where that is larger than expected.
+Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom residuals
+lose weight with their square, measured against the median residual where that is larger than expected.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def _median(values: Array) -> float:
 
 
 def robust(square: Array) -> tuple[Array, float]:
-    """Weights (n,) and the robust cost of squared whitened residuals (n,); far off, the pull falls with the distance."""
+    """Weights (n,) and robust cost of squared whitened residuals (n,); far off, the pull falls with the distance."""
     limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
     ratio = limit / np.maximum(square, limit)
     # d² inside, k (1 + ln(d²/k)) outside

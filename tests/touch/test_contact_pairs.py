@@ -100,4 +100,3 @@ def check(obj, probe, motion):
         wrong = c.normal_rate_residual(-K_o, v_o, -K_f, v_f, omega, rest, n_o)
         assert np.linalg.norm(wrong) == pytest.approx(2 * np.linalg.norm(np.cross(omega, n_o)), abs=1e-8)
         assert np.abs(np.concatenate([v_o, v_f])).max() > 1e-3
-

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
 
-from canprobe.errors import UsageError
-from canprobe.planning.make import make_plan
+from canprobe.errors import PlanError, UsageError
+from canprobe.planning import make_plan
+from canprobe.scene import ObjectSettings
+from canprobe.scene_loader import load_scene
 from canprobe.touch.contact import ContactSample, indentation_from_force
 from canprobe.touch.estimators import METHODS, make_estimator
 from canprobe.touch.fit import fit_surface
@@ -74,18 +77,14 @@ class TestShapes:
             assert e.umbilic == umbilic
 
     def test_concave_tighter_than_the_probe_is_refused_when_planned(self):
-        from canprobe.scene import ObjectSettings, load_scene
-
-        scene = load_scene("cylinder").with_object(ObjectSettings("bowl", radius_mm=30))
-        with pytest.raises(UsageError, match="tighter than the probe"):
+        """What happens when it is met: `tests/cell/test_sensing.py`."""
+        scene = load_scene("cylinder")
+        short = dataclasses.replace(scene.task, length_mm=10.0, width_mm=4.0)
+        scene = dataclasses.replace(scene, task=short, object=ObjectSettings("bowl", radius_mm=30))
+        with pytest.raises(PlanError, match="tighter than the probe"):
             make_plan(scene)
         with pytest.raises(UsageError, match="the probe's own curvature"):
             indentation_from_force(1.0, 1.27e8, 0.04, (-1 / 0.03, -1 / 0.03))
-
-
-def still(path, n):
-    """Standing still at the last place of a path."""
-    return np.repeat(path.points[-1:], n, axis=0), np.repeat(path.normals[-1:], n, axis=0)
 
 
 def roll(points, normals, *, share, spin=0.0, t0=0.0):
@@ -193,24 +192,27 @@ class TestSize:
 
 
 class TestLongRuns:
-    def test_1e6_updates_without_motion_of_note(self, truth):
-        """An hour and a half at 200 Hz and 1 µm/s over an ellipsoid after a scan: definite, no wind-up, still right."""
+    def test_standing_still_after_a_scan_changes_nothing(self, truth):
+        """100 000 samples (1e6 in tests/bench): nothing is forgotten or made up."""
         path = truth.path("ellipsoid", T=truth.any_pose(3))
         estimator = make("recursive")
-        before = fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
+        fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
         rng = np.random.default_rng(1)
-        p, n, T, r = path.points[-1], path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
-        cloud = p + SIGMA[0] * rng.normal(size=(5000, 3))
-        for i in range(1_000_000):
+        n, T, r = path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
+        cloud = path.points[-1] + SIGMA[0] * rng.normal(size=(5000, 3))
+        for i in range(100_000):
             estimator.add(ContactSample(1.0 + 0.005 * i, cloud[i % 5000], n, T, r, 1.0))
+            if i == 999:
+                settled = estimator.estimate()
         after = estimator.estimate()
         assert estimator.dropped.total == 0
         assert_sane(after)
-        assert np.allclose(after.covariance, before.covariance, rtol=0.1)
+        assert after.samples == settled.samples
+        assert np.allclose(np.linalg.eigvalsh(after.covariance), np.linalg.eigvalsh(settled.covariance), rtol=0.05)
         assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
 
-    def test_motion_after_an_hour_without_it_counts_at_once(self, truth):
-        """720 000 samples of standing still, from the start on; then a cylinder is as well known as without them."""
+    def test_motion_after_long_rest_counts_at_once(self, truth):
+        """100 000 samples of rest from the start (an hour in tests/bench); then all is as without them."""
         path = truth.path("cylinder")
         p, n = path.noisy(*SIGMA, 2)
         fresh = fed(make("recursive"), truth.samples(p, n))
@@ -218,31 +220,31 @@ class TestLongRuns:
         T, r = np.eye(4), np.array([0.0, 0.0, 0.04])
         cloud = path.points[0] + SIGMA[0] * rng.normal(size=(5000, 3))
         estimator = make("recursive")
-        for i in range(720_000):
+        for i in range(100_000):
             estimator.add(ContactSample(0.005 * i, cloud[i % 5000], path.normals[0], T, r, 1.0))
         waiting = estimator.estimate()
         assert waiting is None or not waiting.observed.any()
-        e = fed(estimator, truth.samples(p, n, 0.005 * 720_000))
+        e = fed(estimator, truth.samples(p, n, 0.005 * 100_000))
         assert e.rank == 3
-        assert np.allclose(e.covariance, fresh.covariance, rtol=0.3)
+        assert np.allclose(np.diag(e.covariance), np.diag(fresh.covariance), rtol=0.3)
         assert frobenius(path.error(e)) < 4.0 * math.sqrt(WEIGHT @ np.diag(e.covariance))
 
     def test_many_updates_in_motion(self, truth):
-        """4000 updates of the filter, 20 000 samples: symmetric, definite, unbiased at the end as at the start."""
-        s = np.arange(20_000) * 0.125e-3
+        """6000 samples (100 000 in tests/bench), symmetric, definite, right at the end as at the start."""
+        s = np.arange(6_000) * 0.125e-3
         path = truth.placed(truth.surface("saddle"), 5e-3 * np.sin(s / 5e-3), 4e-3 * np.sin(s / 3.1e-3))
         p, n = path.noisy(*SIGMA, 4)
         T, r, estimator, sigmas = np.eye(4), np.array([0.0, 0.0, 0.04]), make("recursive"), []
         for i in range(len(p)):
             estimator.add(ContactSample(0.005 * i, p[i], n[i], T, r, 1.0))
-            if i % 1000 == 999:
+            if i % 500 == 499:
                 e = estimator.estimate()
                 assert_sane(e)
                 K, B = path.surface.curvature_at(path.points[i])
                 P = e.T_frame_contact[:3, :2]
                 assert np.linalg.norm(e.K - P.T @ B @ K @ B.T @ P) < 1.0
                 sigmas.append(math.sqrt(np.trace(e.covariance)))
-        assert max(sigmas[-5:]) < 2.0 * max(sigmas[:5])
+        assert max(sigmas[-5:]) < 1.5 * max(sigmas[:5])
 
 
 BAD = {
@@ -304,16 +306,17 @@ def with_outliers(path, share, size, seed):
 
 class TestOutliers:
     @pytest.mark.parametrize("method", MUST)
-    @pytest.mark.parametrize("size", [0.3e-3, 1e-3, 5e-3])
-    @pytest.mark.parametrize("name", ["plane", "cylinder", "saddle"])
+    @pytest.mark.parametrize(
+        ("name", "size"), [("plane", 1e-3), ("cylinder", 0.3e-3), ("saddle", 1e-3), ("saddle", 5e-3)]
+    )
     def test_five_percent_have_bounded_influence_and_are_flagged(self, name, size, method, truth):
-        s = np.arange(640) * 0.125e-3
+        s = np.arange(400) * 0.125e-3
         path = truth.placed(truth.surface(name), 5e-3 * np.sin(s / 5e-3), 4e-3 * np.sin(s / 3.1e-3))
         worst = 0.0
-        for seed in range(4):
+        for seed in range(2):
             p, n, wrong = with_outliers(path, 0.05, size, seed)
             e = fed(make(method), truth.samples(p, n))
-            assert wrong > 15
+            assert wrong > 10
             assert_sane(e)
             assert any("reduced weight" in note for note in e.notes)
             worst = max(worst, frobenius(path.error(e)))
@@ -325,7 +328,7 @@ class TestOutliers:
         assert_sane(fed(make(method), truth.samples(p, n)))
 
     def test_standing_still_with_outliers_is_no_path(self, truth):
-        path = truth.placed(truth.surface("cylinder"), np.zeros(20_000), np.zeros(20_000))
+        path = truth.placed(truth.surface("cylinder"), np.zeros(10_000), np.zeros(10_000))
         p, n, _ = with_outliers(path, 0.05, 1e-3, 0)
         e = fed(make("recursive"), truth.samples(p, n))
         assert e is None or not e.observed.any()
@@ -358,7 +361,7 @@ class TestPatch:
 
 
 def fillet(k1, k2, seed):
-    """A weave over a surface whose curvature along x jumps from k1 to k2 at x = 0; way past the jump, normals, places."""
+    """A weave over a surface whose curvature along x jumps at x = 0: way past the jump, places, normals, x on them."""
     u = np.linspace(-0.03, 0.008, 100_001)
     y = 2.5e-3 * np.sin(2 * np.pi * u / 6e-3)
     s = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(u), np.diff(y)))])
@@ -396,12 +399,12 @@ def test_fillet(row, sigma, truth):
     """
     k1, k2 = FILLETS[row]
     squares, seen = [], []
-    for seed in range(5):
+    for seed in range(3):
         way, p, n, tangent = fillet(k1, k2, seed)
         estimator = make("recursive", sigma)
         for i, sample in enumerate(truth.samples(p, n)):
             estimator.add(sample)
-            if way[i] >= 5.2e-3 and i % 4 == 0:
+            if way[i] >= 5.2e-3 and i % 6 == 0:
                 e = estimator.estimate()
                 assert_sane(e)
                 seen.append(e.rank == 3)

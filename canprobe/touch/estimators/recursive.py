@@ -115,7 +115,8 @@ class RecursiveEstimator:
         L, R = self._memory, self._T[:3, :3]
         a = anchor(self._c, self._T, R.T @ (self._last.p_base - self._T[:3, 3]) / L, L)
         tangent = a.T_frame_contact[:3, :2]
-        spread = tangent.T @ self._spread.covariance @ tangent / self._gate.sigma_point**2
+        # what only the linear start says is not called observed
+        spread = tangent.T @ self._spread.covariance @ tangent * (float(self._settled) / self._gate.sigma_point**2)
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
         root = upper_root(solved(a.M.T, self._root.T).T)
         decision = decide(root[6:, 6:] * UNIT, spread, size)
