@@ -1,8 +1,8 @@
 """Batch Gauss–Newton on the nine-parameter local model, robust, with the rank decided on curvature.
 
 Source: ESTIMATION of local shape as an errors-in-variables problem; the whitening `σ_n² I + K² σ_p²` keeps it at the
-Cramér–Rao bound also on tight curvature. Residuals count by Huber's rule beyond the 99.9 % point of χ² with three
-degrees of freedom, measured against the median residual where that is larger than expected.
+Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom residuals
+lose weight with their square, measured against the median residual where that is larger than expected.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
     for _ in range(_ITERATIONS):
         r, J, log_det = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
-        weight, cost = huber(square)
+        weight, cost = robust(square)
         cost += log_det  # without it a large K, which explains any residual by noise of the points, would look good
         if cost > best_cost + 1e-3 * len(square) and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
@@ -100,12 +100,12 @@ def _median(values: Array) -> float:
     return float(np.partition(values, middle)[middle])
 
 
-def huber(square: Array) -> tuple[Array, float]:
-    """Weights (n,) and the robust cost of squared whitened residuals (n,)."""
+def robust(square: Array) -> tuple[Array, float]:
+    """Weights (n,) and robust cost of squared whitened residuals (n,); far off, the pull falls with the distance."""
     limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
-    ratio = np.sqrt(limit / np.maximum(square, limit))
-    # Huber: d² inside, 2 k d − k² outside
-    return ratio, float(np.sum(np.where(ratio < 1.0, limit * (2.0 / ratio - 1.0), square)))
+    ratio = limit / np.maximum(square, limit)
+    # d² inside, k (1 + ln(d²/k)) outside
+    return ratio, float(np.sum(np.where(ratio < 1.0, limit * (1.0 - np.log(ratio)), square)))
 
 
 def _size(c: Array) -> float:

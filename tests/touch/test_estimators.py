@@ -280,7 +280,7 @@ class TestTravel:
         spread = Spread()
         for k in range(6):
             spread.fade(0.8)
-            spread.add(x[10 * k : 10 * k + 10], 0.5)
+            spread.add(x[10 * k : 10 * k + 10], np.full(10, 0.5))
         w = 0.5 * np.repeat(0.8 ** np.arange(5, -1, -1), 10)
         assert spread.weight == pytest.approx(w.sum())
         assert np.allclose(spread.covariance, np.cov(x.T, aweights=w, ddof=0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,9 @@ from canprobe.robot.puma260 import PumaModel
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
 from canprobe.touch.patch_image import MomentImage, Moments
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
 HOLLOWEST = 0.9
@@ -44,6 +48,16 @@ class JointHistory:
                 share = (t_ns - t) / (self._times[i + 1] - t)
                 return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
         return None
+
+
+def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
+    """Whether the object is, beyond doubt (3σ), as hollow as a probe of ``radius`` (m): no contact of one patch."""
+    if not estimate.observed.all():
+        return False
+    x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
+    weight = np.array([x * x, 2.0 * x * y, y * y])
+    sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
+    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOWEST / radius
 
 
 class ContactSensing:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
-from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
@@ -209,6 +209,9 @@ class TouchTask:
             self.sensing.set_kappa(np.asarray(estimate.kappa))
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
+            if is_too_hollow(estimate, self.sensing.radius):
+                hollow = -1e3 / float(estimate.kappa[1])
+                self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
 
     def _columns_of(
         self, measurement: Measurement, patch: Patch, contact: ContactSample | None

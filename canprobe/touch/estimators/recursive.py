@@ -20,6 +20,7 @@ from canprobe.touch.anchor import anchor, foot, solution
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
+from canprobe.touch.estimators.change import ChangeTest
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
 from canprobe.touch.noise import Noise
@@ -39,15 +40,11 @@ CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
 START = (0.1, 0.4)
 """Travel over the memory at the first and last batch solution of the start; it doubles from one to the next."""
+GROWTH = 1.4
 START_SAMPLES = 128
-FADE = 0.1
-"""What an alarm leaves of the information's root."""
-ALARM = 2.2
-"""Running innovation, over its long-term mean, at which the surface is taken to have changed."""
-LEAST_USUAL = 0.3
-"""Least long-term innovation that an alarm is measured by; it is below 1 where the stated noise is generous."""
-RUNNING, LONG_TERM = 0.1, 0.004
-"""Weights of one sample in the running and in the long-term innovation."""
+
+AGREEING = 11.34
+"""Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
 
 class _Pending(NamedTuple):
@@ -93,27 +90,17 @@ class RecursiveEstimator:
         self._pending: deque[_Pending] = deque(maxlen=16)
         self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
-        self._T = np.eye(4)
-        self._c = np.zeros(9)
-        self._root = np.zeros((9, 9))
-        self._innovation = self._usual = 1.0
-        self._faded = 0
-        self._first = True
-        self._restart()
-
-    def _restart(self) -> None:
-        self._start: list[_Pending] = []
-        self._started = self._travel.total
-        self._next_start = START[0] * self._memory
+        self._change = ChangeTest()
+        self._doubtful = 0.0
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        if self._last is None:
-            self._begin(sample)
-        self._last = sample
         self._pending.append(_Pending(sample.p_base, sample.n_base, *self._gate.sigmas(sample)))
+        if self._last is None:
+            self._begin(self._pending[-1])
+        self._last = sample
         moved = self._travel.add(sample.p_base)
         if moved > 0.0:
             self._absorb(moved)
@@ -128,7 +115,8 @@ class RecursiveEstimator:
         L, R = self._memory, self._T[:3, :3]
         a = anchor(self._c, self._T, R.T @ (self._last.p_base - self._T[:3, 3]) / L, L)
         tangent = a.T_frame_contact[:3, :2]
-        spread = tangent.T @ self._spread.covariance @ tangent / self._gate.sigma_point**2
+        # what only the linear start says is not called observed
+        spread = tangent.T @ self._spread.covariance @ tangent * (float(self._settled) / self._gate.sigma_point**2)
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
         root = upper_root(solved(a.M.T, self._root.T).T)
         decision = decide(root[6:, 6:] * UNIT, spread, size)
@@ -141,13 +129,18 @@ class RecursiveEstimator:
             length=L,
             T_frame_contact=a.T_frame_contact,
             condition_number=float(singular[0] / singular[-1]),
-            innovation=self._innovation,
+            innovation=self._change.innovation,
             distance=min(self._travel.total, L),
             samples=self._spread.weight,
             method="recursive",
             prior=self._prior.name,
-            notes=(f"the surface changed {self._faded} times: memory shortened",) if self._faded else (),
+            notes=self._notes(),
         )
+
+    def _notes(self) -> tuple[str, ...]:
+        changes, doubtful = self._change.alarms, round(self._doubtful)
+        notes = (f"the surface changed {changes} times: memory shortened",) if changes else ()
+        return (*notes, f"{doubtful} samples with reduced weight") if doubtful else notes
 
     def _make_prior_rows(self) -> Array:
         A, _ = self._prior.rows(self._memory)
@@ -155,82 +148,94 @@ class RecursiveEstimator:
         rows[3:6] = A[:3]
         return rows
 
-    def _begin(self, sample: ContactSample) -> None:
-        self._T = homogeneous(tangent_rotation(-sample.n_base), sample.p_base)
+    def _begin(self, sample: _Pending) -> None:
+        """Start from nothing at a sample."""
+        self._T = homogeneous(tangent_rotation(-sample.normal), sample.point)
+        self._c = np.zeros(9)
         self._root = self._prior_rows.copy()
+        self._start: list[_Pending] = []
+        self._started = self._travel.total
+        self._next_start = START[0] * self._memory
+        self._settled = False
 
     def _absorb(self, moved: float) -> None:
         kept = math.exp(-moved / self._memory)
-        root = math.sqrt(kept) * self._root
-        points = np.array([s.point for s in self._pending])
-        block = self._rows_of_pending(points)
-        weight, changed = self._judge(block, root)
-        if changed:
-            root, weight, kept = FADE * root, np.ones_like(weight), FADE**2 * kept
+        block = self._rows_of_pending()
+        weight = np.ones(len(self._pending))
+        if self._settled:
+            d2 = _innovations(block, math.sqrt(kept) * self._root)
+            weight = CHI2_999 / np.maximum(d2, CHI2_999)  # falls with the square: the further off, the less it pulls
+            if self._change.take(d2):
+                self._drop_agreeing(d2)
+                self._begin(self._pending[-1])
+                block, weight, kept = self._rows_of_pending(), np.ones(len(self._pending)), 0.0
         crowd = min(1.0, self._crowd * moved / len(self._pending))
+        self._doubtful = math.exp(-moved / self._memory) * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)
-        self._spread.add(points, crowd)
-        block *= np.sqrt(crowd * weight).repeat(3)[:, None]
+        self._spread.add(np.array([s.point for s in self._pending]), crowd * weight)
+        self._update(kept, block * np.sqrt(crowd * weight).repeat(3)[:, None])
+
+    def _update(self, kept: float, block: Array) -> None:
+        """One QR of the forgotten root, what the prior has lost, and new rows (m, 10)."""
         lost = math.sqrt(1.0 - kept) * self._prior_rows
         stacked = np.empty((18 + len(block), 10))
-        stacked[:9, :9], stacked[:9, 9] = root, 0.0
+        stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self._root, 0.0
         stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self._c)
         stacked[18:] = block
         full = upper_root(stacked)
         self._root = full[:9, :9]
         self._c = self._c + solved(self._root, full[:9, 9])
-        self._move_frame()
+        if self._settled:
+            self._move_frame()
+
+    def _drop_agreeing(self, d2: Array) -> None:
+        """Forget the pending samples up to the last that still agrees with the surface before a change."""
+        agree = np.flatnonzero(d2[:-1] <= AGREEING * self._change.usual)
+        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
+            self._pending.popleft()
 
     def _start_up(self) -> None:
-        """Solve the first samples again as a batch: the filter's first steps were linearised on a plane."""
+        """Solve the first samples again as a batch: until then the filter is linear, as if |∇f| were 1 everywhere."""
         self._start += self._pending
         if len(self._start) > START_SAMPLES:
             self._start = self._start[::2]
         travelled = self._travel.total - self._started
         if travelled < self._next_start:
             return
-        d = self._design(self._start)
-        if float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) >= SPREAD:
-            fitted = fit(d, self._prior.rows(self._memory))
-            if fitted.decision.rank == 3 and fitted.converged:
-                self._c, self._root = fitted.c, fitted.root
-            self._next_start *= 2.0
-        if travelled >= START[1] * self._memory:
-            self._next_start, self._start, self._first = math.inf, [], False
+        last = travelled >= START[1] * self._memory
+        T = homogeneous(tangent_rotation(-self._start[-1].normal), self._start[-1].point)
+        d = self._design(T, self._start)
+        if not last and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
+            return
+        self._next_start = travelled * GROWTH
+        fitted = fit(d, self._prior.rows(self._memory))
+        if fitted.converged and (last or fitted.decision.rank == 3):
+            self._T, self._c = T, fitted.c
+            self._root = upper_root(np.concatenate([fitted.root, DIFFUSE * np.eye(9)]))
+            self._settled = True
+        if last:
+            self._next_start, self._start, self._settled = math.inf, [], True
 
-    def _design(self, samples: list[_Pending]) -> Design:
-        L, R = self._memory, self._T[:3, :3]
-        points = (np.array([s.point for s in samples]) - self._T[:3, 3]) @ R / L
+    def _design(self, T: Array, samples: list[_Pending]) -> Design:
+        L, R = self._memory, T[:3, :3]
+        points = (np.array([s.point for s in samples]) - T[:3, 3]) @ R / L
         normals = np.array([s.normal for s in samples]) @ R
         noise = Noise(np.array([s.sigma_point for s in samples]) / L, np.array([s.sigma_normal for s in samples]))
         return design(points, normals, noise)
 
-    def _rows_of_pending(self, points: Array) -> Array:
-        """(3n, 10): whitened Jacobian and minus residual."""
+    def _rows_of_pending(self) -> Array:
+        """(3n, 10): whitened Jacobian and minus residual; until the filter has settled, linearised on a plane."""
         R, origin, L = self._T[:3, :3], self._T[:3, 3], self._memory
-        c = self._c.tolist()
+        c = self._c.tolist() if self._settled else [0.0] * 9
         normals = np.array([s.normal for s in self._pending]) @ R
-        x = (points - origin) @ (R / L)
-        block: list[list[float]] = []
+        x = (np.array([s.point for s in self._pending]) - origin) @ (R / L)
+        rows: list[list[float]] = []
         for s, xi, ni in zip(self._pending, x.tolist(), normals.tolist(), strict=True):
-            block += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
-        return np.array(block)
-
-    def _judge(self, block: Array, root: Array) -> tuple[Array, bool]:
-        """Weights (n,) by Huber's rule on the innovations, and whether they say that the surface has changed."""
-        predicted = solved(root.T, block[:, :9].T)
-        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", predicted, predicted))
-        d2 = square.reshape(-1, 3).sum(axis=1)
-        weight = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
-        mean = float(np.minimum(d2, CHI2_999).mean()) / 3.0
-        self._innovation += min(1.0, RUNNING * len(d2)) * (mean - self._innovation)
-        self._usual += min(1.0, LONG_TERM * len(d2)) * (mean - self._usual)
-        if self._first or self._innovation < ALARM * max(LEAST_USUAL, self._usual):
-            return weight, False
-        self._innovation = self._usual
-        self._faded += 1
-        self._restart()
-        return weight, True
+            rows += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
+        block = np.array(rows)
+        if not self._settled:
+            block[:, 9] -= block[:, :9] @ self._c
+        return block
 
     def _move_frame(self) -> None:
         assert self._last is not None
@@ -244,3 +249,11 @@ class RecursiveEstimator:
         self._c[:3] = 0.0
         self._root = solved(M.T, self._root.T).T
         self._T = homogeneous(R @ turned, origin + R @ (L * x))
+
+
+def _innovations(block: Array, root: Array) -> Array:
+    """Squared innovations (n,), χ² of 3 each, of whitened rows (3n, 10) under a root of information."""
+    predicted = solved(root.T, block[:, :9].T)
+    square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", predicted, predicted))
+    result: Array = square.reshape(-1, 3).sum(axis=1)
+    return result

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 
 import numpy as np
 
 from canprobe.touch._arrays import Array
 
-_MEAN_OF = 8
+_MEDIAN_OF, _MEAN_OF = 5, 8
 
 
 class Travel:
     """Path of a noisy point: its running mean over some samples, taken in steps well above the noise.
 
-    A point that stands still never makes a step, however long it stands.
+    A point that stands still never makes a step, however long it stands; nor do single wrong points among the right
+    ones, for the mean is one of medians.
 
     Args:
         step: least distance that counts, m; some standard deviations of the point.
@@ -26,21 +28,24 @@ class Travel:
     def __init__(self, step: float) -> None:
         self.total = 0.0
         self._step2 = step * step
-        self._mean: Array | None = None
-        self._mark = np.zeros(3)
+        self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
+        self._mean = self._mark = (0.0, 0.0, 0.0)
         self._count = 0
 
     def add(self, point: Array) -> float:
         """Take a point (3,), m; the length of the step that it completes, or 0."""
-        if self._mean is None:
-            self._mean, self._mark = point.copy(), point.copy()
+        self._last.append(point.tolist())
+        middle = len(self._last) // 2
+        a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
         self._count = min(self._count + 1, _MEAN_OF)
-        self._mean = self._mean + (point - self._mean) / self._count
+        share = 1.0 / self._count
+        x, y, z = self._mean
+        self._mean = x, y, z = x + share * (a - x), y + share * (b - y), z + share * (c - z)
         if self._count < _MEAN_OF:
             self._mark = self._mean
             return 0.0
-        offset = self._mean - self._mark
-        square = float(offset @ offset)
+        u, v, w = self._mark
+        square = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
         if square < self._step2:
             return 0.0
         self._mark = self._mean
@@ -71,13 +76,13 @@ class Spread:
         self.weight *= kept
         self._sum = self._sum * kept
 
-    def add(self, points: Array, weight: float) -> None:
-        """Take points (n, 3) with one weight each."""
-        added = weight * len(points)
-        mean = points.mean(axis=0)
+    def add(self, points: Array, weights: Array) -> None:
+        """Take points (n, 3) with weights (n,)."""
+        added = float(weights.sum())
+        mean = weights @ points / added
         inner = points - mean
         offset = mean - self._mean
         total = self.weight + added
-        self._sum = self._sum + weight * (inner.T @ inner) + np.outer(offset, offset) * (self.weight * added / total)
+        self._sum = self._sum + (inner.T * weights) @ inner + np.outer(offset, offset) * (self.weight * added / total)
         self._mean = self._mean + offset * (added / total)
         self.weight = total
