@@ -14,6 +14,7 @@ from canopen.objectdictionary.eds import import_eds
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.plant.motor import MotorDynamics
 
 U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5
@@ -161,6 +162,7 @@ class FakePlant:
     t_ns: int = 0
     stuck: bool = False
     torque: int = 0
+    dynamics: MotorDynamics = field(default_factory=lambda: MotorDynamics(gain=100.0, coulomb=50.0, damping=4.0))
 
     def advance(self, t_ns: int) -> None:
         self.t_ns = max(t_ns, self.t_ns)
@@ -175,6 +177,9 @@ class FakePlant:
 
     def torque_permille(self, axis: int) -> int:
         return self.torque
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        return self.dynamics
 
     def set_ramp(self, axis: int, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         assert t1_ns > t0_ns
