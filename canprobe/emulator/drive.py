@@ -141,15 +141,18 @@ class DriveApplication(Application):
 
     def _controlword(self, subindex: int, value: Value) -> None:
         """States change at once; the bits of the mode wait until all values of the same PDO are stored."""
+        states = self._states
+        if value == states.idle_word:
+            return  # as in every cycle of operation
         word, now_ns = int(value), self._core.now_ns
         if word == self._word:
-            self._states.controlword(word, now_ns)
+            states.controlword(word, now_ns)
             return
         self._take_word(now_ns)
         self._word = word
-        enabled = self._states.state is _ENABLED
-        self._states.controlword(word, now_ns)
-        if enabled and self._states.state is _ENABLED:
+        enabled = states.state is _ENABLED
+        states.controlword(word, now_ns)
+        if enabled and states.state is _ENABLED:
             self._word_waits = True
             self._word_timer.arm(now_ns)
 

@@ -7,6 +7,7 @@ Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from canprobe.emulator.drive_motion import AxisPlant, Motion
 from canprobe.emulator.drive_units import Units
@@ -16,7 +17,8 @@ _I16, _I32 = 1 << 15, 1 << 31
 
 
 def _within(value: float, limit: int) -> int:
-    return min(max(round(value), -limit), limit - 1)
+    number = round(value)
+    return number if -limit <= number < limit else min(max(number, -limit), limit - 1)
 
 
 class DriveFeedback:
@@ -24,6 +26,7 @@ class DriveFeedback:
 
     Attributes:
         counts: motor position at the last `measure`.
+        plant_torque: tells the torque that the plant needs for its motion now, permille.
         torque: tells the torque now, permille; a drive that controls torque puts its own there.
     """
 
@@ -32,6 +35,7 @@ class DriveFeedback:
         self.counts = 0.0
         self._velocity = 0.0
         self._t_ns: int | None = None
+        self.plant_torque = partial(plant.torque_permille, axis)
         self.torque: Callable[[], float] = self.plant_torque
         sources: dict[int, Callable[[], int]] = {
             0x6062: lambda: _within(units.position(motion.demand(self._t_ns or 0)), _I32),
@@ -51,10 +55,6 @@ class DriveFeedback:
         """Velocity starts anew."""
         self._t_ns = None
         self._velocity = 0.0
-
-    def plant_torque(self) -> int:
-        """What the plant says that the motion takes, permille."""
-        return self._plant.torque_permille(self._axis)
 
     def measure(self, t_ns: int) -> float:
         """Position at `t_ns`, counts; the velocity is the mean since the last call."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from canprobe.emulator.drive_mode import FOLLOWS, DriveMode, DriveParts
 from canprobe.emulator.drive_parameters import PEAK_PERMILLE
 from canprobe.emulator.entries import key_of
+from canprobe.protocol.emcy import FOLLOWING_ERROR
 
 _TARGET, _OFFSET = key_of(0x607A), key_of(0x60B0)
 
@@ -34,7 +35,8 @@ class CyclicPosition(DriveMode):
 
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the following error and the master, latch the target received since the last SYNC."""
-        if self._lags(t_ns, counts):
+        if self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
+            self.parts.fault(FOLLOWING_ERROR, t_ns)
             return
         fresh, self._fresh = self._fresh, False
         self._supervision.sync(fresh, t_ns)

@@ -122,6 +122,14 @@ def test_cia402_52_fault_reset_needs_a_rising_edge(drive):
     assert (drive.read(0x603F), drive.read(0x1001)) == (0, 0)
 
 
+def test_cia402_52_a_second_fault_is_reset_by_a_second_edge(drive):
+    for _ in range(2):
+        fault(drive, 0x2310)
+        for word in (0x00, 0x00, 0x80):
+            drive.write(0x6040, 0, word, 2)
+        assert drive.node.application.state is S.SWITCH_ON_DISABLED
+
+
 @pytest.mark.parametrize("option", [1, 2, 5, 6])
 def test_cia402_51_quick_stop_options(drive, option):
     bring(drive, S.OPERATION_ENABLED, option)
