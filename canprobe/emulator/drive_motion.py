@@ -125,8 +125,10 @@ class Motion:
             self._trajectory, self._start = None, self._end  # the ramp that has just ended no longer counts as motion
             self._await_standstill(due_ns)
             return
-        step_ns = STEP_NS if left_s > STEP_NS * 1e-9 else max(1, round(left_s * 1e9))
-        end = trajectory.at(begun_s + min(left_s, STEP_NS * 1e-9))[0]
+        step_s = STEP_NS * 1e-9
+        last = left_s <= step_s
+        step_ns = max(1, round(left_s * 1e9)) if last else STEP_NS
+        end = trajectory.at(trajectory.duration_s if last else begun_s + step_s)[0]
         self._ramp(self.demand(due_ns), end, due_ns, due_ns + step_ns)
         self._timer.arm(due_ns + STEP_NS)
 

@@ -42,6 +42,8 @@ class Profile:
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position (counts) and velocity (counts/s) `t_s` after the start."""
+        if t_s >= self.duration_s:
+            return self.end, 0.0
         for piece in self._pieces:
             if t_s < piece.duration_s:
                 return piece.at(t_s)
