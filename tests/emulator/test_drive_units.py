@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
 from canopen.objectdictionary import ODVariable
 
@@ -12,7 +14,7 @@ from canprobe.emulator.drive import make_drive_node
 @pytest.fixture
 def polar(rig):
     """The rig, with a drive whose EDS has 607Eh and 6080h as well."""
-    od = load_eds("puma260_joint", 1)
+    od = deepcopy(load_eds("puma260_joint", 1))
     for index, data_type in ((0x607E, 0x5), (0x6080, 0x7)):
         variable = ODVariable(f"object {index:04X}", index)
         variable.data_type, variable.access_type, variable.default = data_type, "rw", 0
