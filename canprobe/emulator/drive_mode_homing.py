@@ -133,15 +133,16 @@ class Homing(DriveMode):
         return min(wanted, self._parameters.max_speed)
 
     def _watch(self, due_ns: int) -> None:
-        counts = self.parts.feedback.measure(due_ns)
-        if self._lags(due_ns, counts):
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        if self._lags(t_ns, counts):
             return
-        self._timer.arm(due_ns + STEP_NS)
+        self._timer.arm_next(due_ns, STEP_NS)
         if self._phase is Phase.SEARCHING:
             pulse = next_pulse(self._was, self._direction, self._units.turn)
             if (counts - pulse) * self._direction >= 0.0:
                 self._home, self._phase = pulse, Phase.RETURNING
-                self._drive_to(pulse, due_ns)
+                self._drive_to(pulse, t_ns)
 
     def _arrived(self, t_ns: int) -> None:
         if self._phase is Phase.RETURNING:

@@ -123,13 +123,14 @@ class ProfilePosition(DriveMode):
         self._motion.follow(trapezoid(here, speed, point.counts, **rates), t_ns)
 
     def _watch(self, due_ns: int) -> None:
-        counts = self.parts.feedback.measure(due_ns)
-        if self._lags(due_ns, counts):
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        if self._lags(t_ns, counts):
             return
-        self._timer.arm(due_ns + STEP_NS)
+        self._timer.arm_next(due_ns, STEP_NS)
         point = self._active
         if point is not None and not self._reached and not self.halted:
-            self._watch_window(point, counts, due_ns)
+            self._watch_window(point, counts, t_ns)
         self._limit((point is not None and point.limited) or self._strains())
 
     def _watch_window(self, point: SetPoint, counts: float, t_ns: int) -> None:

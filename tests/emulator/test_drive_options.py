@@ -55,10 +55,12 @@ def test_cia402_52_fault_reaction_in_every_mode(rig, mode, option, rate):
 
 
 @pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize(("index", "word", "state"), [("_605B", 0x06, 0x21), ("_605C", 0x07, 0x23)])
+@pytest.mark.parametrize(("word", "state"), [(0x06, 0x21), (0x07, 0x23)])
 @pytest.mark.parametrize("option", [0, 1])
-def test_cia402_605b_605c_shutdown_and_disable_in_every_mode(rig, mode, index, word, state, option):
-    set_in_motion(rig, mode).put(**{index: option}, _6040=word)
+def test_cia402_605b_605c_shutdown_and_disable_in_every_mode(rig, mode, word, state, option):
+    other = 1 - option
+    options = {"_605B": option, "_605C": other} if word == 0x06 else {"_605B": other, "_605C": option}
+    set_in_motion(rig, mode).put(**options, _6040=word)
     assert rig.drive.read(0x6041) & 0x6F == state
     assert travelled(rig) == pytest.approx(SPEED**2 / (2 * SLOW) if option else 0.0)
 
@@ -175,6 +177,21 @@ def test_cia402_53_6502_claims_no_more_than_the_eds(plant):
     node.start(0)
     assert node.dictionary.values[0x6502 << 8] == 0x181
     assert node.application.state is S.SWITCH_ON_DISABLED
+
+
+def test_a_poor_eds_without_the_optional_objects_still_moves(rig):
+    od = deepcopy(load_eds("puma260_joint", 1))
+    for index in [index for index in od if index >= 0x6000]:
+        if index not in (0x6040, 0x6041, 0x6060, 0x6061, 0x6064, 0x607A, 0x6081, 0x6098, 0x60FF, 0x6071):
+            del od[index]
+    rig.drive.node = make_drive_node(od, 1, 0, rig.plant)
+    rig.drive.node.start(0)
+    rig.put(_1006=2500, _6081=5000).enable(1).put(_607A=300).word(0x1F).run(300)
+    assert rig.counts == 300
+    for mode in (6, 8, 9, 10):
+        rig.put(_6060=mode).word(0x1F).run(5)
+    rig.put(_6040=0x02).run(50)
+    assert rig.drive.read(0x6041) & 0x4F == 0x40
 
 
 def test_cia402_60b0_position_offset_is_added(rig):

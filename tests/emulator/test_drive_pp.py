@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 
@@ -128,7 +129,7 @@ def test_cia402_54_change_immediately_replaces_all_without_a_jump(rig):
     rig.run(700)
     places = [counts for _, counts in rig.trace]
     assert max(places) == pytest.approx(before + 20_000**2 / 2e5)  # braked first
-    steps = [b - a for a, b in zip(places, places[1:], strict=False)]
+    steps = [b - a for a, b in pairwise(places)]
     assert max(map(abs, steps)) <= 20_000 * 0.5e-3 + 1e-6
     bends = [abs(b - a) for a, b in zip(steps[::5], steps[5::5], strict=False)]
     assert max(bends) <= 100_000 * 2.5e-3 * 0.5e-3 + 1e-6
