@@ -1,9 +1,9 @@
-"""A CiA 402 drive in cyclic synchronous position mode, on one axis of the plant.
+"""A CiA 402 drive on one axis of the plant: states, faults and options; what a mode does is in `drive_modes`.
 
-At a SYNC in operation enabled the target received since the last one is latched; the plant reaches it by a straight
-ramp over 60C2h, at the next SYNC. Everywhere else the drive holds. It stops by itself when the master dies.
-Not here yet: profile position, homing, cyclic velocity and torque; 6502h does not claim them.
-Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, cyclic synchronous position mode.
+Outside operation enabled the drive holds. It stops by itself when the master dies: in the cyclic modes when SYNC or
+targets are missing, in all modes when the heartbeat is. A change of mode under way slows the motion down by 6084h
+until the new mode is given a target.
+Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, modes of operation.
 """
 
 from __future__ import annotations
@@ -13,20 +13,22 @@ from canopen.objectdictionary import ObjectDictionary
 from canprobe.eds import has_missed_syncs
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
+from canprobe.emulator.drive_faults import DriveFaults
 from canprobe.emulator.drive_feedback import DriveFeedback
+from canprobe.emulator.drive_mode import DriveParts
+from canprobe.emulator.drive_mode_selection import ModeSelection
 from canprobe.emulator.drive_motion import STEP_NS, AxisPlant, Motion
 from canprobe.emulator.drive_parameters import STAYS_STOPPED, DriveParameters
 from canprobe.emulator.drive_states import DriveStates
 from canprobe.emulator.drive_supervision import Supervision
+from canprobe.emulator.drive_units import FACTORS
 from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.node import SlaveNode
 from canprobe.protocol import cia402
-from canprobe.protocol.cia402 import Command, DriveState, Event, OperationMode
-from canprobe.protocol.emcy import FOLLOWING_ERROR, HEARTBEAT_LOST
+from canprobe.protocol.cia402 import POWERED_STATES, Command, DriveState, Event
+from canprobe.protocol.emcy import HEARTBEAT_LOST
 from canprobe.protocol.frames import NmtState
 
-CSP = OperationMode.CYCLIC_SYNC_POSITION
-SUPPORTED_MODES = frozenset({OperationMode.NONE, CSP})
 _TARGET, _STATUSWORD = key_of(0x607A), key_of(0x6041)
 _VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60FF})
 _ABORT_COMMANDS = {2: Command.DISABLE_VOLTAGE, 3: Command.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
@@ -46,28 +48,37 @@ class DriveApplication(Application):
         """
         self._has_misses = has_misses
         self._axis, self._plant = axis, plant
-        self._faults: list[int] = []
-        self._limited = self._following_error = self._standstill = False
-        self._fresh = False
-        self._enabled_ns = 0
-        self._mode = 0
+        self._standstill = False
 
     def attach(self, node: SlaveNode) -> None:
         """Hang the drive's objects on the node."""
         self._node, self._core = node, node.core
-        self._values = node.dictionary.values
-        self._parameters = DriveParameters(node.dictionary, self._has_misses)
-        self._motion = Motion(self._axis, self._plant, node.core.timers)
-        self._feedback = DriveFeedback(node, self._axis, self._plant, self._motion)
+        self._values, dictionary, timers = node.dictionary.values, node.dictionary, node.core.timers
+        self._parameters = DriveParameters(dictionary, self._has_misses)
+        self._motion = Motion(self._axis, self._plant, timers)
+        self._feedback = DriveFeedback(node, self._axis, self._plant, self._motion, self._parameters.units)
+        self._faults = DriveFaults(node, lambda t_ns: self._states.event(Event.FAULT_DETECTED, t_ns))
         self._states = DriveStates(self._entered_state, lambda: self._parameters.quick_stop in STAYS_STOPPED)
         self._supervision = Supervision(node, self._parameters, self._abort_connection)
-        self._pass_on = node.core.timers.new(self._states.pass_on)
-        self._fault_timer = node.core.timers.new(self._raise_injected)
+        self._modes = ModeSelection(self._parts(), lambda: self._states.state is _ENABLED)
+        self._pass_on = timers.new(self._states.pass_on)
         node.store.volatile |= _VOLATILE
-        node.dictionary.on_check(0x6060, _check_mode)
-        node.dictionary.on_write(0x6060, lambda _sub, value: self._select_mode(int(value)))
-        node.dictionary.on_write(0x6040, lambda _sub, word: self._states.controlword(int(word), self._core.now_ns))
-        node.dictionary.on_write(0x607A, self._target_written)
+        for index in FACTORS:
+            dictionary.on_check(index, self._check_not_moving)
+        dictionary.on_write(0x6040, self._controlword)
+
+    def _parts(self) -> DriveParts:
+        return DriveParts(
+            node=self._node,
+            axis=self._axis,
+            plant=self._plant,
+            parameters=self._parameters,
+            motion=self._motion,
+            feedback=self._feedback,
+            supervision=self._supervision,
+            show=self._show,
+            fault=self._faults.find,
+        )
 
     @property
     def state(self) -> DriveState:
@@ -76,21 +87,18 @@ class DriveApplication(Application):
 
     def inject_fault(self, code: int) -> None:
         """Let the drive detect a fault now: EMCY `code`, fault reaction, fault. Goes out at the next `advance`."""
-        self._faults.append(code)
-        self._fault_timer.arm(self._core.now_ns)
+        self._faults.inject(code)
 
     # ------------------------------------------------------------------ the node's events
 
     def reset(self, t_ns: int) -> None:
-        """Power on: brake closed, faults forgotten."""
-        self._faults.clear()
-        self._limited = self._following_error = self._standstill = self._fresh = False
-        self._node.dictionary.put(0x6502, 0, 1 << CSP - 1)
-        self._node.dictionary.put(0x603F, 0, 0)
+        """Power on: brake closed, faults and home forgotten."""
+        self._faults.reset()
+        self._standstill = False
         self._parameters.read()
         self._feedback.reset(t_ns)
         self._motion.hold(t_ns)
-        self._select_mode(self._node.dictionary.number(0x6060))
+        self._modes.reset()
         self._states.reset(t_ns)
 
     def entered(self, t_ns: int) -> None:
@@ -108,43 +116,37 @@ class DriveApplication(Application):
         self._abort_connection(HEARTBEAT_LOST, t_ns)
 
     def sync(self, t_ns: int, counter: int) -> None:
-        """Latch the target, watch the following error and the master."""
-        counts = self._feedback.measure(t_ns)
-        if self._states.state is not _ENABLED:
-            self._fresh = False
+        """The mode watches and latches, one SYNC after it was enabled at the earliest."""
+        counts, modes = self._feedback.measure(t_ns), self._modes
+        if modes.word_waits:
+            modes.take_word(t_ns)
+        if self._states.state is _ENABLED and t_ns > modes.since_ns:
+            modes.active.sync(t_ns, counts)
+
+    def _controlword(self, subindex: int, value: Value) -> None:
+        states, modes = self._states, self._modes
+        if value == states.idle_word:
+            return  # as in every cycle of operation
+        word, now_ns = int(value), self._core.now_ns
+        if word == modes.word:
+            states.controlword(word, now_ns)
             return
-        if self._mode == CSP and t_ns > self._enabled_ns:
-            if self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
-                self._following_error = True
-                self._fault(FOLLOWING_ERROR, t_ns)
-                return
-            self._supervision.sync(self._fresh, t_ns)
-            if self._fresh and self._states.state is _ENABLED:
-                self._latch(t_ns)
-        self._fresh = False
+        modes.keep_word(word)
+        enabled = states.state is _ENABLED
+        states.controlword(word, now_ns)
+        if enabled and states.state is _ENABLED:
+            modes.let_word_wait()
 
-    def _latch(self, t_ns: int) -> None:
-        target: int = self._values[_TARGET]  # type: ignore[assignment]
-        allowed = self._parameters.clamp(target)
-        self._motion.reach(allowed, t_ns, self._parameters.interpolation_ns)
-        if (allowed != target) is not self._limited:
-            self._limited = allowed != target
-            self._show()
-
-    def _target_written(self, subindex: int, value: Value) -> None:
-        self._fresh = True
-
-    def _select_mode(self, mode: int) -> None:
-        if self._mode == CSP and self._states.state is _ENABLED and mode != CSP:
-            self._motion.decelerate(self._core.now_ns, self._parameters.deceleration, _nothing)
-        self._mode = mode
-        self._node.dictionary.put(0x6061, 0, mode)
-        self._show()
+    def _check_not_moving(self, subindex: int, value: Value) -> None:
+        if self._states.state in POWERED_STATES:
+            raise SdoAbort(Abort.DEVICE_STATE)
 
     # ------------------------------------------------------------------ states
 
     def _entered_state(self, old: DriveState, new: DriveState, t_ns: int) -> None:
         self._standstill = False
+        if old is _ENABLED:
+            self._modes.active.leave(t_ns)
         if new is _ENABLED:
             self._enable(t_ns)
         elif new is DriveState.QUICK_STOP_ACTIVE:
@@ -156,8 +158,8 @@ class DriveApplication(Application):
         elif new is DriveState.SWITCHED_ON:
             self._pass_on.arm(t_ns + STEP_NS)
         elif old is DriveState.FAULT:
-            self._forget_fault()
-        elif old is DriveState.QUICK_STOP_ACTIVE and self._motion.stopping:
+            self._faults.forget()
+        elif old is DriveState.QUICK_STOP_ACTIVE and self._motion.busy:
             self._motion.hold(t_ns)
         if new is not _ENABLED:
             self._supervision.stop()
@@ -165,9 +167,8 @@ class DriveApplication(Application):
 
     def _enable(self, t_ns: int) -> None:
         here = self._motion.hold(t_ns)
-        self._values[_TARGET] = round(here)
-        self._enabled_ns, self._fresh, self._limited = t_ns, False, False
-        self._supervision.start(t_ns)
+        self._values[_TARGET] = round(self._parameters.units.position(here))
+        self._modes.start(t_ns)
 
     def _disable(self, new: DriveState, t_ns: int) -> None:
         """605Bh and 605Ch: on the slow-down ramp (1) or by the brake at once (0); disable voltage is the brake."""
@@ -177,7 +178,7 @@ class DriveApplication(Application):
         }
         rate = self._parameters.deceleration if options.get(new) == 1 else 0
         if rate:
-            self._motion.decelerate(t_ns, rate, _nothing)
+            self._motion.decelerate(t_ns, rate)
         else:
             self._motion.hold(t_ns)
 
@@ -191,47 +192,26 @@ class DriveApplication(Application):
     def _reacted(self, t_ns: int) -> None:
         self._states.event(Event.FAULT_REACTION_DONE, t_ns)
 
-    # ------------------------------------------------------------------ faults
-
     def _abort_connection(self, code: int, t_ns: int) -> None:
         option = self._parameters.abort_connection
         if self._states.state is not _ENABLED:
             return
         if option == 1:
-            self._fault(code, t_ns)
+            self._faults.find(code, t_ns)
         elif command := _ABORT_COMMANDS.get(option):
             self._states.force(command, t_ns)
 
-    def _fault(self, code: int, t_ns: int) -> None:
-        self._faults.append(code)
-        self._node.dictionary.put(0x603F, 0, code)
-        self._node.emcy.report(code)
-        self._states.event(Event.FAULT_DETECTED, t_ns)
-
-    def _raise_injected(self, due_ns: int) -> None:
-        codes, self._faults = self._faults, []
-        for code in codes:
-            self._fault(code, due_ns)
-
-    def _forget_fault(self) -> None:
-        for code in self._faults:
-            self._node.emcy.clear(code)
-        self._faults.clear()
-        self._following_error = False
-        self._node.dictionary.put(0x603F, 0, 0)
-
     def _show(self) -> None:
         state = self._states.state
-        follows = state is _ENABLED and self._mode == CSP
         word = (
             cia402.statusword_of(state)
             | 1 << cia402.VOLTAGE_ENABLED
             | (self._core.state is NmtState.OPERATIONAL) << cia402.REMOTE
             | self._standstill << cia402.TARGET_REACHED
-            | self._limited << cia402.INTERNAL_LIMIT
-            | follows << cia402.DRIVE_FOLLOWS
-            | self._following_error << cia402.FOLLOWING_ERROR
+            | self._faults.following_error << cia402.FOLLOWING_ERROR
         )
+        if state is _ENABLED:
+            word |= self._modes.active.status() | self._modes.active.limited << cia402.INTERNAL_LIMIT
         if word != self._values.get(_STATUSWORD):
             self._node.dictionary.put(0x6041, 0, word)
             self._node.pdos.event(0x6041)
@@ -247,12 +227,3 @@ def make_drive_node(od: ObjectDictionary, node_id: int, axis: int, plant: AxisPl
         plant: shared by all nodes.
     """
     return SlaveNode(od, node_id, DriveApplication(axis, plant, has_missed_syncs(od)))
-
-
-def _check_mode(subindex: int, value: Value) -> None:
-    if value not in SUPPORTED_MODES:
-        raise SdoAbort(Abort.VALUE)
-
-
-def _nothing(t_ns: int) -> None:
-    return None

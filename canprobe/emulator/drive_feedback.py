@@ -1,20 +1,24 @@
 """What a drive tells of itself: actual and demand values, brought up to date only where somebody reads them.
 
-Source: CiA 402-2, objects 6062h, 6064h, 606Ch, 6077h, 60F4h.
+Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
+Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from canprobe.emulator.drive_motion import AxisPlant, Motion
+from canprobe.emulator.drive_units import Units
 from canprobe.emulator.node import SlaveNode
 
 _I16, _I32 = 1 << 15, 1 << 31
 
 
 def _within(value: float, limit: int) -> int:
-    return min(max(round(value), -limit), limit - 1)
+    number = round(value)
+    return number if -limit <= number < limit else min(max(number, -limit), limit - 1)
 
 
 class DriveFeedback:
@@ -22,19 +26,25 @@ class DriveFeedback:
 
     Attributes:
         counts: motor position at the last `measure`.
+        plant_torque: tells the torque that the plant needs for its motion now, permille.
+        torque: tells the torque now, permille; a drive that controls torque puts its own there.
     """
 
-    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion) -> None:
-        self._core, self._axis, self._plant, self._motion = node.core, axis, plant, motion
+    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
+        self._core, self._axis, self._plant = node.core, axis, plant
         self.counts = 0.0
         self._velocity = 0.0
         self._t_ns: int | None = None
+        self.plant_torque = partial(plant.torque_permille, axis)
+        self.torque: Callable[[], float] = self.plant_torque
         sources: dict[int, Callable[[], int]] = {
-            0x6062: lambda: _within(motion.demand(self._t_ns or 0), _I32),
-            0x6064: lambda: _within(self.counts, _I32),
-            0x606C: lambda: _within(self._velocity, _I32),
-            0x6077: lambda: _within(plant.torque_permille(axis), _I16),
-            0x60F4: lambda: _within(motion.demand(self._t_ns or 0) - self.counts, _I32),
+            0x6062: lambda: _within(units.position(motion.demand(self._t_ns or 0)), _I32),
+            0x6064: lambda: _within((self.counts - units.origin) / units.scale, _I32),
+            0x606B: lambda: _within(motion.speed(self._t_ns or 0) / units.speed_scale, _I32),
+            0x606C: lambda: _within(self._velocity / units.speed_scale, _I32),
+            0x6074: lambda: _within(self.torque(), _I16),
+            0x6077: lambda: _within(self.torque(), _I16),
+            0x60F4: lambda: _within((motion.demand(self._t_ns or 0) - self.counts) / units.scale, _I32),
         }
         for index, source in sources.items():
             if node.dictionary.has_index(index):

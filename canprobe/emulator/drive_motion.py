@@ -1,16 +1,22 @@
-"""The reference that one drive gives to its axis of the plant: ramps, hold, deceleration to standstill."""
+"""The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from typing import Protocol
 
+from canprobe.emulator.drive_profile import braking
+from canprobe.emulator.drive_trajectories import Trajectory
+from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.timers import Timers
 
 STEP_NS = 2_500_000
 STANDSTILL_COUNTS = 0.1
 """Motion in one step below which the motor is at rest."""
 PATIENCE_STEPS = 400
+NOTHING_S = 1e-9
+"""Rest of a trajectory that is none."""
 
 
 class AxisPlant(Protocol):
@@ -25,31 +31,38 @@ class AxisPlant(Protocol):
     def torque_permille(self, axis: int) -> int:
         """Motor torque, 1/1000 of the rated torque."""
 
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How the motor answers to torque."""
+
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
 
 
 class Motion:
-    """Reference of one axis; remembers the ramp it gave last."""
+    """Reference of one axis; remembers the ramp it gave last.
+
+    A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
+    """
 
     def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
         self._axis, self._plant = axis, plant
         self._timer = timers.new(self._step)
         self._start = self._end = 0.0
         self._t0 = self._t1 = 0
-        self._speed = self._rate = 0.0
+        self._trajectory: Trajectory | None = None
+        self._begin_ns = 0
         self._patience = 0
         self._was = 0.0
-        self._done: Callable[[int], None] = _nothing
+        self._done: Callable[[int], None] | None = None
 
     @property
-    def stopping(self) -> bool:
-        """A deceleration is under way."""
+    def busy(self) -> bool:
+        """A trajectory or a deceleration is under way."""
         return self._timer.due_ns is not None
 
     def hold(self, t_ns: int) -> float:
         """Stay where the motor is; returns that position, counts."""
-        self._timer.cancel()
+        self._stop()
         self._plant.advance(t_ns)
         here = self._plant.motor_counts(self._axis)
         self._ramp(here, here, t_ns, t_ns + STEP_NS)
@@ -57,6 +70,9 @@ class Motion:
 
     def reach(self, counts: float, t_ns: int, duration_ns: int) -> None:
         """From the end of the present ramp to `counts`, in `duration_ns` from now."""
+        if self._timer.due_ns is not None:
+            self._end = self.demand(t_ns)
+            self._stop()
         self._ramp(self._end, counts, t_ns, t_ns + duration_ns)
 
     def demand(self, t_ns: int) -> float:
@@ -67,40 +83,58 @@ class Motion:
 
     def speed(self, t_ns: int) -> float:
         """Speed of the reference, counts/s; a ramp that has just ended still counts, as SYNC comes when it ends."""
+        if self._trajectory is not None:
+            return self._trajectory.at((t_ns - self._begin_ns) * 1e-9)[1]
         moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
         return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
 
-    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None]) -> None:
+    def follow(self, trajectory: Trajectory, t_ns: int, done: Callable[[int], None] | None = None) -> None:
+        """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
+        self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
+        self._patience, self._was = PATIENCE_STEPS, inf
+        if trajectory.duration_s < NOTHING_S:
+            here = self.demand(t_ns)
+            self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        self._step(t_ns)
+
+    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None] | None = None) -> None:
         """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
 
         Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
         reference at once.
         """
-        self._patience = PATIENCE_STEPS
+        here, speed = self.demand(t_ns), self.speed(t_ns) if rate > 0 else 0.0
+        if speed:
+            self.follow(braking(here, speed, rate), t_ns, done)
+            return
+        self._stop()
         self._plant.advance(t_ns)
         self._was = self._plant.motor_counts(self._axis)
-        self._speed = self.speed(t_ns) if rate > 0 else 0.0
-        self._rate, self._done = rate, done
-        here = self.demand(t_ns)
+        self._patience, self._done = PATIENCE_STEPS, done
         self._ramp(here, here, t_ns, t_ns + STEP_NS)
-        if self._speed:
-            self._step(t_ns)
-        else:
-            self._timer.arm(t_ns + STEP_NS)
+        self._timer.arm(t_ns + STEP_NS)
 
     def _step(self, due_ns: int) -> None:
-        speed = self._speed
-        if not speed:
+        trajectory = self._trajectory
+        if trajectory is None:
             self._await_standstill(due_ns)
             return
-        seconds = min(STEP_NS * 1e-9, abs(speed) / self._rate)
-        rest = speed - self._rate * seconds * (1 if speed > 0 else -1)
-        self._speed = rest if seconds == STEP_NS * 1e-9 and rest * speed > 0 else 0.0
-        travel = (speed + self._speed) / 2 * seconds
-        self._ramp(self._end, self._end + travel, due_ns, due_ns + max(1, round(seconds * 1e9)))
+        begun_s = (due_ns - self._begin_ns) * 1e-9
+        left_s = trajectory.duration_s - begun_s
+        if left_s < NOTHING_S:
+            self._trajectory, self._start = None, self._end  # the ramp that has just ended no longer counts as motion
+            self._await_standstill(due_ns)
+            return
+        step_s = STEP_NS * 1e-9
+        last = left_s <= step_s
+        step_ns = max(1, round(left_s * 1e9)) if last else STEP_NS
+        end = trajectory.at(trajectory.duration_s if last else begun_s + step_s)[0]
+        self._ramp(self.demand(due_ns), end, due_ns, due_ns + step_ns)
         self._timer.arm(due_ns + STEP_NS)
 
     def _await_standstill(self, due_ns: int) -> None:
+        if self._done is None:
+            return
         self._plant.advance(due_ns)
         here = self._plant.motor_counts(self._axis)
         moved, self._was = abs(here - self._was), here
@@ -110,10 +144,10 @@ class Motion:
         else:
             self._done(due_ns)
 
+    def _stop(self) -> None:
+        self._timer.cancel()
+        self._trajectory = None
+
     def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
         self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
-
-
-def _nothing(t_ns: int) -> None:
-    return None

@@ -1,93 +1,132 @@
 """Parameters of a CiA 402 drive as its application uses them, read from the dictionary whenever one is written.
 
-Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h, 6066h, 607Dh, 6084h, 6085h, 60C2h.
+Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 607Fh, 6080h, 6083h–6085h, 609Ah, 60C2h.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from math import inf
+
 from canprobe.eds import MISSED_SYNCS
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.dictionary import Dictionary
+from canprobe.emulator.drive_units import FACTORS, Units
 from canprobe.emulator.entries import Value
 
-QUICK_STOP_OPTIONS = frozenset({1, 2, 5, 6})
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
 DEFAULT_MISSES = 5
 """Of a drive whose EDS has no 2000h."""
+DEFAULT_ACCELERATION = 100_000
+"""Position units/s², of a drive whose EDS has no profile acceleration."""
+PEAK_PERMILLE = 2000
+"""What the plant's motors can do at most."""
+_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
 _INDICES = (
-    0x1006,
-    MISSED_SYNCS,
-    0x6007,
-    0x605A,
-    0x605B,
-    0x605C,
-    0x605E,
-    0x6065,
-    0x6066,
-    0x607D,
-    0x6084,
-    0x6085,
-    0x60C2,
+    *(0x1006, MISSED_SYNCS, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
+    *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
+    *FACTORS,
 )
 
 
 class DriveParameters:
-    """Plain numbers; `read` refreshes them.
+    """Plain numbers; `read` refreshes them. Lengths, speeds and accelerations are counts here, whatever the units.
 
     Attributes:
+        units: the factor group.
         interpolation_ns: 60C2h, time to reach a latched target.
         cycle_ns: SYNC period, 1006h or else 60C2h.
-        following_window, following_timeout_ns: 6065h (counts), 6066h.
+        following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
+        position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
         misses: 2000h, SYNCs missed before the master is taken for dead.
-        low, high: 607Dh, counts; low >= high means no limits.
-        abort_connection, quick_stop, shutdown, disable, fault_reaction: option codes.
-        deceleration, quick_deceleration: 6084h, 6085h, counts/s².
+        low, high: 607Dh, position units; low >= high means no limits.
+        abort_connection, quick_stop, shutdown, disable, halt, fault_reaction: option codes.
+        acceleration, deceleration, quick_deceleration, homing_acceleration: 6083h–6085h, 609Ah, counts/s².
+        max_speed: the lower of 607Fh and 6080h, counts/s; infinite for neither.
+        max_torque: 6072h, permille.
     """
 
     def __init__(self, dictionary: Dictionary, has_misses: bool = False) -> None:
         """`has_misses` where 2000h is what it is in our own EDS."""
         self._dictionary = dictionary
         self._has_misses = has_misses
+        self.units = Units()
         self.read()
         for index in _INDICES:
             dictionary.on_write(index, lambda _sub, _value: self.read())
-        dictionary.on_check(0x605A, _check_quick_stop)
+        for index, allowed in _OPTIONS.items():
+            dictionary.on_check(index, _check_among(allowed))
         dictionary.on_check(0x60C2, _check_interpolation)
 
     def read(self) -> None:
         """Take the present values of the dictionary."""
         number = self._dictionary.number
+        self.units.read(self._dictionary)
         self.interpolation_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
         self.cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
-        self.following_window = number(0x6065, 0, NO_WINDOW)
-        self.following_timeout_ns = number(0x6066) * 1_000_000
+        self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
+        self.position_window, self.position_time_ns = self._window(0x6067), number(0x6068) * 1_000_000
         self.misses = number(MISSED_SYNCS, 0, DEFAULT_MISSES) if self._has_misses else DEFAULT_MISSES
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
+        self._read_options()
+        self._read_dynamics()
+
+    def _read_options(self) -> None:
+        number = self._dictionary.number
         self.abort_connection = number(0x6007, 0, 3)
         self.quick_stop = number(0x605A, 0, 2)
         self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
+        self.halt = number(0x605D, 0, 1)
         self.fault_reaction = number(0x605E, 0, 2)
-        self.deceleration, self.quick_deceleration = number(0x6084), number(0x6085)
+
+    def _read_dynamics(self) -> None:
+        number, magnitude = self._dictionary.number, self.units.magnitude
+        self.deceleration, self.quick_deceleration = number(0x6084) * magnitude, number(0x6085) * magnitude
+        self.acceleration = (number(0x6083) or DEFAULT_ACCELERATION) * magnitude
+        self.homing_acceleration = (number(0x609A) or DEFAULT_ACCELERATION) * magnitude
+        turns_per_s = number(0x6080) / 60.0
+        self.max_speed = min(number(0x607F) * magnitude or inf, turns_per_s * self.units.turn or inf)
+        self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
+
+    def _window(self, index: int) -> float:
+        value = self._dictionary.number(index, 0, NO_WINDOW)
+        return inf if value == NO_WINDOW else value * self.units.magnitude
 
     @property
-    def quick_stop_rate(self) -> int:
+    def quick_stop_rate(self) -> float:
         """Deceleration of a quick stop: the slow-down ramp for 605Ah = 1, 5, the quick stop ramp for 2, 6."""
         return self.deceleration if self.quick_stop in (1, 5) else self.quick_deceleration
 
     @property
-    def fault_rate(self) -> int:
+    def halt_rate(self) -> float:
+        """Deceleration of a halt, 605Dh: the slow-down ramp (1) or the quick stop ramp (2)."""
+        return self.quick_deceleration if self.halt == 2 else self.deceleration
+
+    @property
+    def fault_rate(self) -> float:
         """Deceleration of the fault reaction, 605Eh; 0 means the brake at once."""
         return {1: self.deceleration, 2: self.quick_deceleration}.get(self.fault_reaction, 0)
+
+    @property
+    def fence(self) -> tuple[float, float]:
+        """The software limits, counts, lower first; infinite for none."""
+        if self.low >= self.high:
+            return -inf, inf
+        ends = self.units.counts(self.low), self.units.counts(self.high)
+        return min(ends), max(ends)
 
     def clamp(self, target: int) -> int:
         """The target within the software limits."""
         return min(max(target, self.low), self.high) if self.low < self.high else target
 
 
-def _check_quick_stop(subindex: int, value: Value) -> None:
-    if value not in QUICK_STOP_OPTIONS:
-        raise SdoAbort(Abort.VALUE)
+def _check_among(allowed: frozenset[int]) -> Callable[[int, Value], None]:
+    def check(subindex: int, value: Value) -> None:
+        if value not in allowed:
+            raise SdoAbort(Abort.VALUE)
+
+    return check
 
 
 def _check_interpolation(subindex: int, value: Value) -> None:

@@ -26,6 +26,7 @@ class DriveStates:
     Attributes:
         state: present state.
         command: the command that stands, or None.
+        idle_word: the last controlword, if it did nothing and nothing has happened since; it need not be given again.
         resumable: whether a quick stop may be left for operation (605Ah = 5, 6).
     """
 
@@ -35,25 +36,22 @@ class DriveStates:
         self.state = INITIAL_STATE
         self.command: Command | None = None
         self._previous = 0
-        self._idle_word: int | None = None
-        self._idle_state = INITIAL_STATE
+        self.idle_word: int | None = None
 
     def reset(self, t_ns: int) -> None:
         """Power on: self-test passed at once."""
         self.state, self.command, self._previous = INITIAL_STATE, None, 0
-        self._idle_word = None
+        self.idle_word = None
         self.event(Event.INITIALISED, t_ns)
 
     def controlword(self, word: int, t_ns: int) -> None:
         """A controlword was received."""
-        if word == self._idle_word and self.state is self._idle_state:
-            return  # as in every cycle of operation: it did nothing the last time
         command = command_of(word, self._previous)
         repeated, self.command, self._previous = command is self.command, command, word
         goal = None if command is None else TRANSITIONS.get((self.state, command))
         resumes = self.state is DriveState.QUICK_STOP_ACTIVE and goal is DriveState.OPERATION_ENABLED
         if goal is None or (resumes and (repeated or not self.resumable())):
-            self._idle_word, self._idle_state = word, self.state
+            self.idle_word = word
             return  # a drive that stopped by itself is not restarted by a controlword that merely repeats
         self._go(goal, t_ns)
 
@@ -75,5 +73,5 @@ class DriveStates:
             self._go(goal, t_ns)
 
     def _go(self, goal: DriveState, t_ns: int) -> None:
-        old, self.state = self.state, goal
+        old, self.state, self.idle_word = self.state, goal, None
         self._entered(old, goal, t_ns)

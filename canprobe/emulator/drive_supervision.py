@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from canprobe.emulator.drive_parameters import NO_WINDOW, DriveParameters
+from canprobe.emulator.drive_parameters import DriveParameters
 from canprobe.emulator.node import SlaveNode
 from canprobe.protocol.emcy import RPDO_TIMEOUT, SYNC_LOST
 
 
 class Supervision:
-    """Counts missed SYNCs and targets, and times the following error, between `start` and `stop`."""
+    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error."""
 
     def __init__(self, node: SlaveNode, parameters: DriveParameters, on_loss: Callable[[int, int], None]) -> None:
         """`on_loss(code, t_ns)` is called when the master is taken for dead."""
@@ -23,16 +23,23 @@ class Supervision:
         self._by_rpdo = False
         self._outside_ns: int | None = None
 
-    def start(self, t_ns: int) -> None:
-        """Operation is enabled."""
+    def start(self, target: int | None, t_ns: int) -> None:
+        """Operation is enabled, in a mode that lives by SYNC and the object `target`, or by neither (None)."""
         self._misses = 0
         self._outside_ns = None
-        self._by_rpdo = self._node.pdos.receives(0x607A)
-        self._await_sync(t_ns)
+        self._timer.cancel()
+        if target is not None:
+            self._by_rpdo = self._node.pdos.receives(target)
+            self._await_sync(t_ns)
 
     def stop(self) -> None:
         """Operation is no longer enabled."""
         self._timer.cancel()
+
+    @property
+    def watching(self) -> bool:
+        """Between `start` and `stop`."""
+        return self._timer.due_ns is not None
 
     def sync(self, fresh: bool, t_ns: int) -> None:
         """A SYNC came, with a target since the last one (fresh) or without."""
@@ -45,7 +52,7 @@ class Supervision:
     def following_error(self, error_counts: float, t_ns: int) -> bool:
         """Whether the error has been outside 6065h for the time of 6066h."""
         window = self._parameters.following_window
-        if window == NO_WINDOW or abs(error_counts) <= window:
+        if abs(error_counts) <= window:
             self._outside_ns = None
             return False
         if self._outside_ns is None:

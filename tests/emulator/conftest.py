@@ -14,6 +14,7 @@ from canopen.objectdictionary.eds import import_eds
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.plant.motor import MotorDynamics
 
 U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5
@@ -161,6 +162,7 @@ class FakePlant:
     t_ns: int = 0
     stuck: bool = False
     torque: int = 0
+    dynamics: MotorDynamics = field(default_factory=lambda: MotorDynamics(gain=100.0, coulomb=50.0, damping=4.0))
 
     def advance(self, t_ns: int) -> None:
         self.t_ns = max(t_ns, self.t_ns)
@@ -175,6 +177,9 @@ class FakePlant:
 
     def torque_permille(self, axis: int) -> int:
         return self.torque
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        return self.dynamics
 
     def set_ramp(self, axis: int, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         assert t1_ns > t0_ns
@@ -219,3 +224,71 @@ def drive(plant: FakePlant) -> Bench:
     for index, value, size in ((0x6060, 8, 1), (0x1019, 240, 1), (0x1006, 2500, 4)):
         assert made.write(index, 0, value, size) == 0
     return made
+
+
+@dataclass
+class Rig:
+    """A drive at work: words over SDO, time in small steps, the plant's true motion."""
+
+    drive: Bench
+    plant: FakePlant
+    trace: list[tuple[int, float]] = field(default_factory=list)
+
+    def put(self, **objects: int) -> Rig:
+        """Write plain objects, as `_6081=5000`, or sub-indices, as `_607D_1=-5`."""
+        for name, value in objects.items():
+            index, _, sub = name[1:].partition("_")
+            entry = self.drive.node.dictionary.find(int(index, 16), int(sub or "0"))
+            assert self.drive.write(int(index, 16), int(sub or "0"), value, entry.bits // 8) == 0, name
+        return self
+
+    def word(self, word: int) -> Rig:
+        """A controlword, and all that it does at once."""
+        self.put(_6040=word)
+        self.drive.advance(self.drive.t_ns)
+        return self
+
+    def enable(self, mode: int) -> Rig:
+        self.put(_6060=mode)
+        for word in (0x06, 0x07, 0x0F):
+            self.word(word)
+        assert self.drive.read(0x6041) & 0x6F == 0x27
+        return self
+
+    def run(self, ms: float, step_us: int = 500) -> Rig:
+        """Let time pass; `trace` gets (t_ns, counts)."""
+        end_ns, self.trace = self.drive.t_ns + round(ms * 1e6), [(self.drive.t_ns, self.plant.counts[0])]
+        while self.drive.t_ns < end_ns:
+            self.drive.advance(self.drive.t_ns + step_us * 1000)
+            self.trace.append((self.drive.t_ns, self.plant.counts[0]))
+        return self
+
+    def cycles(self, count: int, rpdo: str | None = None) -> list[tuple[int, str]]:
+        """SYNC every 2.5 ms, then an RPDO1 in hex; the frames of the last cycle."""
+        sent: list[tuple[int, str]] = []
+        for _ in range(count):
+            k = self.drive.t_ns // 2_500_000 + 1
+            sent = self.drive.advance(k * 2_500_000) + self.drive.send(0x80, f"{(k - 1) % 240 + 1:02x}")
+            self.trace.append((self.drive.t_ns, self.plant.counts[0]))
+            if rpdo is not None:
+                self.drive.send(0x201, rpdo, k * 2_500_000 + 300_000)
+        return sent
+
+    def signed(self, index: int, sub: int = 0) -> int:
+        value, bits = self.drive.read(index, sub), self.drive.node.dictionary.find(index, sub).bits
+        return value - (1 << bits) if value >> bits - 1 else value
+
+    def bits(self, *numbers: int) -> tuple[int, ...]:
+        """Bits of the statusword."""
+        word = self.drive.read(0x6041)
+        return tuple(word >> number & 1 for number in numbers)
+
+    @property
+    def counts(self) -> float:
+        return self.plant.counts[0]
+
+
+@pytest.fixture
+def rig(drive: Bench, plant: FakePlant) -> Rig:
+    """The drive of `drive`, with room for the following error."""
+    return Rig(drive, plant)

@@ -122,6 +122,14 @@ def test_cia402_52_fault_reset_needs_a_rising_edge(drive):
     assert (drive.read(0x603F), drive.read(0x1001)) == (0, 0)
 
 
+def test_cia402_52_a_second_fault_is_reset_by_a_second_edge(drive):
+    for _ in range(2):
+        fault(drive, 0x2310)
+        for word in (0x00, 0x00, 0x80):
+            drive.write(0x6040, 0, word, 2)
+        assert drive.node.application.state is S.SWITCH_ON_DISABLED
+
+
 @pytest.mark.parametrize("option", [1, 2, 5, 6])
 def test_cia402_51_quick_stop_options(drive, option):
     bring(drive, S.OPERATION_ENABLED, option)
@@ -151,13 +159,14 @@ def test_cia402_51_options_that_do_not_exist_are_refused(drive, option):
 
 
 @pytest.mark.parametrize(
-    ("mode", "code"), [(0, 0), (8, 0), (1, 0x06090030), (6, 0x06090030), (9, 0x06090030), (10, 0x06090030)]
+    ("mode", "code"),
+    [(m, 0) for m in (0, 1, 6, 8, 9, 10)] + [(m, 0x06090030) for m in (2, 3, 4, 5, 7)] + [(11, 0x06090031)],
 )
 def test_cia402_53_modes_follow_and_only_true_ones_are_taken(drive, mode, code):
     drive.write(0x6060, 0, 0, 1)
     assert drive.write(0x6060, 0, mode, 1) == code
     assert drive.read(0x6061) == (0 if code else mode)
-    assert drive.read(0x6502) == 0x80  # CSP, and nothing else yet
+    assert drive.read(0x6502) == 0x3A1  # PP, homing, CSP, CSV, CST
 
 
 def test_cia402_53_csp_bit_12_and_remote_bit_9(drive):

@@ -13,6 +13,7 @@ from math import cos, exp, pi, sin, sqrt, tanh
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
 
 Transition = tuple[float, float, float, float]
@@ -218,6 +219,22 @@ class IdealArm:
         torque += COULOMB_NM[axis] * tanh(rate / _STICTION_RATE)
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
         return max(-_PEAK_PERMILLE, min(_PEAK_PERMILLE, permille))
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
+
+        The wrist's coupling is left out here: it acts on positions only.
+
+        Args:
+            axis: 0 to 5.
+        """
+        share = dict(self._rows[axis])[axis]
+        inertia = REFLECTED_INERTIA[axis]
+        return MotorDynamics(
+            gain=CONTINUOUS_TORQUE_NM[axis] / (1000.0 * inertia * abs(share)),
+            coulomb=1000.0 * COULOMB_NM[axis] / CONTINUOUS_TORQUE_NM[axis],
+            damping=VISCOUS_NMS[axis] / inertia,
+        )
 
     def _states(self) -> list[State]:
         if self._evaluated is None:

@@ -15,6 +15,7 @@ import numpy as np
 from canprobe.emulator.plant.arm import IdealArm
 from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
 from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
+from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import chain, point_velocity, tool_z_offset
@@ -192,6 +193,17 @@ class Plant:
             axis: 0 to 5.
         """
         return self.arm.torque_permille(axis) if self.arm is not None else 0
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
+
+        Args:
+            axis: 0 to 5.
+
+        Raises:
+            RuntimeError: without an arm.
+        """
+        return self._need_arm().motor_dynamics(axis)
 
     def _need_arm(self) -> IdealArm:
         if self.arm is None:

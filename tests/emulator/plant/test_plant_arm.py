@@ -197,3 +197,22 @@ def test_torque_is_kept_within_the_peak():
     a.set_ramp(0, a.counts[0] + 1e6, a.counts[0] + 1e6, 0, 0)
     a.advance(MS)
     assert a.torque_permille(0) == 2000
+
+
+@pytest.mark.parametrize("axis", range(6))
+def test_motor_dynamics_agree_with_the_torque_of_a_steady_motion(axis):
+    a = arm()
+    gain, coulomb, damping = a.motor_dynamics(axis)
+    start, rate = a.counts[axis], 20_000.0
+    a.set_ramp(axis, start, start + rate, 0, 1000 * MS)
+    a.advance(900 * MS)
+    needed = coulomb + rate * damping / gain  # where gain (torque - coulomb) = damping v
+    assert a.torque_permille(axis) == pytest.approx(needed, abs=0.6)
+
+
+def test_motor_dynamics_of_joint_1():
+    gain, coulomb, damping = arm().motor_dynamics(0)
+    counts_per_rad = 46720 / (2 * math.pi)
+    assert gain == pytest.approx(6.4e-3 / 0.030 * counts_per_rad, rel=1e-4)
+    assert coulomb == pytest.approx(1000 * 2.2 / 6.4)
+    assert damping == pytest.approx(0.32 / 0.030)

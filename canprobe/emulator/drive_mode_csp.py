@@ -1,0 +1,56 @@
+"""Cyclic synchronous position: a target latched at a SYNC is reached by a straight ramp after 60C2h.
+
+Offsets of velocity and torque (60B1h, 60B2h) are feed-forwards; the ideal plant needs none and they do nothing here.
+Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 60B0h, 60C2h.
+"""
+
+from __future__ import annotations
+
+from canprobe.emulator.drive_mode import FOLLOWS, DriveMode, DriveParts
+from canprobe.emulator.drive_parameters import PEAK_PERMILLE
+from canprobe.emulator.entries import key_of
+from canprobe.protocol.emcy import FOLLOWING_ERROR
+
+_TARGET, _OFFSET = key_of(0x607A), key_of(0x60B0)
+
+
+class CyclicPosition(DriveMode):
+    """Mode 8. It is the hot one, hence on its own beside `CyclicMode`."""
+
+    target = 0x607A
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._fresh = False
+        parts.node.dictionary.on_write(self.target, self._target_written)
+
+    def start(self, word: int, t_ns: int) -> None:
+        """A target that came before does not count."""
+        self._fresh = False
+        super().start(word, t_ns)
+
+    def status(self) -> int:
+        """The drive follows the command value, unless halted."""
+        return super().status() if self.halted else FOLLOWS
+
+    def sync(self, t_ns: int, counts: float) -> None:
+        """Watch the following error and the master, latch the target received since the last SYNC."""
+        if self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
+            self.parts.fault(FOLLOWING_ERROR, t_ns)
+            return
+        fresh, self._fresh = self._fresh, False
+        self._supervision.sync(fresh, t_ns)
+        if fresh and not self.halted:
+            self._latch(t_ns)
+
+    def _latch(self, t_ns: int) -> None:
+        values, parameters, units = self._values, self._parameters, self._units
+        target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
+        allowed = parameters.clamp(target)
+        self._motion.reach(allowed * units.scale + units.origin, t_ns, parameters.interpolation_ns)
+        limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
+        if limited is not self.limited:
+            self._limit(limited)
+
+    def _target_written(self, subindex: int, value: object) -> None:
+        self._fresh = True

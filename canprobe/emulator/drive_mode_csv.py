@@ -1,0 +1,30 @@
+"""Cyclic synchronous velocity: 60FFh + 60B1h is the velocity from one SYNC to the next.
+
+The velocity is cut to 607Fh and 6080h and the motor waits at a software limit; both set bit 11. The reference is
+the integral of the velocity: the plant follows it as it follows positions.
+Source: CiA 402-2, "Cyclic synchronous velocity mode", objects 60FFh, 60B1h, 607Dh, 607Fh, 6080h.
+"""
+
+from __future__ import annotations
+
+from canprobe.emulator.drive_mode import CyclicMode
+from canprobe.emulator.drive_trajectories import ConstantVelocity, Fenced
+from canprobe.emulator.entries import key_of
+
+_TARGET, _OFFSET = key_of(0x60FF), key_of(0x60B1)
+
+
+class CyclicVelocity(CyclicMode):
+    """Mode 9."""
+
+    target = 0x60FF
+
+    def latch(self, t_ns: int) -> None:
+        """Go on from where the reference is, with the new velocity."""
+        values, parameters = self._values, self._parameters
+        wanted = (int(values[_TARGET]) + int(values.get(_OFFSET, 0))) * self._units.speed_scale
+        velocity = min(max(wanted, -parameters.max_speed), parameters.max_speed)
+        here, (low, high) = self._motion.demand(t_ns), parameters.fence
+        self._motion.follow(Fenced(ConstantVelocity(here, velocity), low, high), t_ns)
+        fenced = (here >= high and velocity > 0.0) or (here <= low and velocity < 0.0)
+        self._limit(velocity != wanted or fenced or self._strains())

@@ -1,0 +1,147 @@
+"""Profile position: set-points by handshake, one under way and one waiting, each a trapezoidal move.
+
+A rising edge of controlword bit 4 offers a set-point (607Ah with 6081h, 6083h and 6084h of that moment); bit 5 puts
+it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 says that
+it was taken, and stays while bit 4 does or while no further one could be taken; one offered then is ignored.
+The next set-point starts when the last is reached: the actual position has been within 6067h for 6068h (bit 10).
+Not here: bit 9 (change on set-point), 60F2h. Halt interrupts a move, which goes on when halt is over.
+Source: CiA 402-2, "Profile position mode", objects 6067h, 6068h, 607Ah, 607Dh, 607Fh, 6081h, 6083h, 6084h, 6086h.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from canprobe.emulator.drive_mode import REACHED, DriveMode, DriveParts
+from canprobe.emulator.drive_motion import STEP_NS
+from canprobe.emulator.drive_profile import trapezoid
+from canprobe.emulator.entries import key_of
+from canprobe.protocol.cia402 import CHANGE_IMMEDIATELY, NEW_SETPOINT, RELATIVE, SETPOINT_ACKNOWLEDGE
+
+_TARGET, _SPEED = key_of(0x607A), key_of(0x6081)
+
+
+@dataclass(frozen=True, slots=True)
+class SetPoint:
+    """One move.
+
+    Attributes:
+        target: within the software limits, position units.
+        counts: the same, motor counts.
+        speed: counts/s; 0 stands still.
+        acceleration, deceleration: counts/s².
+        limited: the master wanted to go beyond.
+    """
+
+    target: int
+    counts: float
+    speed: float
+    acceleration: float
+    deceleration: float
+    limited: bool
+
+
+class ProfilePosition(DriveMode):
+    """Mode 1."""
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._timer = parts.node.core.timers.new(self._watch)
+        self._active: SetPoint | None = None
+        self._next: SetPoint | None = None
+        self._last = 0
+        self._inside_ns: int | None = None
+        self._reached = self._offered = False
+
+    def start(self, word: int, t_ns: int) -> None:
+        """No set-point; the present position is what relative ones begin from."""
+        self._active = self._next = self._inside_ns = None
+        self._offered = self._reached = False
+        self._last = round(self._units.position(self._motion.demand(t_ns)))
+        super().start(word, t_ns)
+        self._timer.arm(t_ns + STEP_NS)
+
+    def leave(self, t_ns: int) -> None:
+        """Set-points are forgotten."""
+        self._timer.cancel()
+
+    def status(self) -> int:
+        """Target reached (with halt: standing still), set-point acknowledge."""
+        acknowledged = self._offered or self._next is not None
+        reached = super().status() if self.halted else REACHED * self._reached
+        return reached | acknowledged << SETPOINT_ACKNOWLEDGE
+
+    def bits(self, word: int, changed: int, t_ns: int) -> None:
+        """A set-point is offered, or the offer taken back."""
+        offers = word >> NEW_SETPOINT & 1
+        if not offers:
+            self._offered = False
+        elif changed >> NEW_SETPOINT & 1:
+            at_once = bool(word >> CHANGE_IMMEDIATELY & 1)
+            if at_once or self._next is None:
+                self._offered = True
+                self._take(self._offer(bool(word >> RELATIVE & 1)), at_once, t_ns)
+
+    def resume(self, t_ns: int) -> None:
+        """The interrupted move goes on."""
+        if self._active is not None and not self._reached:
+            self._move(self._active, t_ns)
+
+    def _offer(self, relative: bool) -> SetPoint:
+        parameters, units = self._parameters, self._units
+        wanted = int(self._values[_TARGET]) + (self._last if relative else 0)
+        target = self._last = parameters.clamp(wanted)
+        return SetPoint(
+            target=target,
+            counts=units.counts(target),
+            speed=min(int(self._values.get(_SPEED, 0)) * units.magnitude, parameters.max_speed),
+            acceleration=parameters.acceleration,
+            deceleration=parameters.deceleration or parameters.acceleration,
+            limited=target != wanted,
+        )
+
+    def _take(self, point: SetPoint, at_once: bool, t_ns: int) -> None:
+        if at_once or self._active is None or self._reached:
+            self._next = None
+            self._begin(point, t_ns)
+        else:
+            self._next = point
+
+    def _begin(self, point: SetPoint, t_ns: int) -> None:
+        self._active, self._inside_ns, self._reached = point, None, False
+        self._limit(point.limited)
+        if not self.halted:
+            self._move(point, t_ns)
+        self.parts.show()
+
+    def _move(self, point: SetPoint, t_ns: int) -> None:
+        if not point.speed:
+            self._motion.decelerate(t_ns, point.deceleration)
+            return
+        here, speed = self._motion.demand(t_ns), self._motion.speed(t_ns)
+        rates = {"speed": point.speed, "acceleration": point.acceleration, "deceleration": point.deceleration}
+        self._motion.follow(trapezoid(here, speed, point.counts, **rates), t_ns)
+
+    def _watch(self, due_ns: int) -> None:
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        if self._lags(t_ns, counts):
+            return
+        self._timer.arm_next(due_ns, STEP_NS)
+        point = self._active
+        if point is not None and not self._reached and not self.halted:
+            self._watch_window(point, counts, t_ns)
+        self._limit((point is not None and point.limited) or self._strains())
+
+    def _watch_window(self, point: SetPoint, counts: float, t_ns: int) -> None:
+        if abs(point.counts - counts) > self._parameters.position_window:
+            self._inside_ns = None
+            return
+        if self._inside_ns is None:
+            self._inside_ns = t_ns
+        if t_ns - self._inside_ns >= self._parameters.position_time_ns:
+            self._reached = True
+            if self._next is not None:
+                point, self._next = self._next, None
+                self._begin(point, t_ns)
+            self.parts.show()
