@@ -20,6 +20,7 @@ from canprobe.emulator.core import NodeCore, Route, Service
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.error_control import HeartbeatConsumer, HeartbeatProducer
+from canprobe.emulator.guarding import ConnectionErrors, NodeGuarding
 from canprobe.emulator.nmt import NMT_TRANSITIONS
 from canprobe.emulator.pdo_engine import PdoEngine
 from canprobe.emulator.sdo_server import SdoServer
@@ -60,9 +61,9 @@ class SlaveNode:
         self.rerouted: Callable[[], None] = _nothing
         self.emcy = Emergency(core)
         self.pdos = PdoEngine(core, self.emcy, self.application)
-        self.store = Store(core)
+        self.store = Store(core, self.application)
         self._heartbeat = HeartbeatProducer(core)
-        consumer = HeartbeatConsumer(core, self.emcy, self._communication_error)
+        self._losses = losses = ConnectionErrors(self.emcy, self._communication_error)
         servers = [SdoServer(core, index) for index in _sdo_servers(core)]
         sync = SyncConsumer(core, self.emcy, self.pdos.sync)
         self._services: tuple[Service, ...] = (
@@ -70,7 +71,8 @@ class SlaveNode:
             self.pdos,
             self.store,
             sync,
-            consumer,
+            HeartbeatConsumer(core, losses),
+            NodeGuarding(core, losses),
             *servers,
             self._heartbeat,
         )
@@ -151,9 +153,11 @@ class SlaveNode:
         self.core.state = NmtState.INITIALISING
         self.application.entered(t_ns)
         self.store.recall(communication_only)
+        self._losses.reset()
         for service in self._services:
             service.reset(t_ns)
         if not communication_only:
+            self.application.recall(self.store.kept)
             self.application.reset(t_ns)
         self._reroute()
         if self._boot_ns:

@@ -1,7 +1,6 @@
-"""One SDO server: expedited, segmented and block transfers on the node's dictionary.
+"""One SDO server: expedited, segmented and block transfers on the node's dictionary, by the table of `sdo_states`.
 
-A new initiate request while a transfer is open takes its place: a master that was restarted is served at once.
-Source: CiA 301, "Service data object (SDO)".
+Source: CiA 301, "Service data object (SDO)", objects 1200h–127Fh.
 """
 
 from __future__ import annotations
@@ -11,12 +10,15 @@ from collections.abc import Callable, Mapping
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.entries import Value
 from canprobe.emulator.sdo_block import BlockDownload, BlockUpload
+from canprobe.emulator.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
 from canprobe.emulator.sdo_transfers import SegmentedDownload, SegmentedUpload, Transfer, check_size
-from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtState
+from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtState, is_restricted
 
 TIMEOUT_NS = 1_000_000_000
 _INVALID = 1 << 31
+_UNUSED_BITS = 0x3FFFF800
 _HEAD = struct.Struct("<BHBI")
 _SERVED = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
@@ -30,14 +32,20 @@ class SdoServer:
         self._transfer: Transfer | None = None
         self._multiplexer = (0, 0)
         self._timer = core.timers.new(self._timed_out)
-        self._initiate: dict[int, Callable[[bytes], bytes]] = {
-            1: self._download,
-            2: self._upload,
-            5: self._block_upload,
-            6: self._block_download,
+        self._initiate: dict[SdoRequest, Callable[[bytes], bytes]] = {
+            SdoRequest.INITIATE_DOWNLOAD: self._download,
+            SdoRequest.INITIATE_UPLOAD: self._upload,
+            SdoRequest.INITIATE_BLOCK_DOWNLOAD: self._block_download,
+            SdoRequest.INITIATE_BLOCK_UPLOAD: self._block_upload,
         }
         if index != 0x1200:
+            core.dictionary.on_check(index, self._check_cob_id)
             core.dictionary.on_write(index, lambda _sub, _value: core.reroute())
+
+    @property
+    def state(self) -> SdoState:
+        """Where the transfer in progress is."""
+        return SdoState.IDLE if self._transfer is None else self._transfer.state
 
     def reset(self, t_ns: int) -> None:
         """Drop what is open."""
@@ -62,9 +70,6 @@ class SdoServer:
     def _receive(self, data: bytes, t_ns: int) -> None:
         if len(data) != 8:
             return
-        if data[0] == 0x80:
-            self._drop()
-            return
         try:
             answers = self._answer(data)
         except SdoAbort as abort:
@@ -72,30 +77,27 @@ class SdoServer:
             return
         for answer in answers:
             self._send(answer)
-        if self._transfer is None or self._transfer.done:
+        if self.state is SdoState.IDLE:
             self._drop()
         else:
             self._timer.arm(t_ns + TIMEOUT_NS)
 
     def _answer(self, data: bytes) -> list[bytes]:
         transfer = self._transfer
-        if transfer is not None and transfer.streaming:
-            return transfer.receive(data)
-        if initiate := self._initiation(data[0]):
-            _, index, subindex, _ = _HEAD.unpack(data)
+        state = SdoState.IDLE if transfer is None else transfer.state
+        request = request_of(state, data[0])
+        if initiate := self._initiate.get(request):
             self._transfer = None
-            self._multiplexer = (index, subindex)
+            self._multiplexer = _HEAD.unpack(data)[1:3]
             return [initiate(data)]
+        if request is SdoRequest.ABORT:
+            self._transfer = None
+            return []
         if transfer is None:
             self._multiplexer = _HEAD.unpack(data)[1:3]
+        if transfer is None or (state, request) not in SDO_TRANSITIONS:
             raise SdoAbort(Abort.COMMAND)
         return transfer.receive(data)
-
-    def _initiation(self, command: int) -> Callable[[bytes], bytes] | None:
-        specifier = command >> 5
-        if (specifier == 5 and command & 3) or (specifier == 6 and command & 1):
-            return None  # later steps of a block transfer
-        return self._initiate.get(specifier)
 
     def _download(self, data: bytes) -> bytes:
         index, subindex = self._multiplexer
@@ -146,6 +148,15 @@ class SdoServer:
     def _drop(self) -> None:
         self._transfer = None
         self._timer.cancel()
+
+    def _check_cob_id(self, subindex: int, value: Value) -> None:
+        """COB-IDs of an additional server: not restricted, and not changed while in use."""
+        if subindex not in (1, 2):
+            return
+        new, old = int(value), self._core.dictionary.number(self._index, subindex, _INVALID)
+        changed_while_valid = not (new | old) & _INVALID and (new ^ old) & 0x7FF
+        if new & _UNUSED_BITS or changed_while_valid or (not new & _INVALID and is_restricted(new & 0x7FF)):
+            raise SdoAbort(Abort.VALUE)
 
     def _timed_out(self, due_ns: int) -> None:
         self._abort(Abort.TIMED_OUT)
