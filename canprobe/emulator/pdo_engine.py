@@ -59,6 +59,8 @@ class PdoEngine:
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
         def reconfigure(subindex: int, value: Value) -> None:
             pdo.configure()
+            if isinstance(pdo, Tpdo) and self._core.state is NmtState.OPERATIONAL:
+                pdo.reconfigured(self._core.now_ns)
             self._rebuild()
             self._core.reroute()
 

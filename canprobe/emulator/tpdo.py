@@ -114,6 +114,11 @@ class Tpdo:
             self._earliest_ns = t_ns
             self.event(t_ns)
 
+    def reconfigured(self, t_ns: int) -> None:
+        """New parameters in operational: the event timer runs from now on."""
+        if self.active and self.by_event and self._event_ns:
+            self._event_timer.arm(t_ns + self._event_ns)
+
     def event(self, t_ns: int) -> None:
         """A mapped value changed."""
         if not self.active:
