@@ -195,18 +195,24 @@ class FakePlant:
         return {"q": np.full(6, state * 1e-9), "force": 2.0}
 
 
+@pytest.fixture(scope="session")
+def tiny_od() -> ObjectDictionary:
+    """The tiny node's dictionary, parsed once; nodes keep their values elsewhere."""
+    return make_tiny_od()
+
+
 @pytest.fixture
-def bench() -> Bench:
+def bench(tiny_od: ObjectDictionary) -> Bench:
     """The tiny node, booted, pre-operational at time 0."""
-    made = Bench(SlaveNode(make_tiny_od(), NODE_ID))
+    made = Bench(SlaveNode(tiny_od, NODE_ID))
     assert spell(made.node.start(0)) == [(0x705, "00")]
     return made
 
 
 @pytest.fixture
-def make_bench() -> Callable[..., Bench]:
+def make_bench(tiny_od: ObjectDictionary) -> Callable[..., Bench]:
     """Make tiny nodes with options of SlaveNode; not started."""
-    return lambda **options: Bench(SlaveNode(make_tiny_od(), NODE_ID, **options))
+    return lambda **options: Bench(SlaveNode(tiny_od, NODE_ID, **options))
 
 
 @pytest.fixture
