@@ -7,19 +7,21 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Mapping
+from functools import partial
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
 from canprobe.emulator.entries import Value
 from canprobe.emulator.sdo_block import BlockDownload, BlockUpload
 from canprobe.emulator.sdo_states import SDO_TRANSITIONS, SdoRequest, SdoState, request_of
-from canprobe.emulator.sdo_transfers import SegmentedDownload, SegmentedUpload, Transfer, check_size
+from canprobe.emulator.sdo_transfers import SegmentedDownload, SegmentedUpload, Transfer
 from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtState, is_restricted
 
 TIMEOUT_NS = 1_000_000_000
 _INVALID = 1 << 31
 _UNUSED_BITS = 0x3FFFF800
 _HEAD = struct.Struct("<BHBI")
+_EXPEDITED = {size: partial(struct.Struct("<BHB4s").pack, 0x43 | (4 - size) << 2) for size in (1, 2, 3, 4)}
 _SERVED = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
@@ -31,6 +33,7 @@ class SdoServer:
         self._index = index
         self._transfer: Transfer | None = None
         self._multiplexer = (0, 0)
+        self._answer_id = 0
         self._timer = core.timers.new(self._timed_out)
         self._initiate: dict[SdoRequest, Callable[[bytes], bytes]] = {
             SdoRequest.INITIATE_DOWNLOAD: self._download,
@@ -40,7 +43,7 @@ class SdoServer:
         }
         if index != 0x1200:
             core.dictionary.on_check(index, self._check_cob_id)
-            core.dictionary.on_write(index, lambda _sub, _value: core.reroute())
+        core.dictionary.on_write(index, lambda _sub, _value: core.reroute())
 
     @property
     def state(self) -> SdoState:
@@ -58,8 +61,9 @@ class SdoServer:
 
     def routes(self) -> Mapping[int, Route]:
         """The request identifier, in pre-operational and operational."""
-        cob_id = self._cob_id(1, SDO_RX_BASE)
-        if self._core.state not in _SERVED or (cob_id | self._cob_id(2, SDO_TX_BASE)) & _INVALID:
+        cob_id, answer_id = self._cob_id(1, SDO_RX_BASE), self._cob_id(2, SDO_TX_BASE)
+        self._answer_id = answer_id & 0x7FF
+        if self._core.state not in _SERVED or (cob_id | answer_id) & _INVALID:
             return NO_ROUTES
         return {cob_id & 0x7FF: self._receive}
 
@@ -76,11 +80,12 @@ class SdoServer:
             self._abort(abort.code)
             return
         for answer in answers:
-            self._send(answer)
-        if self.state is SdoState.IDLE:
-            self._drop()
-        else:
+            self._core.out.append((self._answer_id, answer))
+        transfer = self._transfer
+        if transfer is not None and transfer.state is not SdoState.IDLE:
             self._timer.arm(t_ns + TIMEOUT_NS)
+        elif transfer is not None or self._timer.due_ns is not None:
+            self._drop()
 
     def _answer(self, data: bytes) -> list[bytes]:
         transfer = self._transfer
@@ -101,12 +106,12 @@ class SdoServer:
 
     def _download(self, data: bytes) -> bytes:
         index, subindex = self._multiplexer
-        entry = self._core.dictionary.find_writable(index, subindex)
+        dictionary = self._core.dictionary
+        entry = dictionary.find_writable(index, subindex)
         command = data[0]
         if command & 2:
             size = 4 - (command >> 2 & 3) if command & 1 else min(entry.bits // 8 or 4, 4)
-            check_size(entry, size)
-            self._write(data[4 : 4 + size])
+            dictionary.write_value(entry, entry.from_bytes(data[4 : 4 + size]))
         else:
             announced = int.from_bytes(data[4:8], "little") if command & 1 else None
             self._transfer = SegmentedDownload(entry, announced, self._write)
@@ -114,8 +119,9 @@ class SdoServer:
 
     def _upload(self, data: bytes) -> bytes:
         value = self._core.dictionary.read(*self._multiplexer)
-        if 1 <= len(value) <= 4:
-            return _HEAD.pack(0x43 | (4 - len(value)) << 2, *self._multiplexer, 0)[:4] + value.ljust(4, b"\0")
+        size = len(value)
+        if 1 <= size <= 4:
+            return _EXPEDITED[size](*self._multiplexer, value)
         self._transfer = SegmentedUpload(value)
         return _HEAD.pack(0x41, *self._multiplexer, len(value))
 
@@ -138,12 +144,9 @@ class SdoServer:
     def _write(self, data: bytes) -> None:
         self._core.dictionary.write(*self._multiplexer, data)
 
-    def _send(self, data: bytes) -> None:
-        self._core.send(self._cob_id(2, SDO_TX_BASE) & 0x7FF, data)
-
     def _abort(self, code: Abort) -> None:
         self._drop()
-        self._send(_HEAD.pack(0x80, *self._multiplexer, code))
+        self._core.send(self._answer_id, _HEAD.pack(0x80, *self._multiplexer, code))
 
     def _drop(self) -> None:
         self._transfer = None

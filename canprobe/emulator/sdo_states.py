@@ -12,38 +12,38 @@ Source: CiA 301, "SDO protocols".
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import IntEnum, auto
 
 
-class SdoState(Enum):
+class SdoState(IntEnum):
     """What a server waits for: a new request, or the next frame of a transfer."""
 
-    IDLE = "idle"
-    DOWNLOAD = "download segment"
-    UPLOAD = "upload segment request"
-    BLOCK_DOWNLOAD = "block download segment"
-    BLOCK_DOWNLOAD_END = "end of block download"
-    BLOCK_UPLOAD_START = "start of block upload"
-    BLOCK_UPLOAD = "acknowledgement of a block"
-    BLOCK_UPLOAD_END = "end of block upload"
+    IDLE = auto()
+    DOWNLOAD = auto()
+    UPLOAD = auto()
+    BLOCK_DOWNLOAD = auto()
+    BLOCK_DOWNLOAD_END = auto()
+    BLOCK_UPLOAD_START = auto()
+    BLOCK_UPLOAD = auto()
+    BLOCK_UPLOAD_END = auto()
 
 
-class SdoRequest(Enum):
+class SdoRequest(IntEnum):
     """What a client's frame is, by its command byte."""
 
-    INITIATE_DOWNLOAD = "initiate download"
-    INITIATE_UPLOAD = "initiate upload"
-    DOWNLOAD_SEGMENT = "download segment"
-    UPLOAD_SEGMENT = "upload segment"
-    INITIATE_BLOCK_DOWNLOAD = "initiate block download"
-    BLOCK_SEGMENT = "block download segment"
-    END_BLOCK_DOWNLOAD = "end block download"
-    INITIATE_BLOCK_UPLOAD = "initiate block upload"
-    START_BLOCK_UPLOAD = "start block upload"
-    ACKNOWLEDGE_BLOCK = "acknowledge block"
-    END_BLOCK_UPLOAD = "end block upload"
-    ABORT = "abort"
-    UNKNOWN = "unknown command"
+    INITIATE_DOWNLOAD = auto()
+    INITIATE_UPLOAD = auto()
+    DOWNLOAD_SEGMENT = auto()
+    UPLOAD_SEGMENT = auto()
+    INITIATE_BLOCK_DOWNLOAD = auto()
+    BLOCK_SEGMENT = auto()
+    END_BLOCK_DOWNLOAD = auto()
+    INITIATE_BLOCK_UPLOAD = auto()
+    START_BLOCK_UPLOAD = auto()
+    ACKNOWLEDGE_BLOCK = auto()
+    END_BLOCK_UPLOAD = auto()
+    ABORT = auto()
+    UNKNOWN = auto()
 
 
 _S, _R = SdoState, SdoRequest

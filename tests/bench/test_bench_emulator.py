@@ -1,10 +1,12 @@
 """What a node costs per frame, against canopen-python's `LocalNode` in the same run. Run with --benchmark-only.
 
-Both nodes are made from `puma260_joint.eds` and called in process, without a bus between: frames in by `receive` or
-`notify`, frames out into a list. Goal: at most a fifth of `LocalNode`, and seven nodes at 400 Hz under 15 % of a core.
+Both nodes are made from `puma260_joint.eds`. "alone" calls them without a bus: frames in by `receive` or `notify`, and
+out into a list. "on its bus" adds the way from and to a master: ours on the lockstep bus, `LocalNode` on python-can's
+virtual bus, without the threads that its users have. Goals: at most a fifth of `LocalNode` on its bus; seven nodes at
+400 Hz under 15 % of a core.
 
-`LocalNode` neither applies RPDOs to its dictionary nor answers a SYNC; its TPDO is packed and sent by hand, as its users
-have to. So the two do the same work on SDO only; on PDOs ours does more.
+`LocalNode` neither applies RPDOs to its dictionary nor answers a SYNC; its TPDO is packed and sent by hand, as its
+users have to. So the two do the same work on SDO only; on PDOs ours does more.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import gc
 from statistics import median
 from time import process_time
 
+import can
 import canopen
 import pytest
 
@@ -24,14 +27,15 @@ from canprobe.emulator.node import SlaveNode
 from canprobe.emulator.tactile import make_tactile_node
 
 CYCLE_NS = 2_500_000
-UPLOAD = bytes.fromhex("4000100000000000")
-DOWNLOAD = bytes.fromhex("2b17100000000000")  # 1017h = 0
-SYNC, RPDO = b"\x01", bytes.fromhex("0f0010270000")
-ROUNDS, TURNS = 15, 400
+UPLOAD = 0x601, bytes.fromhex("4000100000000000")
+DOWNLOAD = 0x601, bytes.fromhex("2367600007000000")  # 6067h, an UNSIGNED32 that nothing hangs on
+SYNC, RPDO, FOREIGN = (0x80, b"\x01"), (0x201, bytes.fromhex("0f0010270000")), (0x305, bytes(8))
+BOOT = [(0x601, bytes.fromhex("2f191000f0000000")), (0, b"\x01\x01")]  # counter overflow 240, start
+ROUNDS, TURNS = 15, 1000
 
 
-class LocalNode:
-    """canopen's slave; what it sends is kept."""
+class Alone:
+    """canopen's slave, called without a bus."""
 
     def __init__(self):
         self.sent = sent = []
@@ -40,32 +44,80 @@ class LocalNode:
             def send_message(self, can_id, data, remote=False):
                 sent.append((can_id, bytes(data)))
 
-        self.network = Network()
-        self.node = canopen.LocalNode(1, str(eds_path("puma260_joint")))
-        self.network.add_node(self.node)
-        self.node.tpdo.read(from_od=True)
-        self.node.rpdo.read(from_od=True)
-        self.position = self.node.tpdo[1]["Position actual value"]
+        self._network = Network()
+        self._add(self._network)
 
-    def receive(self, can_id, data):
-        self.network.notify(can_id, bytearray(data), 0.0)
+    def _add(self, network):
+        node = canopen.LocalNode(1, str(eds_path("puma260_joint")))
+        network.add_node(node)
+        node.tpdo.read(from_od=True)
+        node.rpdo.read(from_od=True)
+        self._tpdo, self._position = node.tpdo[1], node.tpdo[1]["Position actual value"]
 
-    def send_tpdo(self):
-        self.position.raw = 1234
-        self.node.tpdo[1].transmit()
+    def __call__(self, frame):
+        self._network.notify(frame[0], bytearray(frame[1]), 0.0)
+        return self.taken()
+
+    def transmit(self):
+        """What its user does at a SYNC."""
+        self._position.raw = 1234
+        self._tpdo.transmit()
+        return self.taken()
+
+    def taken(self):
+        sent = self.sent.copy()
+        self.sent.clear()
+        return sent
 
 
-class Ours:
-    """Our slave in operational; the drive's application is left out, as `LocalNode` has none."""
+class OnVirtualBus(Alone):
+    """The same on python-can's virtual bus, with a master at its other end."""
 
     def __init__(self):
-        self.node = SlaveNode(load_eds("puma260_joint", 1), 1)
-        self.node.start(0)
-        self.receive(0x601, bytes.fromhex("2f191000f0000000"))
-        self.receive(0, b"\x01\x01")
+        self._network = canopen.Network()
+        self._network.bus = can.Bus(interface="virtual", channel="bench")
+        self._master = can.Bus(interface="virtual", channel="bench")
+        self._add(self._network)
 
-    def receive(self, can_id, data):
-        return self.node.receive(can_id, data, 0)
+    def __call__(self, frame):
+        self._master.send(can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False))
+        for listener in self._network.listeners:
+            listener.on_message_received(self._network.bus.recv(0))
+        return self.taken()
+
+    def taken(self):
+        found = []
+        while (message := self._master.recv(0)) is not None:
+            found.append((message.arbitration_id, bytes(message.data)))
+        return found
+
+    def close(self):
+        self._network.bus.shutdown()
+        self._master.shutdown()
+
+
+def alone():
+    """Our slave in operational; the drive's application is left out, as `LocalNode` has none."""
+    node = SlaveNode(load_eds("puma260_joint", 1), 1)
+    node.start(0)
+    for frame in BOOT:
+        node.receive(*frame, 0)
+    return lambda frame: node.receive(*frame, 0)
+
+
+def on_lockstep_bus():
+    """The same on the lockstep bus."""
+    bus = LockstepBus(VirtualClock(), "bench")
+    bus.attach(SlaveNode(load_eds("puma260_joint", 1), 1))
+    port = bus.port()
+
+    def exchange(frame):
+        port.send_batch((frame,))
+        return [(can_id, data) for can_id, data, _ in port.drain()]
+
+    for frame in BOOT:
+        exchange(frame)
+    return exchange
 
 
 def measure(ours, theirs):
@@ -84,44 +136,37 @@ def measure(ours, theirs):
     return median(times[ours]), median(times[theirs])
 
 
-CASES = ["SDO upload", "SDO download", "RPDO and SYNC against RPDO and TPDO", "RPDO received", "TPDO sent", "foreign frame"]
+@pytest.mark.parametrize("what", ["SDO upload", "SDO download", "RPDO in", "TPDO out", "RPDO in, TPDO out", "foreign"])
+@pytest.mark.parametrize("where", ["alone", "on its bus"])
+def test_bench_against_local_node(benchmark, what, where):
+    ours, theirs = (alone(), Alone()) if where == "alone" else (on_lockstep_bus(), OnVirtualBus())
 
+    def both_ours():
+        ours(RPDO)
+        return ours(SYNC)
 
-@pytest.mark.parametrize("what", CASES)
-def test_bench_against_local_node(benchmark, what):
-    ours, theirs = Ours(), LocalNode()
+    def both_theirs():
+        theirs(RPDO)
+        return theirs.transmit()
 
-    def rpdo_and_sync():
-        ours.receive(0x201, RPDO)
-        ours.receive(0x80, SYNC)
+    def same(frame):
+        return lambda: ours(frame), lambda: theirs(frame)
 
-    def rpdo_and_tpdo():
-        theirs.receive(0x201, RPDO)
-        theirs.send_tpdo()
-        theirs.sent.clear()
-
-    def both(can_id, data):
-        def local():
-            theirs.receive(can_id, data)
-            theirs.sent.clear()
-
-        return lambda: ours.receive(can_id, data), local
-
-    def sent():
-        theirs.send_tpdo()
-        theirs.sent.clear()
-
-    pairs = {
-        "SDO upload": both(0x601, UPLOAD),
-        "SDO download": both(0x601, DOWNLOAD),
-        "RPDO and SYNC against RPDO and TPDO": (rpdo_and_sync, rpdo_and_tpdo),
-        "RPDO received": both(0x201, RPDO),
-        "TPDO sent": (lambda: ours.receive(0x80, SYNC), sent),
-        "foreign frame": both(0x305, RPDO),
-    }
-    mine, its = benchmark.pedantic(measure, pairs[what], rounds=1)
-    benchmark.extra_info |= {"ours_us": mine, "local_node_us": its, "share": mine / its}
-    print(f"\n{what}: {mine:.2f} µs, LocalNode {its:.2f} µs: {mine / its:.2f}")
+    mine, its = {
+        "SDO upload": same(UPLOAD),
+        "SDO download": same(DOWNLOAD),
+        "RPDO in": same(RPDO),
+        "TPDO out": (lambda: ours(SYNC), theirs.transmit),
+        "RPDO in, TPDO out": (both_ours, both_theirs),
+        "foreign": same(FOREIGN),
+    }[what]
+    answers = mine(), its()
+    assert answers[0] == answers[1] or ("TPDO" in what and [len(found) for found in answers] == [1, 1])
+    mine_us, its_us = benchmark.pedantic(measure, (mine, its), rounds=1)
+    benchmark.extra_info |= {"ours_us": mine_us, "local_node_us": its_us, "share": mine_us / its_us}
+    print(f"\n{where}, {what}: {mine_us:.2f} µs, LocalNode {its_us:.2f} µs: {mine_us / its_us:.2f}")
+    if where != "alone":
+        theirs.close()
 
 
 class Still:
@@ -178,4 +223,6 @@ def test_bench_seven_nodes_at_400_hz_in_lockstep(benchmark):
     benchmark.pedantic(cycle, rounds=2000, iterations=1)
     share = (process_time() - start) / 2000 / (CYCLE_NS * 1e-9)
     benchmark.extra_info["share_of_a_core"] = share
-    print(f"\nseven nodes at 400 Hz: {share:.1%} of one core, median {benchmark.stats.stats.median * 1e6:.0f} µs a cycle")
+    print(
+        f"\nseven nodes at 400 Hz: {share:.1%} of one core, median {benchmark.stats.stats.median * 1e6:.0f} µs a cycle"
+    )

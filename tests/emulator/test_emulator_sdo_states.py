@@ -24,43 +24,53 @@ COMMAND, TOGGLE, SEQUENCE, TOO_SHORT = 0x05040001, 0x05030000, 0x05040003, 0x060
 REST = OBJECT + "7f000000"  # of an initiate: 127 segments a block, or 127 bytes announced
 
 
+def initiates(command: int) -> SdoState | None:
+    """Where an initiate request leads; the client command specifier is in the three highest bits."""
+    expedited = command & 2
+    goals = {1: S.IDLE if expedited else S.DOWNLOAD, 2: S.UPLOAD}
+    if command & 3 == 0:
+        goals[5] = S.BLOCK_UPLOAD_START
+    if command & 1 == 0:
+        goals[6] = S.BLOCK_DOWNLOAD
+    return goals.get(command >> 5)
+
+
+def numbered(command: int) -> tuple[SdoState, int]:
+    """A segment of a block download: only number 1 is the next, with bit 7 it is the last."""
+    if command & 0x7F == 0:
+        return S.IDLE, SEQUENCE
+    return (S.BLOCK_DOWNLOAD_END if command == 0x81 else S.BLOCK_DOWNLOAD), 0
+
+
+def right_step(state: SdoState, command: int) -> tuple[SdoState, int] | None:
+    """What the one kind of frame does that goes on with the transfer; None for every other frame."""
+    toggled, last = bool(command & 0x10), bool(command & 1)
+    ends = (S.IDLE, TOO_SHORT) if last else (S.DOWNLOAD, 0)
+    # state: (mask and pattern of the command byte, what follows)
+    steps = {
+        S.DOWNLOAD: (0xE0, 0x00, (S.IDLE, TOGGLE) if toggled else ends),
+        S.UPLOAD: (0xE0, 0x60, (S.IDLE, TOGGLE) if toggled else (S.UPLOAD, 0)),
+        S.BLOCK_UPLOAD_START: (0xE3, 0xA3, (S.BLOCK_UPLOAD, 0)),
+        S.BLOCK_UPLOAD: (0xE3, 0xA2, (S.IDLE, SEQUENCE)),  # acknowledges segment 4 (of OBJECT), and two were sent
+        S.BLOCK_UPLOAD_END: (0xE3, 0xA1, (S.IDLE, 0)),
+        S.BLOCK_DOWNLOAD_END: (0xE1, 0xC1, (S.IDLE, TOO_SHORT if command & 0x1C else 0)),
+    }
+    mask, pattern, follows = steps.get(state, (0, 1, None))
+    return follows if command & mask == pattern else None
+
+
 def expected(state: SdoState, command: int) -> tuple[SdoState, int]:
     """State after the command (its other bytes being REST) and abort code: the standard in other words than the code's.
 
-    Source: CiA 301, SDO protocols; the client command specifier is in the three highest bits.
+    Source: CiA 301, SDO protocols.
     """
-    specifier = command >> 5
     if command == 0x80:
         return S.IDLE, 0
     if state is S.BLOCK_DOWNLOAD:
-        if command & 0x7F == 0:
-            return S.IDLE, SEQUENCE
-        right = command & 0x7F == 1
-        return (S.BLOCK_DOWNLOAD_END if right and command & 0x80 else S.BLOCK_DOWNLOAD), 0
-    if specifier == 1:
-        return (S.IDLE if command & 2 else S.DOWNLOAD), 0
-    if specifier == 2:
-        return S.UPLOAD, 0
-    if specifier == 5 and command & 3 == 0:
-        return S.BLOCK_UPLOAD_START, 0
-    if specifier == 6 and command & 1 == 0:
-        return S.BLOCK_DOWNLOAD, 0
-    if specifier == 0 and state is S.DOWNLOAD:
-        if command & 0x10:
-            return S.IDLE, TOGGLE
-        return (S.IDLE, TOO_SHORT) if command & 1 else (S.DOWNLOAD, 0)
-    if specifier == 3 and state is S.UPLOAD:
-        return (S.IDLE, TOGGLE) if command & 0x10 else (S.UPLOAD, 0)
-    if specifier == 5 and command & 3 == 3 and state is S.BLOCK_UPLOAD_START:
-        return S.BLOCK_UPLOAD, 0
-    if specifier == 5 and command & 3 == 2 and state is S.BLOCK_UPLOAD:
-        return S.IDLE, SEQUENCE  # acknowledges segment 4 (of OBJECT), and two were sent
-    if specifier == 5 and command & 3 == 1 and state is S.BLOCK_UPLOAD_END:
-        return S.IDLE, 0
-    if specifier == 6 and command & 1 and state is S.BLOCK_DOWNLOAD_END:
-        unused = command >> 2 & 7
-        return S.IDLE, 0 if unused == 0 else TOO_SHORT
-    return S.IDLE, COMMAND
+        return numbered(command)
+    if (goal := initiates(command)) is not None:
+        return goal, 0
+    return right_step(state, command) or (S.IDLE, COMMAND)
 
 
 def bring(bench, state):

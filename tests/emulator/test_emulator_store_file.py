@@ -72,7 +72,7 @@ def change(path, **values):
 )
 def test_a_file_with_wrong_values_is_refused(stored, make_bench, path, broken, words):
     change(path, **broken)
-    with pytest.raises(UsageError, match="node005.json") as caught:
+    with pytest.raises(UsageError, match=r"node005\.json") as caught:
         keep_in_file(make_bench().node, path)
     assert words in str(caught.value)
 
