@@ -9,9 +9,10 @@ from collections.abc import Callable, Mapping
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
+from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.entries import Value
-from canprobe.emulator.guarding import ConnectionErrors
 from canprobe.emulator.timers import Timer
+from canprobe.protocol.emcy import HEARTBEAT_LOST
 from canprobe.protocol.frames import HEARTBEAT_BASE, NmtState, pack_heartbeat
 
 
@@ -61,8 +62,9 @@ class HeartbeatProducer:
 class HeartbeatConsumer:
     """Watches the producers of 1016h, each from its first heartbeat on."""
 
-    def __init__(self, core: NodeCore, errors: ConnectionErrors) -> None:
-        self._core, self._errors = core, errors
+    def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
+        """`on_loss(t_ns)` is called when a producer is lost."""
+        self._core, self._emcy, self._on_loss = core, emcy, on_loss
         self._timers: dict[int, Timer] = {}
         self._periods: dict[int, int] = {}
         core.dictionary.on_check(0x1016, self._check)
@@ -94,7 +96,7 @@ class HeartbeatConsumer:
         periods = {node_id: period * 1_000_000 for node_id, period in self._entries().values()}
         for node_id, timer in self._timers.items():
             timer.cancel()
-            self._errors.found(node_id)
+            self._emcy.clear(HEARTBEAT_LOST, node_id)
         self._periods = periods
         self._timers = {node_id: self._core.timers.new(self._timed_out(node_id)) for node_id in periods}
         self._core.reroute()
@@ -106,13 +108,15 @@ class HeartbeatConsumer:
             if len(data) != 1:
                 return
             timer.arm(t_ns + period)
-            self._errors.found(node_id)
+            if self._emcy.any:
+                self._emcy.clear(HEARTBEAT_LOST, node_id)
 
         return heard
 
     def _timed_out(self, node_id: int) -> Callable[[int], None]:
         def timed_out(due_ns: int) -> None:
-            self._errors.lost(node_id, due_ns)
+            self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
+            self._on_loss(due_ns)
 
         return timed_out
 

@@ -1,4 +1,4 @@
-"""Node guarding and life guarding, and the account of lost connections that they share with the heartbeat consumer.
+"""Node guarding and life guarding.
 
 Source: CiA 301, "Node guarding protocol", "Life guarding", objects 100Ch and 100Dh; error 8130h.
 """
@@ -12,42 +12,16 @@ from canprobe.emulator.emergency import Emergency
 from canprobe.protocol.emcy import HEARTBEAT_LOST
 from canprobe.protocol.frames import HEARTBEAT_BASE, RTR_FLAG, NmtState
 
-GUARDING_MASTER = 0
-"""What `ConnectionErrors` calls the master that guards this node: node guarding does not tell its id."""
+_MASTER = 0  # whoever guards this node: the protocol does not tell its id
 _TOGGLE = 0x80
-
-
-class ConnectionErrors:
-    """Who has been lost: EMCY 8130h at the first loss, "error reset" when all are back."""
-
-    def __init__(self, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
-        """`on_loss(t_ns)` is called at every loss."""
-        self._emcy, self._on_loss = emcy, on_loss
-        self._lost: set[int] = set()
-
-    def reset(self) -> None:
-        """Forget everything, silently."""
-        self._lost.clear()
-
-    def lost(self, node_id: int, t_ns: int) -> None:
-        """A producer, or the guarding master, has fallen silent."""
-        self._lost.add(node_id)
-        self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)))
-        self._on_loss(t_ns)
-
-    def found(self, node_id: int) -> None:
-        """It is heard again, or no longer watched."""
-        if node_id in self._lost:
-            self._lost.discard(node_id)
-            if not self._lost:
-                self._emcy.clear(HEARTBEAT_LOST)
 
 
 class NodeGuarding:
     """Answers remote requests with toggle bit and state, and watches them from the first on, while 1017h is 0."""
 
-    def __init__(self, core: NodeCore, errors: ConnectionErrors) -> None:
-        self._core, self._errors = core, errors
+    def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
+        """`on_loss(t_ns)` is called when the life guarding error occurs."""
+        self._core, self._emcy, self._on_loss = core, emcy, on_loss
         self._timer = core.timers.new(self._timed_out)
         self._toggle = self._life_ns = 0
         self._heartbeat = False
@@ -73,7 +47,7 @@ class NodeGuarding:
         self._heartbeat = bool(number(0x1017))
         self._life_ns = number(0x100C) * number(0x100D) * 1_000_000
         self._timer.cancel()
-        self._errors.found(GUARDING_MASTER)
+        self._emcy.clear(HEARTBEAT_LOST, _MASTER)
 
     def _guarded(self, data: bytes, t_ns: int) -> None:
         if self._heartbeat:
@@ -82,7 +56,8 @@ class NodeGuarding:
         self._toggle ^= _TOGGLE
         if self._life_ns:
             self._timer.arm(t_ns + self._life_ns)
-            self._errors.found(GUARDING_MASTER)
+            self._emcy.clear(HEARTBEAT_LOST, _MASTER)
 
     def _timed_out(self, due_ns: int) -> None:
-        self._errors.lost(GUARDING_MASTER, due_ns)
+        self._emcy.report(HEARTBEAT_LOST, bytes((_MASTER,)), source=_MASTER)
+        self._on_loss(due_ns)

@@ -20,7 +20,7 @@ from canprobe.emulator.core import NodeCore, Route, Service
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.error_control import HeartbeatConsumer, HeartbeatProducer
-from canprobe.emulator.guarding import ConnectionErrors, NodeGuarding
+from canprobe.emulator.guarding import NodeGuarding
 from canprobe.emulator.nmt import NMT_TRANSITIONS
 from canprobe.emulator.pdo_engine import PdoEngine
 from canprobe.emulator.sdo_server import SdoServer
@@ -63,7 +63,6 @@ class SlaveNode:
         self.pdos = PdoEngine(core, self.emcy, self.application)
         self.store = Store(core, self.application)
         self._heartbeat = HeartbeatProducer(core)
-        self._losses = losses = ConnectionErrors(self.emcy, self._communication_error)
         servers = [SdoServer(core, index) for index in _sdo_servers(core)]
         sync = SyncConsumer(core, self.emcy, self.pdos.sync)
         self._services: tuple[Service, ...] = (
@@ -71,8 +70,8 @@ class SlaveNode:
             self.pdos,
             self.store,
             sync,
-            HeartbeatConsumer(core, losses),
-            NodeGuarding(core, losses),
+            HeartbeatConsumer(core, self.emcy, self._communication_error),
+            NodeGuarding(core, self.emcy, self._communication_error),
             *servers,
             self._heartbeat,
         )
@@ -153,7 +152,6 @@ class SlaveNode:
         self.core.state = NmtState.INITIALISING
         self.application.entered(t_ns)
         self.store.recall(communication_only)
-        self._losses.reset()
         for service in self._services:
             service.reset(t_ns)
         if not communication_only:

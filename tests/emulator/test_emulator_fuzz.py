@@ -202,6 +202,7 @@ def test_frames_that_hypothesis_finds(make_bench):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", ["tiny", "drive", "tactile"])
 def test_a_million_frames(benchmark, kind, make_bench, plant):
     """Run with --benchmark-only. Memory after the first tenth may not grow by more than its transfers can hold."""
