@@ -64,9 +64,9 @@ def test_cia301_emcy_42_history(tiny):
 def test_cia301_emcy_43_inhibit_time(tiny):
     tiny.set((0x1015, 0, 3000, 2))  # 300 ms
     tiny.nmt(0x01)
-    tiny.send(0x80, "01")
+    first = tiny.send(0x80, "01")
     tiny.send(0x205, "00")
-    first = tiny.expect(SYNC_LENGTH)
+    tiny.expect(SYNC_LENGTH)
     tiny.assert_after(first, tiny.expect(PDO_SHORT, within_ms=300), 300)
 
 

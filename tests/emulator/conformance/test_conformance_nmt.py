@@ -91,12 +91,11 @@ def test_cia301_nmt_07_state_change_is_heard_at_once(tiny):
 
 
 def test_cia301_heartbeat_08_a_write_acts_at_once(tiny):
-    tiny.send(0x605, "2b17100032000000")
-    first = tiny.expect((0x705, "7f"))
-    tiny.expect((0x585, "6017100000000000"))
+    first = tiny.send(0x605, "2b17100032000000")
+    tiny.expect((0x705, "7f"), (0x585, "6017100000000000"))
     for beat in (1, 2, 3):
         tiny.assert_after(first, tiny.expect((0x705, "7f"), within_ms=50), beat * 50)
-    tiny.send(0x605, "2b1710000000000000"[:16])
+    tiny.send(0x605, "2b17100000000000")
     while tiny.next().can_id == 0x705:
         pass
     tiny.silence(120)

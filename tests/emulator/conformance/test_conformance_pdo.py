@@ -164,8 +164,8 @@ def test_cia301_pdo_30_no_request_where_bit_30_forbids_it(tiny):
 
 def test_cia301_pdo_31_inhibit_time_holds_back_and_sends_the_latest(tiny):
     configure(tiny, 0x1800, cob_id=0x185, words=[0x20010020], type=255, inhibit=3000)  # 300 ms
-    tiny.nmt(0x01)
-    first = tiny.expect((0x185, INITIAL[:8]))
+    first = tiny.nmt(0x01)
+    tiny.expect((0x185, INITIAL[:8]))
     tiny.set((0x2001, 0, 1, 4), (0x2001, 0, 2, 4))
     tiny.assert_after(first, tiny.expect((0x185, "02000000"), within_ms=300), 300)
     tiny.silence(350)
@@ -173,8 +173,8 @@ def test_cia301_pdo_31_inhibit_time_holds_back_and_sends_the_latest(tiny):
 
 def test_cia301_pdo_31_event_timer_repeats(tiny):
     configure(tiny, 0x1800, cob_id=0x185, words=[0x20010020], type=254, event=60)
-    tiny.nmt(0x01)
-    first = tiny.expect((0x185, INITIAL[:8]))
+    first = tiny.nmt(0x01)
+    tiny.expect((0x185, INITIAL[:8]))
     for turn in (1, 2, 3):
         tiny.assert_after(first, tiny.expect((0x185, INITIAL[:8]), within_ms=60), 60 * turn)
     tiny.nmt(0x02)
