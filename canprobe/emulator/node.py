@@ -110,7 +110,7 @@ class SlaveNode:
         return self._taken()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """A frame from the bus, of anyone to anyone. Never raises, whatever the bytes."""
+        """A frame from the bus, of anyone to anyone (a remote request has RTR_FLAG). Never raises, whatever it is."""
         route = self._routes.get(can_id)
         if route is None:
             return []

@@ -139,7 +139,7 @@ class Tpdo:
     def sample(self, t_ns: int) -> None:
         """Type 252: pack the values of this SYNC, for the next remote request."""
         self.before(t_ns)
-        self._buffer = self._pack(*self._fetch(self._core.dictionary.values))
+        self._buffer = self._packed()
 
     def remote(self, data: bytes, t_ns: int) -> None:
         """A remote request. Synchronous PDOs answer with the values of the last SYNC, the others with the present."""
@@ -150,7 +150,10 @@ class Tpdo:
         else:
             if self.type in (BUFFERED, ON_REQUEST):
                 self.before(t_ns)
-            self.send()
+            self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
+
+    def _packed(self) -> bytes:
+        return self._pack(*self._fetch(self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
         self.before(t_ns)

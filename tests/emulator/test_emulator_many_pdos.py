@@ -106,3 +106,12 @@ def test_type_252_forgets_its_sample_out_of_operational(bench):
     bench.write(0x2001, 0, 0xAA, 4)
     bench.nmt(0x01)
     assert bench.send(0x40000185, "") == [(0x185, "aa000000feff")]
+
+
+def test_a_request_does_not_use_up_an_event_that_waits_for_a_sync(bench):
+    bench.write(0x1800, 2, 0, 1)
+    bench.nmt(0x01)
+    bench.write(0x2001, 0, 0xAA, 4)
+    assert bench.send(0x40000185, "") == [(0x185, "aa000000feff")]
+    assert bench.send(0x80, "") == [(0x185, "aa000000feff")]
+    assert bench.send(0x80, "") == []
