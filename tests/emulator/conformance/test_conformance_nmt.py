@@ -90,6 +90,14 @@ def test_cia301_nmt_07_state_change_is_heard_at_once(tiny):
         tiny.expect((0x705, state))
 
 
+def test_cia301_nmt_07_the_state_is_told_before_anything_else(tiny):
+    tiny.set((0x1800, 2, 255, 1))
+    tiny.send(0x605, "2b171000ffff0000")
+    tiny.expect((0x705, "7f"), (0x585, "6017100000000000"))
+    tiny.nmt(0x01)
+    tiny.expect((0x705, "05"), (0x185, "04030201feff"))
+
+
 def test_cia301_heartbeat_08_a_write_acts_at_once(tiny):
     first = tiny.send(0x605, "2b17100032000000")
     tiny.expect((0x705, "7f"), (0x585, "6017100000000000"))
