@@ -205,12 +205,22 @@ def emulate(
     node_ids: tuple[int, ...],
     seed: int | None = None,
     truth_path: Path | None = None,
+    store_folder: Path | None = None,
     say: Say = _quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
+    Args:
+        scene: whose nodes.
+        interface, channel, bitrate: of the bus.
+        node_ids: which nodes.
+        seed: in the place of the scene's.
+        truth_path: file for the plant's true values, written at the end.
+        store_folder: folder with a file for each node, where its 1010h stores; None forgets at the end.
+        say: called when the nodes are about to be served.
+
     Raises:
-        UsageError: the scene does not fit.
+        UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
     """
@@ -221,6 +231,7 @@ def emulate(
     from canprobe.bus.probe import answering_nodes
     from canprobe.emulator.build import make_world
     from canprobe.emulator.serve import serve
+    from canprobe.emulator.store_file import keep_in_file
     from canprobe.planning import make_plan
 
     resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
@@ -234,6 +245,9 @@ def emulate(
         rehearse(resolved)
         reserve_memory()
         world = make_world(plan, node_ids)
+        if store_folder is not None:
+            for node in world.nodes:
+                keep_in_file(node, store_folder / f"node{node.node_id:03}.json")
         port.drain()  # what passed meanwhile
         ask_for_processor()
         say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")

@@ -20,6 +20,7 @@ _EXAMPLE = """\
 example:
   canprobe emulate cylinder --channel vcan0
   canprobe emulate cylinder --channel vcan0 --nodes 1-6
+  canprobe emulate cylinder --channel vcan0 --store nodes/
 """
 
 
@@ -32,6 +33,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="write the plant's true values there at the end (.npz)"
+    )
+    parser.add_argument(
+        "--store", metavar="DIR", type=Path, help="keep there what a master stores by 1010h [forgotten at the end]"
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.set_defaults(run=run, bus="socketcan")
@@ -61,6 +65,7 @@ def run(args: argparse.Namespace) -> int:
             node_ids=wanted,
             seed=args.seed,
             truth_path=args.truth,
+            store_folder=args.store,
             say=say,
         )
     return 0
