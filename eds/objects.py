@@ -139,7 +139,7 @@ def _count_of(index: int, count: int) -> ODVariable:
 
 def _check_count(source: Source, head: Section, subs: Subs) -> None:
     text = head.value("SubNumber")
-    if not subs:
+    if not subs or head.value("CompactSubObj"):
         return
     if not text:
         source.warn(head, "SubNumber", f"missing; {len(subs)} sub-objects are described")

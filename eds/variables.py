@@ -43,6 +43,7 @@ def build_variable(
     _set_limits(source, section, variable, data_type)
     set_value(source, section, "DefaultValue", variable)
     set_value(source, section, "ParameterValue", variable)
+    _check_default(source, section, variable)
     _set_extras(section, variable)
     return variable
 
@@ -155,6 +156,15 @@ def _limit(source: Source, section: Section, key: str, data_type: int) -> int | 
     except (ValueError, OverflowError):
         source.warn(section, key, f"{text!r} is not a value of type {name_of(data_type)}; not used")
         return None
+
+
+def _check_default(source: Source, section: Section, variable: ODVariable) -> None:
+    default = variable.default
+    if not isinstance(default, (int, float)):
+        return
+    too_low = variable.min is not None and default < variable.min
+    if too_low or (variable.max is not None and default > variable.max):
+        source.warn(section, "DefaultValue", f"{default} is outside LowLimit and HighLimit; served")
 
 
 def _set_extras(section: Section, variable: ODVariable) -> None:
