@@ -47,7 +47,7 @@ def eds_path(name: str) -> Path:
         return _FOLDER / f"{stem}.eds"
     near = difflib.get_close_matches(stem, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
-    raise EdsError(f"EDS {name!r}: no such packaged file: {hint}")
+    raise EdsError(f"EDS {name!r}: no such file, and none of that name is packaged: {hint}")
 
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
