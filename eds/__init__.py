@@ -85,12 +85,12 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
     return _parse(path, path.stat().st_mtime_ns, node_id)
 
 
-def check_eds(name_or_path: str | os.PathLike[str], node_id: int = 1) -> Reading:
+def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) -> Reading:
     """Read an EDS or DCF file with everything that is wrong with it.
 
     Args:
         name_or_path: as for `load_eds`.
-        node_id: 1..127, put in for $NODEID.
+        node_id: 1..127, put in for $NODEID; None for that of the DCF, or else 1.
 
     Raises:
         EdsError: missing or unreadable.

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ObjectDictionary
 
+from canprobe.eds.lines import Section, Sections
+from canprobe.eds.numbers import parse_integer
 from canprobe.eds.source import Source
 
 _RATES_KBIT_S = (10, 20, 50, 125, 250, 500, 800, 1000)
@@ -46,6 +48,24 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
             if section.value(key):
                 number = source.number(section, key)
                 setattr(information, field, bool(number) if key in _FLAGS else number)
-    section = source.sections.get("devicecomissioning") or source.sections.get("devicecommissioning")
-    if section is not None and (rate := source.number(section, "Baudrate")):
-        od.bitrate = rate * 1000
+    if (section := _commissioning(source.sections)) is not None:
+        if rate := source.number(section, "Baudrate"):
+            od.bitrate = rate * 1000
+        if (node_id := source.number(section, "NodeID", source.node_id)) != source.node_id:
+            source.warn(section, "NodeID", f"the file configures node {node_id}; read for node {source.node_id}")
+
+
+def commissioned_node(sections: Sections) -> int | None:
+    """Node id that a DCF has been made for; None where it tells none."""
+    section = _commissioning(sections)
+    if section is None:
+        return None
+    try:
+        node_id = parse_integer(section.value("NodeID"), lambda _: None)
+    except ValueError:
+        return None
+    return node_id if 1 <= node_id <= 127 else None
+
+
+def _commissioning(sections: Sections) -> Section | None:
+    return sections.get("devicecomissioning") or sections.get("devicecommissioning")

@@ -13,7 +13,7 @@ from pathlib import Path
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.eds.faults import Fault, Faults
-from canprobe.eds.information import read_information
+from canprobe.eds.information import commissioned_node, read_information
 from canprobe.eds.lines import decode, split_sections
 from canprobe.eds.lists import check_lists
 from canprobe.eds.objects import build_objects, find_objects
@@ -71,12 +71,12 @@ def device_profile(od: ObjectDictionary) -> int:
     return value & _PROFILE if isinstance(value, int) else 0
 
 
-def read_eds(path: Path, node_id: int) -> Reading:
+def read_eds(path: Path, node_id: int | None) -> Reading:
     """Read a file, whatever is in it.
 
     Args:
         path: of an EDS or DCF file.
-        node_id: 1..127, for $NODEID.
+        node_id: 1..127, for $NODEID; None for that of the DCF, or else 1.
 
     Raises:
         EdsError: the file itself cannot be read.
@@ -86,7 +86,8 @@ def read_eds(path: Path, node_id: int) -> Reading:
     except OSError as error:
         raise EdsError(f"{path}: {error.strerror}") from error
     faults, od = Faults(), ObjectDictionary()  # type: ignore[no-untyped-call]
-    source = Source(split_sections(decode(data, faults), faults), node_id, faults)
+    sections = split_sections(decode(data, faults), faults)
+    source = Source(sections, commissioned_node(sections) or 1 if node_id is None else node_id, faults)
     read_information(source, od)
     heads, subs = find_objects(source)
     if heads or subs:

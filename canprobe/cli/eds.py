@@ -44,7 +44,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     path.set_defaults(run=run, action="path")
     check = actions.add_parser("check", help="list the faults of a file, with section and line", epilog=_CHECK)
     check.add_argument("file", metavar="FILE", help="the path of an EDS or DCF file, or the name of a packaged one")
-    check.add_argument("--node-id", metavar="N", type=whole(1, 127), default=1, help="for $NODEID [1]")
+    check.add_argument("--node-id", metavar="N", type=whole(1, 127), help="for $NODEID [that of the DCF, or 1]")
     add_json(check)
     check.set_defaults(run=run_check)
 

@@ -95,3 +95,10 @@ def test_pairs_of_file_and_node_id_reach_the_api(monkeypatch):
         "channel": "c",
         "bitrate": 500_000,
     }
+
+
+def test_a_dcf_is_checked_for_the_node_that_it_configures(capsys):
+    assert main(["eds", "check", str(MESSY / "configured.dcf")]) == 0
+    assert "clean" in capsys.readouterr().out
+    assert main(["eds", "check", str(MESSY / "configured.dcf"), "--node-id", "5"]) == 0
+    assert "NodeID: the file configures node 7; read for node 5" in capsys.readouterr().out
