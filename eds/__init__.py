@@ -65,6 +65,11 @@ def _resolve(source: str | os.PathLike[str]) -> Path:
     raise EdsError(f"EDS {str(source)!r}: no such file")
 
 
+def _check_node_id(source: str | os.PathLike[str], node_id: int) -> None:
+    if not 1 <= node_id <= 127:
+        raise EdsError(f"EDS {str(source)!r}: node id {node_id} is not 1..127")
+
+
 def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
     """Load an EDS or DCF file into canopen's object dictionary for one node.
 
@@ -79,8 +84,7 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
         EdsError: missing, unreadable or with faults that prevent its use; names the file and each fault. What is
             merely untidy is accepted, see `check_eds`.
     """
-    if not 1 <= node_id <= 127:
-        raise EdsError(f"EDS {str(name_or_path)!r}: node id {node_id} is not 1..127")
+    _check_node_id(name_or_path, node_id)
     path = _resolve(name_or_path)
     return _parse(path, path.stat().st_mtime_ns, node_id)
 
@@ -93,8 +97,10 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
         node_id: 1..127, put in for $NODEID; None for that of the DCF, or else 1.
 
     Raises:
-        EdsError: missing or unreadable.
+        EdsError: missing or unreadable, or no such node id.
     """
+    if node_id is not None:
+        _check_node_id(name_or_path, node_id)
     from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
 
     return read_eds(_resolve(name_or_path), node_id)

@@ -1,28 +1,24 @@
-"""Sections → objects: variables, arrays and records, also in the compact form, and the dummy types.
+"""Sections → objects of the dictionary, and the dummy types.
 
-Source: CiA 306-1, "Object description", "CompactSubObj", "Dummy usage".
+Source: CiA 306-1, "Object description", "Dummy usage".
 """
 
 from __future__ import annotations
 
-import copy
 import re
 
-from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODRecord, ODVariable
 
+from canprobe.eds.composites import ARRAY, RECORD, Subs, build_composite
 from canprobe.eds.lines import Section
 from canprobe.eds.numbers import parse_integer
 from canprobe.eds.source import Source
-from canprobe.eds.standard_types import COUNTING, is_variable
-from canprobe.eds.variables import build_variable, set_value
+from canprobe.eds.variables import build_variable
 
 _OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})")
 _SUB_OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})\s*sub\s*(?:0x)?([0-9a-f]{1,2})")
-_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD = 0, 2, 5, 6, 7, 8, 9
-_KINDS = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, _ARRAY, _RECORD})
-_MOST_COMPACT = 254
-
-Subs = dict[int, Section]
+_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR = 0, 2, 5, 6, 7
+_KINDS = frozenset({_NULL, _DOMAIN, _DEFTYPE, _DEFSTRUCT, _VAR, ARRAY, RECORD})
 
 
 def find_objects(source: Source) -> tuple[dict[int, Section], dict[int, Subs]]:
@@ -53,11 +49,11 @@ def _build(source: Source, index: int, head: Section | None, subs: Subs) -> ODVa
         first = next(iter(subs.values()))
         head = Section(f"{index:04X}", first.line)
         source.warn(head, "", "no section for the object itself, only for its sub-objects; taken for a record")
-        return _composite(source, index, head, subs, _RECORD)
+        return build_composite(source, index, head, subs, RECORD)
     kind = _kind(source, head, subs)
     if kind in (_VAR, _DOMAIN):
         return build_variable(source, head, index, 0)
-    return _composite(source, index, head, subs, kind) if kind in (_ARRAY, _RECORD) else None
+    return build_composite(source, index, head, subs, kind) if kind in (ARRAY, RECORD) else None
 
 
 def _kind(source: Source, head: Section, subs: Subs) -> int:
@@ -71,95 +67,13 @@ def _kind(source: Source, head: Section, subs: Subs) -> int:
     compact = bool(head.value("CompactSubObj")) and source.number(head, "CompactSubObj") > 0
     if stated in (_NULL, _DEFTYPE, _DEFSTRUCT) and not subs:
         return stated
-    shown = _RECORD if subs else _ARRAY if compact else _VAR
-    fits = stated in (_ARRAY, _RECORD) if subs or compact else stated in (_VAR, _DOMAIN)
-    if fits or (stated in (_ARRAY, _RECORD) and not head.value("DataType")):
+    shown = RECORD if subs else ARRAY if compact else _VAR
+    fits = stated in (ARRAY, RECORD) if subs or compact else stated in (_VAR, _DOMAIN)
+    if fits or (stated in (ARRAY, RECORD) and not head.value("DataType")):
         return stated
     what = f"{text} does not fit" if text else "missing"
     source.warn(head, "ObjectType", f"{what}; taken for {'a variable' if shown == _VAR else 'an array or record'}")
     return shown
-
-
-def _composite(source: Source, index: int, head: Section, subs: Subs, kind: int) -> ODArray | ODRecord | None:
-    if is_variable(index):
-        source.fault(head, "", "the standard has a variable at this index, not an array or record")
-        return None
-    name = head.value("ParameterName")
-    if not name:
-        name = f"Object {index:04X}h"
-        if head.items:
-            source.warn(head, "ParameterName", f"missing; named {name!r}")
-    built = (ODArray if kind == _ARRAY else ODRecord)(name, index)
-    if location := head.value("StorageLocation"):
-        setattr(built, "storage_location", location)  # noqa: B010 - canopen declares it as None
-    members = _compact_members(source, index, head)
-    for subindex in subs:
-        variable = build_variable(source, subs[subindex], index, subindex, composite=True)
-        if variable is not None:
-            members[subindex] = variable
-    if not members:
-        source.warn(head, "", "no section describes a sub-object of it; left out")
-        return None
-    _check_count(source, head, subs)
-    _check_highest(source, head, subs, members)
-    for subindex in sorted(members):
-        built.add_member(members[subindex])
-    return built
-
-
-def _compact_members(source: Source, index: int, head: Section) -> dict[int, ODVariable]:
-    """Members of an object with CompactSubObj; names and values from [indexName] and [indexValue]."""
-    count = source.number(head, "CompactSubObj")
-    if not 0 < count <= _MOST_COMPACT:
-        if count:
-            source.warn(head, "CompactSubObj", f"{count} is not 1..{_MOST_COMPACT}; ignored")
-        return {}
-    template = build_variable(source, head, index, 1, composite=True)
-    if template is None:
-        return {}
-    members = {0: _count_of(index, 0 if index in COUNTING else count)}
-    names = source.sections.get(f"{index:04x}name")
-    values = source.sections.get(f"{index:04x}value")
-    for subindex in range(1, count + 1):
-        members[subindex] = variable = copy.copy(template)
-        named = names.value(str(subindex)) if names is not None else ""
-        variable.subindex, variable.name = subindex, named or f"{template.name}_{subindex:x}"
-        if values is not None:
-            set_value(source, values, "DefaultValue", variable, str(subindex))
-    return members
-
-
-def _count_of(index: int, count: int) -> ODVariable:
-    variable = ODVariable("Number of entries", index, 0)
-    variable.data_type = datatypes.UNSIGNED8
-    variable.access_type = "rw" if index in COUNTING else "ro"
-    variable.default = count
-    return variable
-
-
-def _check_count(source: Source, head: Section, subs: Subs) -> None:
-    text = head.value("SubNumber")
-    if not subs or head.value("CompactSubObj"):
-        return
-    if not text:
-        source.warn(head, "SubNumber", f"missing; {len(subs)} sub-objects are described")
-    elif (stated := source.number(head, "SubNumber", -1)) != len(subs):
-        source.warn(head, "SubNumber", f"{stated}, but {len(subs)} sub-objects are described; those are taken")
-
-
-def _check_highest(source: Source, head: Section, subs: Subs, members: dict[int, ODVariable]) -> None:
-    index = next(iter(members.values())).index
-    highest = max(members)
-    if 0 not in members:
-        source.warn(head, "", f"subindex 0 is not described; taken for {highest}")
-        members[0] = _count_of(index, highest)
-    elif index not in COUNTING and members[0].default != highest and 0 in subs:
-        default = members[0].default
-        if default is None:
-            source.warn(subs[0], "DefaultValue", f"missing, but the highest subindex is {highest}; taken")
-            members[0].default = highest
-        else:
-            source.warn(subs[0], "DefaultValue", f"{default}, but the highest subindex described is {highest}")
 
 
 def _add_dummies(source: Source, od: ObjectDictionary) -> None:

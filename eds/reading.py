@@ -22,6 +22,8 @@ from canprobe.eds.source import Source
 from canprobe.errors import EdsError
 
 _PROFILE = 0xFFFF
+_DRIVE_PROFILE = 402
+_DRIVE_OBJECTS = (0x6040, 0x6041)
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,11 @@ def device_profile(od: ObjectDictionary) -> int:
     return value & _PROFILE if isinstance(value, int) else 0
 
 
+def is_drive(od: ObjectDictionary) -> bool:
+    """Whether the device profile is CiA 402 and the two objects of its state machine are there."""
+    return device_profile(od) == _DRIVE_PROFILE and all(index in od.indices for index in _DRIVE_OBJECTS)
+
+
 def read_eds(path: Path, node_id: int | None) -> Reading:
     """Read a file, whatever is in it.
 
@@ -94,6 +101,9 @@ def read_eds(path: Path, node_id: int | None) -> Reading:
         build_objects(source, heads, subs, od)
         check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
         repair(source, heads, od)
+        if device_profile(od) == _DRIVE_PROFILE and not is_drive(od):
+            text = "the profile is CiA 402, but controlword or statusword is not described; served, but not as a drive"
+            faults.warn(0, "1000", "", text)
     elif not any(fault.prevents for fault in faults.found):
         faults.fault(0, "", "", "no object in it")
     return Reading(path, od, faults.sorted())

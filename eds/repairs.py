@@ -27,6 +27,7 @@ def repair(source: Source, heads: dict[int, Section], od: ObjectDictionary) -> N
     for index in od:
         if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
             _check_mapping(source, heads, od, index)
+    _check_pdo_counts(source, od)
 
 
 def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable | None:
@@ -96,6 +97,14 @@ def _tell(
         source.faults.warn(0, f"{index:04X}sub{subindex:X}", "DefaultValue", text)
     else:
         source.warn(section, key, text)
+
+
+def _check_pdo_counts(source: Source, od: ObjectDictionary) -> None:
+    section = source.sections.get("deviceinfo")
+    for key, first, name in (("NrOfRXPDO", 0x1400, "RPDOs"), ("NrOfTXPDO", 0x1800, "TPDOs")):
+        described = sum(first <= index < first + 0x200 for index in od)
+        if section is not None and section.value(key) and (stated := source.number(section, key)) != described:
+            source.warn(section, key, f"{stated}, but {described} {name} are described; those are served")
 
 
 def _check_mapping(source: Source, heads: dict[int, Section], od: ObjectDictionary, index: int) -> None:

@@ -9,15 +9,15 @@ from contextlib import suppress
 
 from canopen.objectdictionary import ODVariable, datatypes
 
+from canprobe.eds.data_types import data_type_of
 from canprobe.eds.lines import Section
-from canprobe.eds.numbers import parse_flag, parse_integer, parse_sum
+from canprobe.eds.numbers import parse_flag, parse_sum
 from canprobe.eds.source import Source
-from canprobe.eds.standard_types import standard_access, standard_type
-from canprobe.eds.values import KNOWN, NAMES, TEXTS, convert, convert_limit, name_of
+from canprobe.eds.standard_types import standard_access
+from canprobe.eds.values import TEXTS, convert, convert_limit, name_of
 
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
-_OBJECT_DOMAIN = 2
 
 
 def build_variable(
@@ -31,7 +31,7 @@ def build_variable(
         index, subindex: of the variable.
         composite: it is part of an array or record.
     """
-    data_type = _data_type(source, section, index, subindex)
+    data_type = data_type_of(source, section, index, subindex)
     if data_type is None:
         return None
     variable = ODVariable(_name(source, section, index, subindex), index, subindex)
@@ -74,47 +74,6 @@ def _name(source: Source, section: Section, index: int, subindex: int) -> str:
         name = f"Object {index:04X}h:{subindex:02X}"
         source.warn(section, "ParameterName", f"missing; named {name!r}")
     return name
-
-
-def _data_type(source: Source, section: Section, index: int, subindex: int) -> int | None:
-    text = section.value("DataType")
-    demanded = standard_type(index, subindex)
-    if not text:
-        return _untyped(source, section, demanded)
-    if (named := NAMES.get(text.upper())) is not None:
-        source.warn(section, "DataType", f"{text} is read as {named:#06x}")
-        return named
-    try:
-        data_type = parse_integer(text, source.remark(section, "DataType"))
-    except ValueError:
-        source.fault(section, "DataType", f"{text!r} is not a data type")
-        return None
-    if data_type not in KNOWN:
-        data_type = _foreign(source, section, data_type)
-    if demanded is not None and data_type != demanded:
-        source.warn(section, "DataType", f"{name_of(data_type)}, but the standard demands {name_of(demanded)}; taken")
-        return demanded
-    return data_type
-
-
-def _untyped(source: Source, section: Section, demanded: int | None) -> int | None:
-    if section.value("ObjectType") and source.number(section, "ObjectType") == _OBJECT_DOMAIN:
-        return int(datatypes.DOMAIN)
-    if demanded is None:
-        source.fault(section, "DataType", "missing, so the length of the object cannot be known")
-    else:
-        source.warn(section, "DataType", f"missing; the standard demands {name_of(demanded)}")
-    return demanded
-
-
-def _foreign(source: Source, section: Section, data_type: int) -> int:
-    """A type of the maker's own: defined in a section such as [A0] by some editors, else served as octets."""
-    definition = source.sections.get(f"{data_type:x}sub1")
-    base = source.number(definition, "DefaultValue") if definition is not None else 0
-    if base in KNOWN:
-        return base
-    source.warn(section, "DataType", f"{data_type:#06x} is not a type of CiA 301; the object is served as octets")
-    return int(datatypes.DOMAIN)
 
 
 def _access(source: Source, section: Section, index: int, subindex: int, composite: bool) -> str:

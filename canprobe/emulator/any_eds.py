@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.eds.reading import device_profile
+from canprobe.eds.reading import is_drive
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.ideal_axis import IdealAxis
 from canprobe.emulator.node import SlaveNode
-
-DRIVE_PROFILE = 402
-_DRIVE_OBJECTS = (0x6040, 0x6041)
-
-
-def is_drive(od: ObjectDictionary) -> bool:
-    """Whether the device profile of 1000h is CiA 402 and the objects of its state machine are there."""
-    return device_profile(od) == DRIVE_PROFILE and all(index in od.indices for index in _DRIVE_OBJECTS)
 
 
 def make_eds_node(od: ObjectDictionary, node_id: int) -> SlaveNode:

@@ -85,6 +85,7 @@ VALUES = {
     "stray_lines.eds": {(0x2000, 0): 1},
     "mappings.eds": {(0x1A02, 2): 0x20000008},
     "dummies.eds": {(0x1600, 1): 0x00040020},
+    "no_statusword.eds": {(0x6040, 0): 0},
     "drive402.eds": {(0x1000, 0): 0x20192, (0x6081, 0): 4096, (0x6064, 0): None, (0x60C2, 2): -3},
 }
 
@@ -275,13 +276,15 @@ def test_the_vendors_drive_moves_an_axis_of_its_own():
     assert upload(node, 0x6502, 0, t_ns) == (1 << 7).to_bytes(4, "little"), "what the emulated drive can do"
 
 
-def test_a_device_of_another_profile_is_no_drive():
-    node = make_eds_node(load_eds(FOLDER / "compact.eds", NODE_ID), NODE_ID)
+@pytest.mark.parametrize("name", ["compact.eds", "no_statusword.eds"])
+def test_a_device_of_another_profile_is_no_drive(name):
+    """Nor one that lacks the state machine: a controlword has no effect there, and nothing breaks."""
+    node = make_eds_node(load_eds(FOLDER / name, NODE_ID), NODE_ID)
     node.start(0)
     node.receive(0, bytes((1, 0)), 0)
-    node.receive(0x605, bytes.fromhex("2f10200100000000"), 0)
-    assert node.application.__class__.__name__ == "Application"
+    node.receive(0x605, bytes.fromhex("2b40600006000000"), 0)
     assert upload(node, 0x6041, 0) == 0x06020000
+    assert upload(node, 0x1001, 0) == b"\0", "no error"
 
 
 def damaged(data, rng):
