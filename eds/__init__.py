@@ -47,7 +47,7 @@ def eds_path(name: str) -> Path:
         return _FOLDER / f"{stem}.eds"
     near = difflib.get_close_matches(stem, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
-    raise EdsError(f"EDS {name!r}: no such file, and none of that name is packaged: {hint}")
+    raise EdsError(f"EDS {name!r}: no such file, and no such packaged file: {hint}")
 
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
@@ -110,4 +110,4 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
 def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
     from canprobe.eds.reading import read_eds
 
-    return read_eds(path, node_id).usable()
+    return read_eds(path, node_id, serving=False).usable()

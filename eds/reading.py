@@ -78,12 +78,14 @@ def is_drive(od: ObjectDictionary) -> bool:
     return device_profile(od) == _DRIVE_PROFILE and all(index in od.indices for index in _DRIVE_OBJECTS)
 
 
-def read_eds(path: Path, node_id: int | None) -> Reading:
+def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Reading:
     """Read a file, whatever is in it.
 
     Args:
         path: of an EDS or DCF file.
         node_id: 1..127, for $NODEID; None for that of the DCF, or else 1.
+        serving: add the mandatory objects that are missing, and take what the default mapping of a PDO carries as
+            mappable, whatever PDOMapping says. A master had better not rely on either.
 
     Raises:
         EdsError: the file itself cannot be read.
@@ -100,7 +102,7 @@ def read_eds(path: Path, node_id: int | None) -> Reading:
     if heads or subs:
         build_objects(source, heads, subs, od)
         check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
-        repair(source, heads, od)
+        repair(source, heads, od, serving)
         if device_profile(od) == _DRIVE_PROFILE and not is_drive(od):
             text = "the profile is CiA 402, but controlword or statusword is not described; served, but not as a drive"
             faults.warn(0, "1000", "", text)

@@ -20,13 +20,14 @@ _PDO_BASES = {
 }
 
 
-def repair(source: Source, heads: dict[int, Section], od: ObjectDictionary) -> None:
-    """Put right what the standard fixes, each time with a warning."""
-    _add_mandatory(source, od)
+def repair(source: Source, heads: dict[int, Section], od: ObjectDictionary, serving: bool) -> None:
+    """Put right what the standard fixes, each time with a warning; `serving` as in `read_eds`."""
+    if serving:
+        _add_mandatory(source, od)
     _repair_identifiers(source, heads, od)
     for index in od:
         if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
-            _check_mapping(source, heads, od, index)
+            _check_mapping(source, heads, od, index, serving)
     _check_pdo_counts(source, od)
 
 
@@ -107,8 +108,8 @@ def _check_pdo_counts(source: Source, od: ObjectDictionary) -> None:
             source.warn(section, key, f"{stated}, but {described} {name} are described; those are served")
 
 
-def _check_mapping(source: Source, heads: dict[int, Section], od: ObjectDictionary, index: int) -> None:
-    """The default mapping of a PDO. What it maps can be mapped, whatever PDOMapping says."""
+def _check_mapping(source: Source, heads: dict[int, Section], od: ObjectDictionary, index: int, serving: bool) -> None:
+    """The default mapping of a PDO."""
     bits = 0
     for subindex, word in _words(od, index):
         name, length = f"{word >> 16:04X}h:{word >> 8 & 0xFF:02X}", word & 0xFF
@@ -121,7 +122,7 @@ def _check_mapping(source: Source, heads: dict[int, Section], od: ObjectDictiona
             _tell(source, heads, (index, subindex), text)
         elif not target.pdo_mappable and target.index > 7:
             _tell(source, heads, (target.index, target.subindex), f"is mapped in {index:04X}h, so 1", "PDOMapping")
-            target.pdo_mappable = True
+            target.pdo_mappable = serving
     if bits > _MOST_BITS:
         _tell(source, heads, (index, 0), f"maps {bits} bits, but a frame has {_MOST_BITS}; the PDO is served empty")
 

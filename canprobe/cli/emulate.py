@@ -60,8 +60,6 @@ def run(args: argparse.Namespace) -> int:
     """Serve until an interrupt, which is the normal way to leave."""
     if (args.scene is None) is not bool(args.eds):
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N")
-    if args.channel is None:
-        raise UsageError("emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0")
     serve = _eds_server(args) if args.eds else _scene_server(args)
 
     from canprobe.child import end_with_parent
@@ -79,6 +77,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
     if args.node_id:
         raise UsageError("emulate: --node-id belongs to --eds; of a scene's nodes, choose with --nodes")
     scene = load_scene(args.scene)
+    _check_channel(args)
     target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
 
@@ -102,6 +101,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     for option in ("nodes", "seed", "truth"):
         if getattr(args, option) is not None:
             raise UsageError(f"emulate: --{option} belongs to a scene, not to --eds")
+    _check_channel(args)
     channels = [channel for _, channel in args.channel]
     if len(channels) > 1 or args.channel[0][0] is not None:
         raise UsageError("emulate: with --eds there is one channel, without a name: --channel CH")
@@ -115,6 +115,11 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         bitrate=args.bitrate or _BITRATE,
         say=say,
     )
+
+
+def _check_channel(args: argparse.Namespace) -> None:
+    if args.channel is None:
+        raise UsageError("emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0")
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

@@ -131,7 +131,7 @@ def test_what_is_wrong_is_told_with_its_line_and_nothing_else(path):
 
 @pytest.mark.parametrize("path", SERVABLE, ids=lambda path: path.name)
 def test_values_are_what_the_file_means(path):
-    od = load_eds(path, NODE_ID)
+    od = check_eds(path, NODE_ID).usable()
     for (index, subindex), expected in VALUES[path.name].items():
         entry = od[index]
         variable = entry.subindices[subindex] if hasattr(entry, "subindices") else entry
@@ -172,6 +172,16 @@ def test_limits_names_rights_and_dummies():
     assert (var("types.eds", 0x2004).access_type, var("types.eds", 0x2004).data_type) == ("wo", 0xF)
     configured = var("configured.dcf", 0x1014), var("configured.dcf", 0x1017), var("configured.dcf", 0x1800)[1]
     assert [v.value for v in configured] == [0x321, 250, 0x80000185]
+
+
+def test_a_master_takes_the_file_at_its_word_and_a_served_node_is_complete():
+    """No object and no mappability that the file does not state; a conforming node needs 1000h and 1018h."""
+    path = FOLDER / "drive402.eds"
+    assert load_eds(path, NODE_ID)[0x6041].pdo_mappable is False
+    assert check_eds(path, NODE_ID).dictionary[0x6041].pdo_mappable is True
+    path = FOLDER / "bare.eds"
+    assert not {0x1000, 0x1018} & set(load_eds(path, NODE_ID))
+    assert {0x1000, 0x1018} <= set(check_eds(path, NODE_ID).dictionary)
 
 
 @pytest.mark.parametrize("name", ["puma260_joint", "tactile_array"])
@@ -231,7 +241,7 @@ LIVE = {0x1001, 0x1003, 0x6041, 0x6061, 0x6064, 0x6502, 0x607A}
 @pytest.mark.parametrize("path", SERVABLE, ids=lambda path: path.name)
 def test_every_value_is_served_over_sdo(path):
     """CiA 301, SDO upload: the bytes are those of canopen's own encoder."""
-    od = load_eds(path, NODE_ID)
+    od = check_eds(path, NODE_ID).usable()
     node = make_eds_node(od, NODE_ID)
     boot_up, *_ = node.start(0)
     assert boot_up == (0x705, b"\0")
@@ -253,7 +263,7 @@ def test_every_value_is_served_over_sdo(path):
 
 def test_the_vendors_drive_moves_an_axis_of_its_own():
     """CiA 402: from a vendor's EDS alone to a motion in cyclic synchronous position, in raw frames."""
-    node = make_eds_node(load_eds(FOLDER / "drive402.eds", NODE_ID), NODE_ID)
+    node = make_eds_node(check_eds(FOLDER / "drive402.eds", NODE_ID).usable(), NODE_ID)
     t_ns = 0
     node.start(t_ns)
     node.receive(0, bytes((1, NODE_ID)), t_ns)
@@ -279,7 +289,7 @@ def test_the_vendors_drive_moves_an_axis_of_its_own():
 @pytest.mark.parametrize("name", ["compact.eds", "no_statusword.eds"])
 def test_a_device_of_another_profile_is_no_drive(name):
     """Nor one that lacks the state machine: a controlword has no effect there, and nothing breaks."""
-    node = make_eds_node(load_eds(FOLDER / name, NODE_ID), NODE_ID)
+    node = make_eds_node(check_eds(FOLDER / name, NODE_ID).usable(), NODE_ID)
     node.start(0)
     node.receive(0, bytes((1, 0)), 0)
     node.receive(0x605, bytes.fromhex("2b40600006000000"), 0)
