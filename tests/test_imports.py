@@ -37,7 +37,14 @@ ALLOWED = {
     "bridge": EDGE | {"cell", "emulator", "plant", "api", "studies"},
     "package": {*EDGE, "api", "cli"},
 }
-COMPOSITION = {"api", "results", "session", "child", "rehearsal"}  # top-level modules that join cell and emulator
+COMPOSITION = {
+    "api",
+    "results",
+    "session",
+    "child",
+    "rehearsal",
+    "emulation",
+}  # top-level modules that join cell and emulator
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
 NEVER_IN_PURE = EDGE_ONLY | {
