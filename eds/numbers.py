@@ -12,7 +12,7 @@ Remark = Callable[[str], None]
 
 _HEX = re.compile(r"([+-]?)0x([0-9a-f]+)", re.IGNORECASE)
 _HEX_SUFFIX = re.compile(r"()([0-9][0-9a-f]*)h", re.IGNORECASE)
-_DECIMAL = re.compile(r"[+-]?\d+")
+_DECIMAL = re.compile(r"[+-]?[0-9]+")
 _NODE_ID = re.compile(r"\$node_?id", re.IGNORECASE)
 
 
@@ -59,7 +59,7 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
         ValueError: it is none.
     """
     total, relative = 0, False
-    for term in "".join(text.split()).split("+"):
+    for term in map(str.strip, text.split("+")):
         if _NODE_ID.fullmatch(term):
             total, relative = total + node_id, True
         elif term:

@@ -41,7 +41,7 @@ def convert(text: str, data_type: int, node_id: int, remark: Remark) -> Value:
         remark: called with what is odd about it.
 
     Raises:
-        ValueError: it does not mean a value of that type.
+        ValueError, OverflowError: it does not mean a value of that type.
     """
     if data_type in TEXTS:
         return text
@@ -61,7 +61,7 @@ def convert_limit(text: str, data_type: int, node_id: int, remark: Remark) -> in
     """A limit; None where a type has none.
 
     Raises:
-        ValueError: it does not mean a number of that type.
+        ValueError, OverflowError: it does not mean a number of that type.
     """
     if data_type not in SIGNED | UNSIGNED | REALS:
         return None
@@ -99,11 +99,16 @@ def _real(text: str, data_type: int, remark: Remark) -> float:
         real: float = struct.unpack(form, bytes.fromhex(text[2:])[::-1])[0]
         remark(f"{text} is taken for the bytes of {real:g}")
         return real
-    try:
-        return float(text)
-    except ValueError:
-        pass
+    number = _decimal(text, remark)
+    struct.pack(form, number)  # OverflowError where it does not fit
+    return number
+
+
+def _decimal(text: str, remark: Remark) -> float:
     if re.fullmatch(r"[+-]?\d*,\d+", text):
         remark(f"{text} has a comma for its decimal point")
         return float(text.replace(",", "."))
-    return float(parse_sum(text, 0, remark)[0])
+    try:
+        return float(text)
+    except ValueError:
+        return float(parse_sum(text, 0, remark)[0])

@@ -30,14 +30,14 @@ def test_faults_give_status_2_with_section_and_line(capsys):
     assert main(["eds", "check", str(MESSY / "broken.eds")]) == 2
     *rows, last = capsys.readouterr().out.splitlines()
     assert rows[0] == "fault: line 24 [1000] DefaultValue: 'many' is not a value of type UNSIGNED32"
-    assert last.endswith(": 7 faults, 0 warnings; cannot be served")
+    assert last.endswith(": 8 faults, 0 warnings; cannot be served")
 
 
 def test_json_has_faults_and_warnings_apart(capsys):
     assert main(["eds", "check", "--json", str(MESSY / "broken.eds")]) == 2
     document = json.loads(capsys.readouterr().out)
-    assert (document["servable"], len(document["faults"]), document["warnings"]) == (False, 7, [])
-    assert document["faults"][2]["line"] == 83
+    assert (document["servable"], len(document["faults"]), document["warnings"]) == (False, 8, [])
+    assert document["faults"][2]["section"] == "2006"
     assert main(["eds", "check", "--json", str(MESSY / "drive402.eds")]) == 0
     document = json.loads(capsys.readouterr().out)
     assert (document["servable"], document["device_profile"], document["faults"]) == (True, 402, [])
@@ -80,7 +80,7 @@ def test_wrong_usage_is_one_clear_line(words, told, capsys):
 
 def test_a_file_that_cannot_be_served_is_told_fault_by_fault(capsys):
     assert main(["emulate", "--eds", str(MESSY / "broken.eds"), "--node-id", "5", "--channel", "vcan0"]) == 2
-    assert capsys.readouterr().err.count("not a usable EDS file: line ") == 7
+    assert capsys.readouterr().err.count("not a usable EDS file: line ") == 8
 
 
 def test_pairs_of_file_and_node_id_reach_the_api(monkeypatch):
