@@ -1,4 +1,4 @@
-"""Points 48–53, 56, 57, 59: the drive, by raw frames. Source: CiA 402-2. Points 54, 55, 58, 60: tests/emulator."""
+"""Points 48–60: the drive, by raw frames. Source: CiA 402-2. Modes in depth: tests/emulator/test_drive_*.py."""
 
 from __future__ import annotations
 
@@ -233,6 +233,96 @@ def test_cia402_57_software_limits(drive, target, reached, limited):
     for _ in range(3):
         statusword, _ = master.cycle(0)
     assert statusword >> 11 & 1 == 0
+
+
+def power(drive, plant, mode):
+    """Operation enabled in a mode, no following error to watch."""
+    drive.set((0x6060, 0, mode, 1), (0x6065, 0, 0xFFFFFFFF, 4))
+    bring(drive, plant, "operation enabled")
+
+
+def bits(drive, *numbers):
+    word = drive.read(0x6041)
+    return tuple(word >> number & 1 for number in numbers)
+
+
+def signed(drive, index):
+    value = drive.read(index)
+    return value - (1 << 32) if value >> 31 else value
+
+
+def waits_for(drive, bit):
+    for _ in range(100):
+        if bits(drive, bit) == (1,):
+            return True
+        drive.silence(20)
+    return False
+
+
+def comes_to(drive, position):
+    for _ in range(100):
+        if signed(drive, 0x6064) == position:
+            return True
+        drive.silence(20)
+    return False
+
+
+def test_cia402_54_handshake_of_profile_position(drive, plant):
+    power(drive, plant, 1)
+    drive.set((0x6081, 0, 5000, 4), (0x6083, 0, 50_000, 4), (0x6084, 0, 50_000, 4))
+    drive.set((0x607A, 0, 700, 4))
+    assert bits(drive, 12) == (0,)
+    drive.set((0x6040, 0, 0x1F, 2))  # new set-point
+    assert bits(drive, 10, 12) == (0, 1)
+    drive.set((0x6040, 0, 0x0F, 2))
+    assert bits(drive, 12) == (0,)
+    assert waits_for(drive, 10)  # within the window 6067h
+    assert comes_to(drive, 700)
+    drive.set((0x607A, 0, -200, 4), (0x6040, 0, 0x5F, 2), (0x6040, 0, 0x0F, 2))  # relative
+    assert waits_for(drive, 10)
+    assert comes_to(drive, 500)
+
+
+def test_cia402_55_homing_bits(drive, plant):
+    power(drive, plant, 6)
+    assert drive.write(0x6098, 0, 17, 1) == 0x06090030  # needs a limit switch, which this drive has not
+    drive.set((0x6098, 0, 37, 1), (0x607C, 0, 90, 4))
+    assert bits(drive, 12, 13) == (0, 0)
+    drive.set((0x6040, 0, 0x1F, 2))
+    assert waits_for(drive, 12)
+    assert bits(drive, 10, 13) == (1, 0)
+    assert signed(drive, 0x6064) == -90
+    drive.set((0x6040, 0, 0x0F, 2), (0x6098, 0, 0, 1), (0x6040, 0, 0x1F, 2))  # no method
+    assert waits_for(drive, 13)
+    assert bits(drive, 12) == (0,)
+
+
+def test_cia402_58_torque_limit(drive, plant):
+    drive.set((0x6072, 0, 200, 2), (0x6007, 0, 0, 2))
+    power(drive, plant, 10)
+    master = Master(drive)
+    for torque, applied, limited in ((500, 200, 1), (150, 150, 0)):
+        drive.set((0x6071, 0, torque, 2))
+        for _ in range(3):
+            master.sync()
+            drive.silence(10)
+        assert (drive.read(0x6077), bits(drive, 11)) == (applied, (limited,))
+
+
+def test_cia402_60_halt_and_on(drive, plant):
+    power(drive, plant, 1)
+    drive.set((0x6081, 0, 2000, 4), (0x6083, 0, 50_000, 4), (0x6084, 0, 50_000, 4), (0x605D, 0, 1, 2))
+    drive.set((0x607A, 0, 4000, 4), (0x6040, 0, 0x1F, 2), (0x6040, 0, 0x0F, 2))
+    drive.silence(200)
+    drive.set((0x6040, 0, 0x10F, 2))
+    assert waits_for(drive, 10)  # at rest
+    there = signed(drive, 0x6064)
+    assert 0 < there < 4000
+    assert is_in(drive, "operation enabled")
+    drive.silence(50)
+    assert signed(drive, 0x6064) == there
+    drive.set((0x6040, 0, 0x0F, 2))
+    assert comes_to(drive, 4000)
 
 
 @pytest.mark.parametrize("lost", ["SYNC", "RPDO"])
