@@ -21,6 +21,8 @@ from canprobe.touch.quadric import design
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 
+_MEAN_OF = 8
+
 
 class Touches(NamedTuple):
     """Checked input of a batch fit.
@@ -42,9 +44,16 @@ class Touches(NamedTuple):
 def make_touches(points: Array, normals: Array, noise: Noise) -> Touches:
     """Extent and length of arrays that are already checked."""
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
-    steps = np.diff(points, axis=0)
-    distance = float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
-    return Touches(points, normals, noise, path_extent(points, floor), distance)
+    return Touches(points, normals, noise, path_extent(points, floor), travelled(points))
+
+
+def travelled(points: Array) -> float:
+    """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
+    each = min(_MEAN_OF, max(1, len(points) // 20))
+    means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
+    steps = np.diff(means, axis=0)
+    share = (len(points) - 1) / max(len(points) - each, 1)  # the ends that the means cut off
+    return share * float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
 
 
 def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:

@@ -15,17 +15,17 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, positive, solved, upper_root
-from canprobe.touch.anchor import anchor, foot, solution
+from canprobe.touch._arrays import Array, positive, upper_root
+from canprobe.touch.anchor import anchor, foot
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
 from canprobe.touch.noise import Noise
 from canprobe.touch.nonlinear import CHI2_999, fit
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric import UNIT, Design, design, transport
+from canprobe.touch.quadric import UNIT, Design, curvature_jacobian, design, transport
 from canprobe.touch.quadric_row import sample_rows
 from canprobe.touch.rank import SPREAD, decide, spread_of
 
@@ -37,9 +37,10 @@ ANCHOR = 0.05
 """Travel between two changes of the working frame over the memory."""
 CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
-START = (0.1, 0.4)
+START = (0.1, 0.8)
 """Travel over the memory at the first and last batch solution of the start; it doubles from one to the next."""
 START_SAMPLES = 128
+"""Most samples of such a solution; where there are more, neighbours are averaged."""
 FADE = 0.1
 """What an alarm leaves of the information's root."""
 ALARM = 2.2
@@ -55,6 +56,17 @@ class _Pending(NamedTuple):
     normal: Array
     sigma_point: float
     sigma_normal: float
+
+
+def _mean(a: _Pending, b: _Pending) -> _Pending:
+    """Two neighbouring samples as one."""
+    normal = a.normal + b.normal
+    return _Pending(
+        0.5 * (a.point + b.point),
+        normal / math.sqrt(float(normal @ normal)),
+        0.5 * math.hypot(a.sigma_point, b.sigma_point),
+        0.5 * math.hypot(a.sigma_normal, b.sigma_normal),
+    )
 
 
 class RecursiveEstimator:
@@ -84,6 +96,7 @@ class RecursiveEstimator:
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
         self._prior_rows = self._make_prior_rows()
+        self._prior_score = self._prior_rows.T @ self._prior_rows
         self.reset()
 
     def reset(self) -> None:
@@ -95,7 +108,7 @@ class RecursiveEstimator:
         self._spread = Spread()
         self._T = np.eye(4)
         self._c = np.zeros(9)
-        self._root = np.zeros((9, 9))
+        self._set_root(self._prior_rows)
         self._innovation = self._usual = 1.0
         self._faded = 0
         self._first = True
@@ -116,9 +129,9 @@ class RecursiveEstimator:
         self._pending.append(_Pending(sample.p_base, sample.n_base, *self._gate.sigmas(sample)))
         moved = self._travel.add(sample.p_base)
         if moved > 0.0:
-            self._absorb(moved)
+            crowd = self._absorb(moved)
             if self._next_start < math.inf:
-                self._start_up()
+                self._start_up(1.0 / math.sqrt(crowd))
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -130,14 +143,14 @@ class RecursiveEstimator:
         tangent = a.T_frame_contact[:3, :2]
         spread = tangent.T @ self._spread.covariance @ tangent / self._gate.sigma_point**2
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
-        root = upper_root(solved(a.M.T, self._root.T).T)
-        decision = decide(root[6:, 6:] * UNIT, spread, size)
+        q = a.M[6:] @ self._inverse / UNIT[:, None]
+        decision = decide(np.linalg.cholesky(np.linalg.inv(q @ q.T)).T, spread, size)
         known = decision.vectors[:, decision.passed]
         a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-        here = a._replace(M=np.eye(9), turn=0.0)
+        D = curvature_jacobian(a.c) @ a.M @ self._inverse @ self._inverse.T
         singular = np.linalg.svd(self._root, compute_uv=False)
         return build_estimate(
-            solution(here, root, decision, has_prior=False),
+            Solution(a.c, D @ self._score @ D.T, decision, has_prior=False),
             length=L,
             T_frame_contact=a.T_frame_contact,
             condition_number=float(singular[0] / singular[-1]),
@@ -157,14 +170,19 @@ class RecursiveEstimator:
 
     def _begin(self, sample: ContactSample) -> None:
         self._T = homogeneous(tangent_rotation(-sample.n_base), sample.p_base)
-        self._root = self._prior_rows.copy()
 
-    def _absorb(self, moved: float) -> None:
+    def _set_root(self, root: Array) -> None:
+        """Take a root whose rows all count in full."""
+        self._root, self._inverse, self._score = root, np.linalg.inv(root), root.T @ root
+
+    def _absorb(self, moved: float) -> float:
+        """Take in what is pending; the weight of each sample where they are crowded, else 1."""
         kept = math.exp(-moved / self._memory)
         root = math.sqrt(kept) * self._root
+        inverse: Array = self._inverse / math.sqrt(kept)
         points = np.array([s.point for s in self._pending])
         block = self._rows_of_pending(points)
-        weight, changed = self._judge(block, root)
+        weight, changed = self._judge(block, inverse)
         if changed:
             root, weight, kept = FADE * root, np.ones_like(weight), FADE**2 * kept
         crowd = min(1.0, self._crowd * moved / len(self._pending))
@@ -178,14 +196,20 @@ class RecursiveEstimator:
         stacked[18:] = block
         full = upper_root(stacked)
         self._root = full[:9, :9]
-        self._c = self._c + solved(self._root, full[:9, 9])
+        self._inverse = np.linalg.inv(self._root)
+        self._c = self._c + self._inverse @ full[:9, 9]
+        # what the rows' noise does to an answer whose rows have faded: weights enter squared
+        self._score = kept**2 * self._score + (1.0 - kept**2) * self._prior_score + block[:, :9].T @ block[:, :9]
         self._move_frame()
+        return crowd
 
-    def _start_up(self) -> None:
+    def _start_up(self, wider: float) -> None:
         """Solve the first samples again as a batch: the filter's first steps were linearised on a plane."""
-        self._start += self._pending
+        self._start += [
+            _Pending(s.point, s.normal, wider * s.sigma_point, wider * s.sigma_normal) for s in self._pending
+        ]
         if len(self._start) > START_SAMPLES:
-            self._start = self._start[::2]
+            self._start = [_mean(a, b) for a, b in zip(self._start[::2], self._start[1::2], strict=False)]
         travelled = self._travel.total - self._started
         if travelled < self._next_start:
             return
@@ -193,7 +217,8 @@ class RecursiveEstimator:
         if float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) >= SPREAD:
             fitted = fit(d, self._prior.rows(self._memory))
             if fitted.decision.rank == 3 and fitted.converged:
-                self._c, self._root = fitted.c, fitted.root
+                self._c = fitted.c
+                self._set_root(fitted.root)
             self._next_start *= 2.0
         if travelled >= START[1] * self._memory:
             self._next_start, self._start, self._first = math.inf, [], False
@@ -216,15 +241,17 @@ class RecursiveEstimator:
             block += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
         return np.array(block)
 
-    def _judge(self, block: Array, root: Array) -> tuple[Array, bool]:
+    def _judge(self, block: Array, inverse: Array) -> tuple[Array, bool]:
         """Weights (n,) by Huber's rule on the innovations, and whether they say that the surface has changed."""
-        predicted = solved(root.T, block[:, :9].T)
-        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", predicted, predicted))
-        d2 = square.reshape(-1, 3).sum(axis=1)
-        weight = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
-        mean = float(np.minimum(d2, CHI2_999).mean()) / 3.0
-        self._innovation += min(1.0, RUNNING * len(d2)) * (mean - self._innovation)
-        self._usual += min(1.0, LONG_TERM * len(d2)) * (mean - self._usual)
+        predicted = block[:, :9] @ inverse
+        square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->i", predicted, predicted))
+        d2 = square.reshape(-1, 3) @ np.ones(3)
+        limited = np.minimum(d2, CHI2_999)
+        weight: Array = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
+        n = len(d2)
+        mean = float(np.add.reduce(limited)) / (3.0 * n)
+        self._innovation += min(1.0, RUNNING * n) * (mean - self._innovation)
+        self._usual += min(1.0, LONG_TERM * n) * (mean - self._usual)
         if self._first or self._innovation < ALARM * max(LEAST_USUAL, self._usual):
             return weight, False
         self._innovation = self._usual
@@ -242,5 +269,7 @@ class RecursiveEstimator:
         turned = transported_rotation(np.eye(3), z)
         self._c, M = transport(self._c, homogeneous(turned, x))
         self._c[:3] = 0.0
-        self._root = solved(M.T, self._root.T).T
+        back = np.linalg.inv(M)
+        self._root, self._inverse = self._root @ back, M @ self._inverse
+        self._score = back.T @ self._score @ back
         self._T = homogeneous(R @ turned, origin + R @ (L * x))

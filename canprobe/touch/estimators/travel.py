@@ -26,21 +26,22 @@ class Travel:
     def __init__(self, step: float) -> None:
         self.total = 0.0
         self._step2 = step * step
-        self._mean: Array | None = None
-        self._mark = np.zeros(3)
+        self._mean = self._mark = (0.0, 0.0, 0.0)
         self._count = 0
 
     def add(self, point: Array) -> float:
         """Take a point (3,), m; the length of the step that it completes, or 0."""
-        if self._mean is None:
-            self._mean, self._mark = point.copy(), point.copy()
-        self._count = min(self._count + 1, _MEAN_OF)
-        self._mean = self._mean + (point - self._mean) / self._count
+        x, y, z = point.tolist()
+        if self._count < _MEAN_OF:
+            self._count += 1
+        mx, my, mz = self._mean
+        share = 1.0 / self._count
+        self._mean = mx, my, mz = mx + share * (x - mx), my + share * (y - my), mz + share * (z - mz)
         if self._count < _MEAN_OF:
             self._mark = self._mean
             return 0.0
-        offset = self._mean - self._mark
-        square = float(offset @ offset)
+        ax, ay, az = self._mark
+        square = (mx - ax) ** 2 + (my - ay) ** 2 + (mz - az) ** 2
         if square < self._step2:
             return 0.0
         self._mark = self._mean
@@ -50,34 +51,33 @@ class Travel:
 
 
 class Spread:
-    """Weighted covariance of points, with forgetting.
-
-    Attributes:
-        weight: sum of weights.
-    """
+    """Weighted covariance of points, with forgetting: second moments about the first point."""
 
     def __init__(self) -> None:
-        self.weight = 0.0
-        self._mean = np.zeros(3)
-        self._sum = np.zeros((3, 3))
+        self._origin: Array | None = None
+        self._moments = np.zeros((4, 4))
+
+    @property
+    def weight(self) -> float:
+        """Sum of weights."""
+        return float(self._moments[3, 3])
 
     @property
     def covariance(self) -> Array:
         """(3, 3), m²."""
-        return self._sum / max(self.weight, 1e-300)
+        M = self._moments / max(self.weight, 1e-300)
+        mean = M[:3, 3]
+        result: Array = M[:3, :3] - mean[:, None] * mean
+        return result
 
     def fade(self, kept: float) -> None:
         """Weigh everything so far by a factor."""
-        self.weight *= kept
-        self._sum = self._sum * kept
+        self._moments *= kept
 
     def add(self, points: Array, weight: float) -> None:
         """Take points (n, 3) with one weight each."""
-        added = weight * len(points)
-        mean = points.mean(axis=0)
-        inner = points - mean
-        offset = mean - self._mean
-        total = self.weight + added
-        self._sum = self._sum + weight * (inner.T @ inner) + np.outer(offset, offset) * (self.weight * added / total)
-        self._mean = self._mean + offset * (added / total)
-        self.weight = total
+        if self._origin is None:
+            self._origin = points[0].copy()
+        X = np.ones((len(points), 4))
+        X[:, :3] = points - self._origin
+        self._moments += weight * (X.T @ X)
