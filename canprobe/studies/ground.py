@@ -22,6 +22,8 @@ _AXES = {"ellipsoid": (1.6, 1.2, 0.93), "hyperboloid": (1.6, 1.2, 0.93)}
 _START = {"ellipsoid": (1.04, 0.53, 0.59), "hyperboloid": (1.44, 0.72, 0.37)}
 _TORUS_RING, _TORUS_ANGLE = 2.5, 0.5
 """Radius of a torus's ring over that of its tube, and where on the tube it is touched (rad from the equator)."""
+WAVES, _AMPLITUDE = 1.6, 5.0 / 12.0
+"""Waves of a weave, and its amplitude over the length of a wave."""
 _OFF_AXIS = 0.4
 """Turn of the principal directions against the path, rad, so that no entry of K is special."""
 
@@ -60,7 +62,7 @@ class Ground:
         return np.array([delta[0, 0], delta[0, 1], delta[1, 1]])
 
 
-def make_ground(surface: str, size: float, path: str, length: float, samples: int) -> Ground:
+def make_ground(surface: str, size: float, path: str, length: float, samples: int, *, waves: float = WAVES) -> Ground:
     """A path over a surface.
 
     Args:
@@ -69,13 +71,14 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         path: one of `PATHS`.
         length: along the path as seen from above, m.
         samples: equally spaced points.
+        waves: of a weave; it is as wide as such a wave is long, times 5/6.
 
     Raises:
         UsageError: for an unknown name.
     """
     if path not in PATHS:
         raise UsageError(f"path: expected one of {', '.join(PATHS)}, got {path!r}")
-    x, y = (_weave if path == "weave" else _circle)(length, samples)
+    x, y = _weave(length, samples, waves) if path == "weave" else _circle(length, samples)
     if surface == "torus":
         return _on_torus(size, x, y, length)
     if surface not in SURFACES:
@@ -85,13 +88,14 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
     return Ground(points, matrix.normal(points), matrix, length)
 
 
-def _weave(length: float, samples: int) -> tuple[Array, Array]:
-    """A sine of an eighth of the length up and down, three tenths of it long."""
-    x = np.linspace(-length, 0.0, 8001)
-    y = 0.125 * length * np.sin(2.0 * np.pi * x / (0.3 * length))
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x), np.diff(y)))])
-    at = np.linspace(arc[-1] - length, arc[-1], samples)
-    return np.interp(at, arc, x), np.interp(at, arc, y)
+def _weave(length: float, samples: int, waves: float) -> tuple[Array, Array]:
+    """A sine whose amplitude is 5/12 of its wave length, cut to the wanted length; it ends at the origin."""
+    t = np.linspace(-waves, 0.0, 8001)
+    y = _AMPLITUDE * np.sin(2.0 * np.pi * t)
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(t), np.diff(y)))])
+    at = np.linspace(0.0, arc[-1], samples)
+    scale = length / arc[-1]
+    return scale * np.interp(at, arc, t), scale * np.interp(at, arc, y)
 
 
 def _circle(length: float, samples: int) -> tuple[Array, Array]:

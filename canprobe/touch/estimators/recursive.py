@@ -179,7 +179,7 @@ class RecursiveEstimator:
         """Take in what is pending; the weight of each sample where they are crowded, else 1."""
         kept = math.exp(-moved / self._memory)
         root = math.sqrt(kept) * self._root
-        inverse: Array = self._inverse / math.sqrt(kept)
+        inverse = self._inverse * (1.0 / math.sqrt(kept))
         points = np.array([s.point for s in self._pending])
         block = self._rows_of_pending(points)
         weight, changed = self._judge(block, inverse)
