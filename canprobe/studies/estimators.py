@@ -1,7 +1,7 @@
 """Study `estimators`: error against run time for every estimator, window, lag and noise.
 
-A probe goes on in a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last contact.
-Costs are measured apart from errors: all estimators take turns at eight frames and an answer (the loop's 40 ms), with
+A probe goes on in a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
+contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (the loop's 40 ms), with
 the garbage collector off, medians over the turns, the first turn left out.
 """
 
@@ -167,7 +167,7 @@ def _back_and_forth(ground: Ground, noise: tuple[float, float], n: int) -> tuple
     return points[index], normals[index]
 
 
-def _row(
+def _row(  # noqa: PLR0917 - one row of a table
     surface: str,
     ground: Ground,
     setting: Setting,
@@ -176,7 +176,8 @@ def _row(
     costs: tuple[Array, Array],
 ) -> dict[str, Any]:
     size = float(np.linalg.norm(ground.K))
-    last = slice(-setting.window, None)
+    # the filter's memory fades, it has no window: it is held against all that it was given
+    last = slice(None if setting.method == "recursive" else -setting.window, None)
     C = cramer_rao(
         ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
     )
@@ -207,7 +208,11 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     for r in rows:
         reference = by[r["surface"], r["sigma_point_um"], *REFERENCE]
         r["ratio_to_chen1996"] = r["sample_us"] / reference["sample_us"]
-    said = ["chen1996 of the ratios: 160 samples, lag 10; error: RMS of ‖K − K_true‖ over ‖K_true‖."]
+    said = [
+        "the bound is that of the nine-parameter model and the window; of recursive, whose memory fades, of all 480 "
+        "samples. chord and chen1996 take |∇f| for constant: on a cylinder that is true and worth information.",
+        "chen1996 of the ratios: 160 samples, lag 10; error: RMS of ‖K − K_true‖ over ‖K_true‖.",
+    ]
     for sigma_point, sigma_normal in NOISES:
         key = (GROUNDS[0][0], sigma_point * 1e6)
         ml, filtered = by[*key, "ml", 160, None], by[*key, "recursive", 160, None]

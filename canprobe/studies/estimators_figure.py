@@ -21,7 +21,7 @@ def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure = Figure(figsize=(4.3 * len(noises), 3.9 * len(surfaces)), dpi=110, layout="constrained")
     figure.suptitle(
         "Error of local curvature against the time of one tactile frame with an answer\n"
-        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); dotted: Cramér–Rao bound of each window",
+        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); dotted: Cramér–Rao bound of each window, and of all 480 samples for the fading memory of recursive",
         x=0.01, ha="left", fontsize=11, color=INK,
     )  # fmt: skip
     grid = figure.subplots(len(surfaces), len(noises), squeeze=False, sharex=True, sharey=True)
@@ -58,12 +58,9 @@ def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
             )
     for r in rows:
         if r["method"] == "ml":
-            label = "Cramér–Rao bound" if r["window_samples"] == 40 else None
-            axes.axhline(r["bound_percent"], color=INK, linewidth=0.8, linestyle=":", label=label)
-            axes.annotate(
-                f"{r['window_samples']}", (1.0, r["bound_percent"]), xycoords=("axes fraction", "data"),
-                textcoords="offset points", xytext=(-2, 2), ha="right", fontsize=7, color=INK,
-            )  # fmt: skip
+            _draw_bound(axes, r["bound_percent"], str(r["window_samples"]), r["window_samples"] == 40)
+    whole = next(r["bound_percent"] for r in rows if r["method"] == "recursive")
+    _draw_bound(axes, whole, "all 480", False)
     axes.axvspan(BUDGET_MS, 1e3, color=FAINT, alpha=0.5, linewidth=0)
     axes.axvline(BUDGET_MS, color=INK, linewidth=1.0, label="budget of a tactile frame, 5 ms")
     axes.set_xscale("log")
@@ -72,3 +69,11 @@ def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.grid(color=FAINT, linewidth=0.6)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def _draw_bound(axes: Axes, percent: float, text: str, named: bool) -> None:
+    axes.axhline(percent, color=INK, linewidth=0.8, linestyle=":", label="Cramér–Rao bound" if named else None)
+    axes.annotate(
+        text, (1.0, percent), xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(-2, 2),
+        ha="right", fontsize=7, color=INK,
+    )  # fmt: skip

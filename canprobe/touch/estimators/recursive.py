@@ -13,6 +13,7 @@ from collections import deque
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive, upper_root
@@ -33,11 +34,11 @@ DIFFUSE = 1e-2
 """Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
 STEP = 0.025
 """Travel between two updates over the memory."""
-ANCHOR = 0.05
+ANCHOR = 0.1
 """Travel between two changes of the working frame over the memory."""
 CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
-START = (0.1, 0.8)
+START = (0.2, 0.8)
 """Travel over the memory at the first and last batch solution of the start; it doubles from one to the next."""
 START_SAMPLES = 128
 """Most samples of such a solution; where there are more, neighbours are averaged."""
@@ -241,7 +242,7 @@ class RecursiveEstimator:
             block += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
         return np.array(block)
 
-    def _judge(self, block: Array, inverse: Array) -> tuple[Array, bool]:
+    def _judge(self, block: Array, inverse: NDArray[np.floating]) -> tuple[Array, bool]:
         """Weights (n,) by Huber's rule on the innovations, and whether they say that the surface has changed."""
         predicted = block[:, :9] @ inverse
         square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->i", predicted, predicted))
