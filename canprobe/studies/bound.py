@@ -71,20 +71,24 @@ class Case:
 
 
 def all_cases() -> Iterator[Case]:
-    """Every surface, size, path and noise; paths no longer than the radius but for a few that are."""
+    """Weaves over every surface and size with every noise, circles with the middle one, and paths of 1.5 radii."""
     for surface in SURFACES:
         for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
-            for path in PATHS:
-                for noise in NOISES:
+            for path, noises in zip(PATHS, (NOISES, NOISES[1:2]), strict=True):
+                for noise in noises:
                     yield Case(surface, path, size, min(size, LONGEST_M), *noise)
         if surface != "plane":
-            for noise in NOISES:
+            for noise in NOISES[1:]:
                 yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
 
 
 def run(*, quick: bool, say: Say) -> StudyResult:
     """Measure all cases."""
-    seeds = 20 if quick else 200
+    return measure_all(20 if quick else 200, quick, say)
+
+
+def measure_all(seeds: int, quick: bool, say: Say) -> StudyResult:
+    """The study with so many seeds a case."""
     rows: list[dict[str, Any]] = []
     last = ""
     for i, case in enumerate(all_cases()):
@@ -105,9 +109,11 @@ def measure(case: Case, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """One row for each method."""
     ground = case.ground
     prior = Prior.weak(float(np.linalg.norm(ground.points - ground.points[-1], axis=1).max()))
-    noise = {"sigma_point": case.sigma_point, "sigma_normal": case.sigma_normal}
-    C = cramer_rao(ground.points, ground.normals, ground.surface, prior=prior, **noise)
-    fit = partial(fit_surface, prior=prior, **noise)
+    C = cramer_rao(
+        ground.points, ground.normals, ground.surface,
+        sigma_point=case.sigma_point, sigma_normal=case.sigma_normal, prior=prior,
+    )  # fmt: skip
+    fit = partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
     bound = math.sqrt(float(WEIGHT @ np.diag(C)))
     exact = fit(ground.points, ground.normals)
     model_bias = _length(ground.error(exact.T_frame_contact, exact.K)) / bound
@@ -121,7 +127,7 @@ def measure(case: Case, seeds: Sequence[int]) -> list[dict[str, Any]]:
     felt = [ground.felt(case.sigma_point, case.sigma_normal, np.random.default_rng(seed)) for seed in seeds]
     rows = [shared | {"method": m} | _score(ground, [fit(p, n, method=m) for p, n in felt], bound) for m in METHODS]
     for row in rows:
-        row["verdict"] = verdict(row)
+        row["verdict"] = verdict(row, len(seeds))
     return rows
 
 
@@ -145,11 +151,12 @@ def _score(ground: Ground, answers: Sequence[Any], bound: float) -> dict[str, An
         return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
     errors = np.array([ground.error(a.T_frame_contact, a.K) for a in seen])
     squares = [float(e @ np.linalg.solve(a.covariance, e)) for e, a in zip(errors, seen, strict=True)]
+    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ WEIGHT) / len(errors)  # the mean's own scatter
     claimed = float(np.median([WEIGHT @ np.diag(a.covariance) for a in seen]))
     return {
         "ratio": math.sqrt(float(np.mean(errors**2 @ WEIGHT))) / bound,
         "claimed": math.sqrt(claimed) / bound,
-        "bias": _length(errors.mean(axis=0)) / bound,
+        "bias": math.sqrt(max(_length(mean) ** 2 - scatter, 0.0)) / bound,
         "coverage": float(np.mean(np.array(squares) < CHI2_95_OF_3)),
         "observed": len(seen) / len(answers),
     }
@@ -159,21 +166,26 @@ def _length(error: Array) -> float:
     return math.sqrt(float(WEIGHT @ error**2))
 
 
-def verdict(row: dict[str, Any]) -> str:
-    """What a row shows: `good`, or what is wrong with it."""
+def verdict(row: dict[str, Any], seeds: int) -> str:
+    """What a row shows: `good`, or what is wrong with it.
+
+    With few seeds the limits are wider by what that many leave open: three standard deviations of the coverage
+    (where that is more than 5 %), one of the mean error and two of its size (1/√(6n): three entries, sum of squares).
+    """
     if row["ratio"] is None:
-        return "good" if not row["inside"] else "not observed"
+        return "not observed" if row["inside"] else "good"
+    open_cover = max(0.05, 3.0 * math.sqrt(0.95 * 0.05 / seeds))
     wrong = []
     if row["inside"]:
-        if row["ratio"] > CASE_RATIO[row["method"]]:
+        if row["ratio"] > CASE_RATIO[row["method"]] * (1.0 + (0.0 if seeds >= 200 else 2.0 / math.sqrt(6.0 * seeds))):
             wrong.append("error")
-        if row["bias"] > LARGEST_BIAS:
+        if row["bias"] > LARGEST_BIAS + row["ratio"] / math.sqrt(seeds):
             wrong.append("bias")
         if row["observed"] < 1.0:
             wrong.append("not observed")
-    if row["coverage"] < 0.90:
+    if row["coverage"] < 0.95 - open_cover:
         wrong.append("overconfident")
-    elif row["coverage"] > 0.99 and row["inside"]:
+    elif row["inside"] and row["coverage"] > min(0.99, 0.95 + open_cover) and seeds >= 200:
         wrong.append("covers too much")
     return ", ".join(wrong) or "good"
 

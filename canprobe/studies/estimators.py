@@ -1,8 +1,8 @@
 """Study `estimators`: error against run time for every estimator, window, lag and noise.
 
 A probe goes on in a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
-contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (the loop's 40 ms), with
-the garbage collector off, medians over the turns, the first turn left out.
+contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (the
+loop's 40 ms), with the garbage collector off, medians over the turns, the first turn left out.
 """
 
 from __future__ import annotations

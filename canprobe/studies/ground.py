@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,12 +37,14 @@ class Ground:
         points, normals: (n, 3) in the contact frame of the last point, m; outward unit normals.
         surface: the quadric of the surface's second order there (the surface itself but for a torus).
         length: along the path, m.
+        tensor: the true curvature tensor (3, 3) at the foot of a point (3,) near the contact, 1/m.
     """
 
     points: Array
     normals: Array
     surface: SurfaceMatrix
     length: float
+    tensor: Callable[[Array], Array]
 
     @property
     def K(self) -> Array:
@@ -55,10 +58,13 @@ class Ground:
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def error(self, T_frame_contact: Array, K: Array) -> Array:
-        """(3,) K11, K12, K22 of an estimate less the truth, in the contact frame of the estimate, 1/m."""
+        """(3,) K11, K12, K22 of an estimate less the truth at the place that it speaks of, in its contact frame, 1/m.
+
+        An estimate is for the foot of the last *measured* point, which is off by that point's noise; on a tight surface
+        the true curvature differs there by as much as the bound.
+        """
         axes = T_frame_contact[:3, :2]
-        true, basis = self.surface.curvature_at(np.zeros(3))
-        delta = K - axes.T @ (basis @ true @ basis.T) @ axes
+        delta = K - axes.T @ self.tensor(T_frame_contact[:3, 3]) @ axes
         return np.array([delta[0, 0], delta[0, 1], delta[1, 1]])
 
 
@@ -85,7 +91,12 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
         raise UsageError(f"surface: expected one of {', '.join(SURFACES)}, got {surface!r}")
     matrix = _turned(_quadric(surface, size))
     points = np.stack([x, y, matrix.height(x, y)], axis=1)
-    return Ground(points, matrix.normal(points), matrix, length)
+    return Ground(points, matrix.normal(points), matrix, length, partial(_tensor_of_quadric, matrix))
+
+
+def _tensor_of_quadric(surface: SurfaceMatrix, near: Array) -> Array:
+    K, basis = surface.curvature_at(surface.project(near))
+    return np.asarray(basis @ K @ basis.T, dtype=np.float64)
 
 
 def _weave(length: float, samples: int, waves: float) -> tuple[Array, Array]:
@@ -138,12 +149,20 @@ def _on_torus(tube: float, x: Array, y: Array, length: float) -> Ground:
     normals = np.cos(round_tube)[:, None] * out
     normals[:, 2] = np.sin(round_tube)
     points = ring * out + tube * normals
-    points -= [ring + tube * np.cos(a), 0.0, tube * np.sin(a)]
+    contact = np.array([ring + tube * np.cos(a), 0.0, tube * np.sin(a)])
+    points -= contact
     # contact frame: u along the ring, v along the tube, w = inward normal; x, y turned off both as the path is
     u, v = np.array([0.0, 1.0, 0.0]), np.array([-np.sin(a), 0.0, np.cos(a)])
     w = -np.array([np.cos(a), 0.0, np.sin(a)])
     axes = np.stack([c * u + s * v, -s * u + c * v, w], axis=1)
-    principal = np.diag([np.cos(a) / (ring + tube * np.cos(a)), 1.0 / tube])
-    turn = np.array([[c, -s], [s, c]])
-    surface = SurfaceMatrix.from_curvature(turn.T @ principal @ turn)
-    return Ground(points @ axes, normals @ axes, surface, length)
+
+    def tensor(near: Array) -> Array:
+        x, y, z = axes @ near + contact
+        about, height = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y) - ring)
+        along = np.array([-np.sin(about), np.cos(about), 0.0])
+        up = np.array([-np.sin(height) * np.cos(about), -np.sin(height) * np.sin(about), np.cos(height)])
+        k = np.cos(height) / (ring + tube * np.cos(height))
+        return np.asarray(axes.T @ (k * np.outer(along, along) + np.outer(up, up) / tube) @ axes, dtype=np.float64)
+
+    K = tensor(np.zeros(3))[:2, :2]
+    return Ground(points @ axes, normals @ axes, SurfaceMatrix.from_curvature(K), length, tensor)

@@ -8,7 +8,40 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, positive
+
+
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """Noise that is alike from sample to sample: hysteresis, aliasing of a moving centroid, an arm that bends.
+
+    Between samples a path of s apart the noise of points and normals, whitened to unit variance, has the correlation
+    `share · exp(−s / length)`; the rest of the variance, 1 − share, is independent (a first-order autoregression over
+    the path plus white noise). Where the contact comes back to the same place its error is taken for a new one.
+
+    Attributes:
+        length: correlation length, m (the unit of the points).
+        share: of the variance, 0 to 1.
+    """
+
+    length: float
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        positive("correlation.length", self.length)
+        if not 0.0 <= self.share <= 1.0:
+            raise UsageError(f"correlation.share: expected a number from 0 to 1, got {self.share}")
+
+    def matrix(self, path: Array) -> Array:
+        """Correlations (n, n) of samples at places (n,) along the path, m."""
+        R: Array = self.share * np.exp(-np.abs(path[:, None] - path) / self.length)
+        np.fill_diagonal(R, 1.0)
+        return R
+
+    def whitener(self, path: Array) -> Array:
+        """(n, n): the inverse of the lower Cholesky factor of `matrix`; samples at one place are told apart by 1e-9."""
+        R = self.matrix(path) + 1e-9 * np.eye(len(path))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(R)), dtype=np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

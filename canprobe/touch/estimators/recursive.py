@@ -23,10 +23,10 @@ from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
-from canprobe.touch.noise import Noise
+from canprobe.touch.noise import Correlation, Noise
 from canprobe.touch.nonlinear import CHI2_999, fit
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric import UNIT, Design, curvature_jacobian, design, transport
+from canprobe.touch.quadric import UNIT, Design, curvature_jacobian, design, rows, transport
 from canprobe.touch.quadric_row import sample_rows
 from canprobe.touch.rank import SPREAD, decide, spread_of
 
@@ -59,14 +59,15 @@ class _Pending(NamedTuple):
     sigma_normal: float
 
 
-def _mean(a: _Pending, b: _Pending) -> _Pending:
-    """Two neighbouring samples as one."""
+def _mean(a: _Pending, b: _Pending, share: float) -> _Pending:
+    """Two neighbouring samples as one; `share` of their noise is the same."""
+    smaller = 0.5 * math.sqrt(1.0 + share)
     normal = a.normal + b.normal
     return _Pending(
         0.5 * (a.point + b.point),
         normal / math.sqrt(float(normal @ normal)),
-        0.5 * math.hypot(a.sigma_point, b.sigma_point),
-        0.5 * math.hypot(a.sigma_normal, b.sigma_normal),
+        smaller * math.hypot(a.sigma_point, b.sigma_point),
+        smaller * math.hypot(a.sigma_normal, b.sigma_normal),
     )
 
 
@@ -78,6 +79,8 @@ class RecursiveEstimator:
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
+            is what such an answer has under correlated noise.
     """
 
     def __init__(
@@ -88,7 +91,9 @@ class RecursiveEstimator:
         memory_m: float = 0.02,
         window: int = 160,
         prior: Prior | None = None,
+        correlation: Correlation | None = None,
     ) -> None:
+        self._correlation = correlation
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
@@ -165,9 +170,9 @@ class RecursiveEstimator:
 
     def _make_prior_rows(self) -> Array:
         A, _ = self._prior.rows(self._memory)
-        rows = DIFFUSE * np.eye(9)
-        rows[3:6] = A[:3]
-        return rows
+        own = DIFFUSE * np.eye(9)
+        own[3:6] = A[:3]
+        return own
 
     def _begin(self, sample: ContactSample) -> None:
         self._T = homogeneous(tangent_rotation(-sample.n_base), sample.p_base)
@@ -175,6 +180,7 @@ class RecursiveEstimator:
     def _set_root(self, root: Array) -> None:
         """Take a root whose rows all count in full."""
         self._root, self._inverse, self._score = root, np.linalg.inv(root), root.T @ root
+        self._recent = np.zeros((3, 9))
 
     def _absorb(self, moved: float) -> float:
         """Take in what is pending; the weight of each sample where they are crowded, else 1."""
@@ -200,9 +206,24 @@ class RecursiveEstimator:
         self._inverse = np.linalg.inv(self._root)
         self._c = self._c + self._inverse @ full[:9, 9]
         # what the rows' noise does to an answer whose rows have faded: weights enter squared
-        self._score = kept**2 * self._score + (1.0 - kept**2) * self._prior_score + block[:, :9].T @ block[:, :9]
+        self._score = kept**2 * self._score + (1.0 - kept**2) * self._prior_score
+        self._score += self._score_of(block[:, :9], moved, kept)
         self._move_frame()
         return crowd
+
+    def _score_of(self, J: Array, moved: float, kept: float) -> Array:
+        """What new rows (3n, 9) add to the score's covariance: with each other, and with earlier ones they resemble."""
+        if self._correlation is None:
+            return np.asarray(J.T @ J, dtype=np.float64)
+        n = len(J) // 3
+        places = moved / n * np.arange(1.0, n + 1.0)
+        by_sample = J.reshape(n, 27)
+        own = J.T @ (self._correlation.matrix(places) @ by_sample).reshape(-1, 9)
+        fades = np.exp(-places / self._correlation.length)
+        cross = (fades @ by_sample).reshape(3, 9).T @ (kept * self._recent)
+        newest = (self._correlation.share * fades[-1] / fades) @ by_sample
+        self._recent = kept * fades[-1] * self._recent + newest.reshape(3, 9)
+        return np.asarray(own + cross + cross.T, dtype=np.float64)
 
     def _start_up(self, wider: float) -> None:
         """Solve the first samples again as a batch: the filter's first steps were linearised on a plane."""
@@ -210,7 +231,8 @@ class RecursiveEstimator:
             _Pending(s.point, s.normal, wider * s.sigma_point, wider * s.sigma_normal) for s in self._pending
         ]
         if len(self._start) > START_SAMPLES:
-            self._start = [_mean(a, b) for a, b in zip(self._start[::2], self._start[1::2], strict=False)]
+            share = 0.0 if self._correlation is None else self._correlation.share
+            self._start = [_mean(a, b, share) for a, b in zip(self._start[::2], self._start[1::2], strict=False)]
         travelled = self._travel.total - self._started
         if travelled < self._next_start:
             return
@@ -220,9 +242,19 @@ class RecursiveEstimator:
             if fitted.decision.rank == 3 and fitted.converged:
                 self._c = fitted.c
                 self._set_root(fitted.root)
+                if self._correlation is not None:
+                    self._score_start(rows(fitted.c, d).J, travelled, self._correlation)
             self._next_start *= 2.0
         if travelled >= START[1] * self._memory:
             self._next_start, self._start, self._first = math.inf, [], False
+
+    def _score_start(self, J: Array, travelled: float, correlation: Correlation) -> None:
+        places = np.linspace(0.0, travelled, len(J))
+        by_sample = J.reshape(-1, 27)
+        resembling = (correlation.matrix(places) @ by_sample).reshape(-1, 9)
+        self._score = self._prior_score + J.reshape(-1, 9).T @ resembling
+        newest = correlation.share * np.exp((places - travelled) / correlation.length)
+        self._recent = (newest @ by_sample).reshape(3, 9)
 
     def _design(self, samples: list[_Pending]) -> Design:
         L, R = self._memory, self._T[:3, :3]
@@ -273,4 +305,5 @@ class RecursiveEstimator:
         back = np.linalg.inv(M)
         self._root, self._inverse = self._root @ back, M @ self._inverse
         self._score = back.T @ self._score @ back
+        self._recent = self._recent @ back
         self._T = homogeneous(R @ turned, origin + R @ (L * x))
