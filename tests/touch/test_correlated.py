@@ -14,7 +14,7 @@ from canprobe.touch.noise import Correlation
 
 SIGMA = {"sigma_point": 5e-5, "sigma_normal": 3e-3}
 LENGTH, SHARE, STEP = 1.5e-3, 0.9, 0.125e-3
-SEEDS = 80
+SEEDS = 50
 CHI2_95 = 7.815
 WEIGHT = np.array([1.0, 2.0, 1.0])
 KNOWN = Correlation(LENGTH, SHARE)
@@ -49,9 +49,9 @@ def scores(path, method, correlation, seeds=SEEDS):
 def test_intervals_cover_when_they_know(method, truth):
     path = truth.path("ellipsoid")
     cover, _ = scores(path, method, KNOWN)
-    # 80 seeds: three standard deviations of the count of a true 95 % are 7 %
-    assert cover >= 0.88
-    blind, _ = scores(path, method, None, seeds=40)
+    # 50 seeds: three standard deviations of the count of a true 95 % are 9 %
+    assert cover >= 0.86
+    blind, _ = scores(path, method, None, seeds=20)
     assert blind < 0.75
 
 
