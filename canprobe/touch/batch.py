@@ -43,7 +43,7 @@ class Touches(NamedTuple):
     correlation: Correlation | None = None
 
     def whitener(self) -> Array | None:
-        """(n, n) that makes the whitened samples independent; None where they are."""
+        """(3, n, n) that makes the whitened samples independent; None where they are."""
         if self.correlation is None:
             return None
         return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from canprobe.touch._arrays import Array, upper_root
 from canprobe.touch.batch import checked_arrays, make_touches
-from canprobe.touch.noise import Correlation, make_noise
+from canprobe.touch.noise import Correlation, make_noise, mixed
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import UNIT, curvature_jacobian, design, parameters_of, rows
 from canprobe.touch.rank import decide
@@ -60,7 +60,7 @@ def cramer_rao(
     d = design((p - origin) @ R / length, n @ R, touches.noise.scaled(length, R))
     J = rows(c, d).J
     independent = touches.whitener()
-    J = J.reshape(-1, 9) if independent is None else (independent @ J.reshape(len(p), 27)).reshape(-1, 9)
+    J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
     stated = Prior.weak(length) if prior is None else prior
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch._arrays import Array, solved, upper_root
+from canprobe.touch.noise import mixed
 from canprobe.touch.quadric import UNIT, Design, linear_rows, rows
 from canprobe.touch.rank import Decision, decide, spread_of
 
@@ -52,7 +53,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
     Args:
         d: constant parts (`quadric.design`).
         prior: rows (6, 9) and right-hand side (6,) (`Prior.rows`).
-        independent: (n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
+        independent: (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
     """
     spread = spread_of(d.X, d.point_variance)
     c, root, decision = _start(d, prior, spread)
@@ -65,7 +66,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
         w = np.sqrt(weight)[:, None]
         rw, Jw = r * w, J * w[:, :, None]
         if independent is not None:
-            rw, Jw = independent @ rw, (independent @ Jw.reshape(len(Jw), 27)).reshape(Jw.shape)
+            rw, Jw = mixed(independent, rw[:, :, None])[:, :, 0], mixed(independent, Jw)
             cost = float(np.sum(rw * rw))
         # without log_det a large K, which explains any residual by noise of the points, would look good; without the
         # prior's part a large c33 on a short path, which flattens f/|∇f|, would

@@ -79,7 +79,7 @@ def test_whitening_is_the_inverse_of_the_correlation():
     path = np.cumsum(np.random.default_rng(0).uniform(0.0, 1e-3, 30))
     W = KNOWN.whitener(path)
     expected = SHARE * np.exp(-np.abs(np.subtract.outer(path, path)) / LENGTH) + (1.0 - SHARE) * np.eye(30)
-    assert np.allclose(W.T @ W @ expected, np.eye(30), atol=1e-6)
+    assert np.allclose(W.mT @ W @ expected, np.eye(30), atol=1e-6)
 
 
 @pytest.mark.parametrize(

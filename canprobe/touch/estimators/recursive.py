@@ -23,7 +23,7 @@ from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
-from canprobe.touch.noise import Correlation, Noise
+from canprobe.touch.noise import Correlation, Noise, mixed
 from canprobe.touch.nonlinear import CHI2_999, fit
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import UNIT, Design, curvature_jacobian, design, rows, transport
@@ -218,11 +218,11 @@ class RecursiveEstimator:
         n = len(J) // 3
         places = moved / n * np.arange(1.0, n + 1.0)
         by_sample = J.reshape(n, 27)
-        own = J.T @ (self._correlation.matrix(places) @ by_sample).reshape(-1, 9)
+        own = J.T @ mixed(self._correlation.matrix(places), J.reshape(n, 3, 9)).reshape(-1, 9)
         fades = np.exp(-places / self._correlation.length)
         cross = (fades @ by_sample).reshape(3, 9).T @ (kept * self._recent)
-        newest = (self._correlation.share * fades[-1] / fades) @ by_sample
-        self._recent = kept * fades[-1] * self._recent + newest.reshape(3, 9)
+        newest = self._correlation.shares[:, None] * ((fades[-1] / fades) @ by_sample).reshape(3, 9)
+        self._recent = kept * fades[-1] * self._recent + newest
         return np.asarray(own + cross + cross.T, dtype=np.float64)
 
     def _start_up(self, wider: float) -> None:
@@ -250,11 +250,10 @@ class RecursiveEstimator:
 
     def _score_start(self, J: Array, travelled: float, correlation: Correlation) -> None:
         places = np.linspace(0.0, travelled, len(J))
-        by_sample = J.reshape(-1, 27)
-        resembling = (correlation.matrix(places) @ by_sample).reshape(-1, 9)
+        resembling = mixed(correlation.matrix(places), J).reshape(-1, 9)
         self._score = self._prior_score + J.reshape(-1, 9).T @ resembling
-        newest = correlation.share * np.exp((places - travelled) / correlation.length)
-        self._recent = (newest @ by_sample).reshape(3, 9)
+        fades = np.exp((places - travelled) / correlation.length)
+        self._recent = correlation.shares[:, None] * (fades @ J.reshape(-1, 27)).reshape(3, 9)
 
     def _design(self, samples: list[_Pending]) -> Design:
         L, R = self._memory, self._T[:3, :3]
