@@ -52,6 +52,9 @@ RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
 
+_ONES = np.ones(3)
+
+
 class _Pending(NamedTuple):
     point: Array
     normal: Array
@@ -277,7 +280,7 @@ class RecursiveEstimator:
         """Weights (n,) by Huber's rule on the innovations, and whether they say that the surface has changed."""
         predicted = block[:, :9] @ inverse
         square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->i", predicted, predicted))
-        d2 = square.reshape(-1, 3) @ np.ones(3)
+        d2 = square.reshape(-1, 3) @ _ONES
         limited = np.minimum(d2, CHI2_999)
         weight: Array = np.sqrt(CHI2_999 / np.maximum(d2, CHI2_999))
         n = len(d2)
