@@ -21,8 +21,8 @@ def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure = Figure(figsize=(4.3 * len(noises), 3.9 * len(surfaces)), dpi=110, layout="constrained")
     figure.suptitle(
         "Error of local curvature against the time of one tactile frame with an answer\n"
-        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); dotted: Cramér–Rao bound of each window, "
-        "and of all 480 samples (the memory of recursive fades)",
+        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); no marker: not observed\n"
+        "dotted: Cramér–Rao bound of each window, and of all 480 samples (the memory of recursive fades)",
         x=0.01, ha="left", fontsize=11, color=INK,
     )  # fmt: skip
     grid = figure.subplots(len(surfaces), len(noises), squeeze=False, sharex=True, sharey=True)
