@@ -30,9 +30,9 @@ rest hangs together over 5 to 20 mm of path. A constant tilt costs nothing as lo
 than the normals, hence the generous 0.1 mm: with 0.010 mm the error of K is seven times as large."""
 CORRELATION = (4e-3, 0.15, 0.0)
 """Length (m) and shares (normals, points) of that noise along the path (`touch.noise.Correlation`). Tuned, not
-measured: with the generous deviations above, the measured 5–20 mm and 0.9 claim three times the error. Of some twenty settings
-tried on one scan each of cylinder, sphere and saddle, this one's 95 % regions held the truth in 99, 97 and 100 % of 94
-answers; other scans have not been looked at."""
+measured: with the generous deviations above, the measured 5–20 mm and 0.9 claim three times the error. Of some twenty
+settings tried on one scan each of cylinder, sphere and saddle, this one's 95 % regions held the truth in
+99, 97 and 100 % of 94 answers; other scans have not been looked at."""
 CYCLES_TO_EFFECT = 2
 
 
