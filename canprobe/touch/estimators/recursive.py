@@ -147,7 +147,7 @@ class RecursiveEstimator:
             return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
         noise = self._inverse.T @ self._score.matrix @ self._inverse
         D = curvature_jacobian(a.c) @ a.M @ self._inverse
-        sandwich = solved(np.linalg.cholesky(noise), root)
+        sandwich = solved(np.asarray(np.linalg.cholesky(noise), dtype=np.float64), root)
         return Solution(a.c, D @ noise @ D.T, decision, has_prior=False, root=sandwich)
 
     def _notes(self) -> tuple[str, ...]:
