@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tasks.shape import ShapeRecord
-from canprobe.errors import CanprobeError, NodeError, UsageError
-from canprobe.rehearsal import rehearse
+from canprobe.emulation import emulate, emulate_eds
+from canprobe.errors import CanprobeError, UsageError
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
@@ -20,7 +20,7 @@ from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
 if TYPE_CHECKING:
     from canprobe.touch.surface_map import SurfaceMap
 
-__all__ = ["Command", "Measurement", "RunResult", "emulate", "open_cell", "run", "scan", "up"]
+__all__ = ["Command", "Measurement", "RunResult", "emulate", "emulate_eds", "open_cell", "run", "scan", "up"]
 
 Say = Callable[[str], None]
 Progress = Callable[[float, float], None]
@@ -194,56 +194,6 @@ def up(
     with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())
-
-
-def emulate(
-    scene: Scene,
-    *,
-    interface: str,
-    channel: str,
-    bitrate: int,
-    node_ids: tuple[int, ...],
-    seed: int | None = None,
-    truth_path: Path | None = None,
-    say: Say = _quiet,
-) -> None:
-    """Serve emulated nodes on a real interface until interrupted, for any master.
-
-    Raises:
-        UsageError: the scene does not fit.
-        InterfaceError: no such interface.
-        NodeError: somebody on the bus has one of the node ids already.
-    """
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.bus.memory import reserve_memory
-    from canprobe.bus.open import open_port
-    from canprobe.bus.priority import ask_for_processor
-    from canprobe.bus.probe import answering_nodes
-    from canprobe.emulator.build import make_world
-    from canprobe.emulator.serve import serve
-    from canprobe.planning import make_plan
-
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
-    plan = make_plan(resolved)
-    port = open_port(interface, channel, bitrate, MonotonicClock())
-    try:
-        if busy := answering_nodes(port, node_ids, 0.1):
-            raise NodeError(
-                busy[0], f"is on {channel} already; its id is busy: end that node, or name others with --nodes"
-            )
-        rehearse(resolved)
-        reserve_memory()
-        world = make_world(plan, node_ids)
-        port.drain()  # what passed meanwhile
-        ask_for_processor()
-        say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
-        try:
-            serve(world.participants, port, lambda: False)
-        finally:
-            if truth_path is not None:
-                world.recorder.save(truth_path)
-    finally:
-        port.close()
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

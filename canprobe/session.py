@@ -68,7 +68,7 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as canbusload counts by default."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
 
     def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
         self._write = write

@@ -8,9 +8,7 @@ The vendor number is this project's own choice; CiA has not assigned it. Source 
 
 from __future__ import annotations
 
-import configparser
 import difflib
-import io
 import os
 from functools import lru_cache
 from pathlib import Path
@@ -20,6 +18,8 @@ from canprobe.errors import EdsError
 
 if TYPE_CHECKING:
     import canopen
+
+    from canprobe.eds.reading import Reading
 
 MISSED_SYNCS = 0x2000
 """Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
@@ -47,7 +47,7 @@ def eds_path(name: str) -> Path:
         return _FOLDER / f"{stem}.eds"
     near = difflib.get_close_matches(stem, names, n=1)
     hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
-    raise EdsError(f"EDS {name!r}: no such packaged file: {hint}")
+    raise EdsError(f"EDS {name!r}: no such file, and no such packaged file: {hint}")
 
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
@@ -65,19 +65,13 @@ def _resolve(source: str | os.PathLike[str]) -> Path:
     raise EdsError(f"EDS {str(source)!r}: no such file")
 
 
-def _check_values(path: Path, od: canopen.ObjectDictionary) -> None:
-    """Canopen skips a default that it cannot convert; a contract must not lose one silently."""
-    for entry in od.values():
-        for var in entry.values() if hasattr(entry, "values") else (entry,):
-            if getattr(var, "default_raw", "") != "" and var.default is None:
-                raise EdsError(
-                    f"{path}: [{var.index:04X}] sub {var.subindex:X} {var.name}: DefaultValue={var.default_raw} "
-                    f"does not convert to data type {var.data_type:04X}h"
-                )
+def _check_node_id(source: str | os.PathLike[str], node_id: int) -> None:
+    if not 1 <= node_id <= 127:
+        raise EdsError(f"EDS {str(source)!r}: node id {node_id} is not 1..127")
 
 
 def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
-    """Load an EDS file into canopen's object dictionary for one node.
+    """Load an EDS or DCF file into canopen's object dictionary for one node.
 
     Planner, master and emulator each ask for the same file, and parsing costs 60 ms: they get one object. Treat it as
     read-only; a node's values live elsewhere.
@@ -87,29 +81,33 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
         node_id: 1..127, put in for $NODEID.
 
     Raises:
-        EdsError: missing, unreadable or not an EDS file; names the file and what is wrong in it.
+        EdsError: missing, unreadable or with faults that prevent its use; names the file and each fault. What is
+            merely untidy is accepted, see `check_eds`.
     """
-    if not 1 <= node_id <= 127:
-        raise EdsError(f"EDS {str(name_or_path)!r}: node id {node_id} is not 1..127")
+    _check_node_id(name_or_path, node_id)
     path = _resolve(name_or_path)
     return _parse(path, path.stat().st_mtime_ns, node_id)
 
 
+def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) -> Reading:
+    """Read an EDS or DCF file with everything that is wrong with it.
+
+    Args:
+        name_or_path: as for `load_eds`.
+        node_id: 1..127, put in for $NODEID; None for that of the DCF, or else 1.
+
+    Raises:
+        EdsError: missing or unreadable, or no such node id.
+    """
+    if node_id is not None:
+        _check_node_id(name_or_path, node_id)
+    from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
+
+    return read_eds(_resolve(name_or_path), node_id)
+
+
 @lru_cache(maxsize=64)
 def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
-    from canopen.objectdictionary import eds  # late: the command line's --help must not pay for it
+    from canprobe.eds.reading import read_eds
 
-    try:
-        text = path.read_text(encoding="utf-8")
-        if "[DeviceInfo]" not in text:  # mandatory; canopen would warn through a method that Python 3.13 dropped
-            raise EdsError(f"{path}: not a usable EDS file: no section [DeviceInfo]")
-        od: canopen.ObjectDictionary = eds.import_eds(io.StringIO(text), node_id)  # type: ignore[no-untyped-call]
-    except UnicodeDecodeError as error:
-        raise EdsError(f"{path}: not a text file: {error}") from error
-    except (configparser.Error, KeyError, ValueError, OSError) as error:
-        raise EdsError(f"{path}: not a usable EDS file: {' '.join(str(error).split())}") from error
-    if len(od) == 0:
-        raise EdsError(f"{path}: not a usable EDS file: no object in it")
-    _check_values(path, od)
-    od.node_id = node_id
-    return od
+    return read_eds(path, node_id, serving=False).usable()

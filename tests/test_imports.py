@@ -38,7 +38,17 @@ ALLOWED = {
     "package": {*EDGE, "api", "cli"},
 }
 # top-level modules that join cell and emulator
-COMPOSITION = {"api", "results", "session", "child", "rehearsal", "recorded", "recorded_summary", "surface_file"}
+COMPOSITION = {
+    "api",
+    "results",
+    "session",
+    "child",
+    "rehearsal",
+    "recorded",
+    "recorded_summary",
+    "surface_file",
+    "emulation",
+}
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
 NEVER_IN_PURE = EDGE_ONLY | {

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.protocol.frames import Frame
+from canprobe.protocol.frames import RTR_FLAG, Frame
 
 __all__ = [
     "EFF_FLAG",
@@ -28,7 +28,6 @@ __all__ = [
 ]
 
 EFF_FLAG = 0x80000000
-RTR_FLAG = 0x40000000
 ERR_FLAG = 0x20000000
 
 TimedFrame = tuple[int, bytes, int]

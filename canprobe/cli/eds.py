@@ -1,23 +1,37 @@
-"""`canprobe eds`: the packaged EDS files, for other tools and masters."""
+"""`canprobe eds`: the packaged EDS files, for other tools and masters; and what is wrong with any file."""
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_json
+from canprobe.cli.parser import Commands, Parser, add_json, whole
+
+if TYPE_CHECKING:
+    from canprobe.eds.faults import Fault
+    from canprobe.eds.reading import Reading
 
 _EXAMPLE = """\
 examples:
   canprobe eds list
   canprobe eds path puma260_joint
+  canprobe eds check drive.eds
+"""
+_CHECK = """\
+Faults prevent serving: what the device would answer cannot be known from the file. Warnings tell what was put right
+or left out. Exit status: 0 without faults, 2 with faults.
+
+examples:
+  canprobe eds check drive.eds
+  canprobe eds check drive.eds --node-id 5 --json
 """
 
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "eds", help="list the EDS files or show where they are", description=__doc__, epilog=_EXAMPLE
+        "eds", help="list the EDS files, show where they are, or check one", description=__doc__, epilog=_EXAMPLE
     )
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     listing = actions.add_parser("list", help="list the packaged files", epilog="example:\n  canprobe eds list\n")
@@ -28,6 +42,11 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     path.add_argument("name", metavar="NAME", help="name of a packaged file, with or without .eds")
     path.set_defaults(run=run, action="path")
+    check = actions.add_parser("check", help="list the faults of a file, with section and line", epilog=_CHECK)
+    check.add_argument("file", metavar="FILE", help="the path of an EDS or DCF file, or the name of a packaged one")
+    check.add_argument("--node-id", metavar="N", type=whole(1, 127), help="for $NODEID [that of the DCF, or 1]")
+    add_json(check)
+    check.set_defaults(run=run_check)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -41,3 +60,45 @@ def run(args: argparse.Namespace) -> int:
     else:
         print("\n".join(eds_names()))
     return 0
+
+
+def run_check(args: argparse.Namespace) -> int:
+    """Print what is wrong with a file; status 2 when it cannot be served."""
+    from canprobe.eds import check_eds
+
+    reading = check_eds(args.file, args.node_id)
+    if args.json:
+        print_json(_document(reading))
+    else:
+        for fault in reading.found:
+            print(f"{'fault' if fault.prevents else 'warning'}: {fault}")
+        print(f"{reading.path}: {_summary(reading)}")
+    return 2 if reading.faults else 0
+
+
+def _summary(reading: Reading) -> str:
+    faults, warnings = len(reading.faults), len(reading.warnings)
+    if not faults and not warnings:
+        return f"clean, {len(reading.dictionary)} objects"
+    verdict = "cannot be served" if faults else "can be served"
+    return f"{faults} fault{'s' * (faults != 1)}, {warnings} warning{'s' * (warnings != 1)}; {verdict}"
+
+
+def _document(reading: Reading) -> dict[str, object]:
+    return {
+        "file": str(reading.path),
+        "servable": not reading.faults,
+        "objects": len(reading.dictionary),
+        "device_profile": reading.profile or None,
+        "faults": [_row(fault) for fault in reading.faults],
+        "warnings": [_row(fault) for fault in reading.warnings],
+    }
+
+
+def _row(fault: Fault) -> dict[str, object]:
+    return {
+        "line": fault.line or None,
+        "section": fault.section or None,
+        "key": fault.key or None,
+        "text": fault.text,
+    }

@@ -1,9 +1,14 @@
-"""`canprobe emulate`: serve a scene's emulated nodes on a bus until Ctrl-C, for any master."""
+"""`canprobe emulate`: serve a scene's emulated nodes on a bus until Ctrl-C, for any master.
+
+Without a scene it serves a node from each EDS file: the values of the file, and the CiA 402 state machine with an
+ideal axis where the file describes a drive.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,21 +22,39 @@ if TYPE_CHECKING:
     from canprobe.scene import Scene
 
 _EXAMPLE = """\
-example:
+examples:
   canprobe emulate cylinder --channel vcan0
   canprobe emulate cylinder --channel vcan0 --nodes 1-6
+  canprobe emulate cylinder --channel vcan0 --store nodes/
+  canprobe emulate --eds drive.eds --node-id 5 --channel vcan0
+  canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
 """
+_BITRATE = 1_000_000
 
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser("emulate", help="serve emulated nodes on a bus", description=__doc__, epilog=_EXAMPLE)
-    add_scene(parser)
+    add_scene(parser, optional=True)
     add_bus(parser)
+    parser.add_argument(
+        "--eds", metavar="FILE", action="append", default=[], help="an EDS or DCF file to serve; may be repeated"
+    )
+    parser.add_argument(
+        "--node-id",
+        metavar="N",
+        action="append",
+        default=[],
+        type=whole(1, 127),
+        help="node id of the --eds of the same rank",
+    )
     parser.add_argument("--nodes", metavar="IDS", type=node_ids, help="such as 1-6,16 [those the scene marks emulated]")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="write the plant's true values there at the end (.npz)"
+    )
+    parser.add_argument(
+        "--store", metavar="DIR", type=Path, help="keep there what a master stores by 1010h [forgotten at the end]"
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.set_defaults(run=run, bus="socketcan")
@@ -39,31 +62,70 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Serve until an interrupt, which is the normal way to leave."""
-    from canprobe.scene_loader import load_scene
+    if (args.scene is None) is not bool(args.eds):
+        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N")
+    serve = _eds_server(args) if args.eds else _scene_server(args)
 
-    scene = load_scene(args.scene)
-    if args.channel is None:
-        raise UsageError("emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0")
-    target = target_of(args, scene)
-    wanted = _nodes(args.nodes, scene)
-
-    from canprobe import api
     from canprobe.child import end_with_parent
 
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
         if args.parent is not None:
             end_with_parent(args.parent)
-        api.emulate(
-            scene,
-            interface=target.interface,
-            channel=target.channel,
-            bitrate=target.bitrate,
-            node_ids=wanted,
-            seed=args.seed,
-            truth_path=args.truth,
-            say=say,
-        )
+        serve()
     return 0
+
+
+def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
+    from canprobe.scene_loader import load_scene
+
+    if args.node_id:
+        raise UsageError("emulate: --node-id belongs to --eds; of a scene's nodes, choose with --nodes")
+    scene = load_scene(args.scene)
+    _check_channel(args)
+    target = target_of(args, scene)
+    wanted = _nodes(args.nodes, scene)
+
+    from canprobe import api
+
+    return lambda: api.emulate(
+        scene,
+        interface=target.interface,
+        channel=target.channel,
+        bitrate=target.bitrate,
+        node_ids=wanted,
+        seed=args.seed,
+        truth_path=args.truth,
+        store_folder=args.store,
+        say=say,
+    )
+
+
+def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
+    if len(args.eds) != len(args.node_id):
+        raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+    for option in ("nodes", "seed", "truth"):
+        if getattr(args, option) is not None:
+            raise UsageError(f"emulate: --{option} belongs to a scene, not to --eds")
+    _check_channel(args)
+    channels = [channel for _, channel in args.channel]
+    if len(channels) > 1 or args.channel[0][0] is not None:
+        raise UsageError("emulate: with --eds there is one channel, without a name: --channel CH")
+
+    from canprobe import api
+
+    return lambda: api.emulate_eds(
+        list(zip(args.eds, args.node_id, strict=True)),
+        interface=args.bus,
+        channel=channels[0],
+        bitrate=args.bitrate or _BITRATE,
+        store_folder=args.store,
+        say=say,
+    )
+
+
+def _check_channel(args: argparse.Namespace) -> None:
+    if args.channel is None:
+        raise UsageError("emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0")
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

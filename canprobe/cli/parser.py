@@ -31,10 +31,13 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def add_scene(parser: argparse.ArgumentParser) -> None:
-    """SCENE, which most commands take."""
+def add_scene(parser: argparse.ArgumentParser, optional: bool = False) -> None:
+    """SCENE, which most commands take; optional where another argument can stand for it."""
     parser.add_argument(
-        "scene", metavar="SCENE", help="a packaged scene (see `canprobe scenes`) or the path of a TOML file"
+        "scene",
+        metavar="SCENE",
+        nargs="?" if optional else None,
+        help="a packaged scene (see `canprobe scenes`) or the path of a TOML file",
     )
 
 

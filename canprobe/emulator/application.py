@@ -14,6 +14,13 @@ class Application:
     def attach(self, node: SlaveNode) -> None:
         """Once, at construction of the node: hang checks, hooks and samplers on its dictionary and PDOs."""
 
+    def keep(self) -> bytes:
+        """What "save" (1010h) stores of the device beside its dictionary."""
+        return b""
+
+    def recall(self, kept: bytes) -> None:
+        """Before `reset`: what was stored; empty when nothing was, or after "load" (1011h)."""
+
     def reset(self, t_ns: int) -> None:
         """The node boots; the dictionary holds its defaults or what was stored."""
 

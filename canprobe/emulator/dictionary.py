@@ -109,7 +109,7 @@ class Dictionary:
 
     def read(self, index: int, subindex: int) -> bytes:
         """SDO upload. Raises SdoAbort."""
-        entry = self.find(index, subindex)
+        entry = self.entries.get(index << 8 | subindex) or self.find(index, subindex)
         if not entry.readable:
             raise SdoAbort(Abort.WRITE_ONLY)
         if refresh := self._refreshers.get(index):

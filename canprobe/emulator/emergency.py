@@ -6,7 +6,7 @@ Source: CiA 301, "Emergency object", objects 1001h, 1003h, 1014h, 1015h.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
@@ -41,7 +41,7 @@ class Emergency:
 
     def __init__(self, core: NodeCore) -> None:
         self._core = core
-        self._active: set[int] = set()
+        self._active: dict[int, set[Hashable]] = {}
         self.any = False
         self._history: list[int] = []
         self._waiting: deque[tuple[int, int, bytes]] = deque(maxlen=_MOST_WAITING)
@@ -71,24 +71,36 @@ class Emergency:
         """Codes of the errors present."""
         return frozenset(self._active)
 
-    def report(self, code: int, data: bytes = b"") -> None:
-        """An error is present: remember and send it, once until `clear`."""
-        if code in self._active:
+    def report(self, code: int, data: bytes = b"", source: Hashable = None) -> None:
+        """An error is present: remember and send it, once until it is cleared.
+
+        Args:
+            code: emergency error code.
+            data: manufacturer's bytes, up to five.
+            source: which of several PDOs, producers… has it; the error lasts until the last one is cleared.
+        """
+        if (sources := self._active.get(code)) is not None:
+            sources.add(source)
             return
-        self._active.add(code)
+        self._active[code] = {source}
         self._history.insert(0, code | int.from_bytes(data[:2], "little") << 16)
         self._show()
         self._send(code, data)
 
-    def clear(self, code: int) -> None:
-        """An error is gone: EMCY 0000h with what remains in the register."""
-        if code in self._active:
-            self._active.discard(code)
-            self._show()
-            if self._waiting and self._waiting[-1][0] == code:
-                self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
-            else:
-                self._send(NO_ERROR, b"")
+    def clear(self, code: int, source: Hashable = None) -> None:
+        """An error of one source is gone: EMCY 0000h with what remains in the register, if it was the last source."""
+        sources = self._active.get(code)
+        if sources is None:
+            return
+        sources.discard(source)
+        if sources:
+            return
+        del self._active[code]
+        self._show()
+        if self._waiting and self._waiting[-1][0] == code:
+            self._waiting.pop()  # come and gone within the inhibit time: nobody needs to hear of it
+        else:
+            self._send(NO_ERROR, b"")
 
     def _send(self, code: int, data: bytes) -> None:
         if self._core.state not in _SENDING:

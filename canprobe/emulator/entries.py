@@ -116,5 +116,6 @@ def _default(variable: ODVariable, bits: int) -> Value:
     if value is None:
         return 0 if bits else b""
     if isinstance(value, str):
-        return value.encode("latin-1", "replace")
+        unicode = variable.data_type == datatypes.UNICODE_STRING
+        return value.encode("utf-16-le") if unicode else value.encode("latin-1", "replace")
     return bytes(value) if isinstance(value, (bytes, bytearray)) else value

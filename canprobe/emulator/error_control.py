@@ -1,6 +1,6 @@
-"""Heartbeat producer and consumer, and what the node does when the network is lost.
+"""Heartbeat producer and consumer.
 
-Source: CiA 301, "Error control services", objects 1016h, 1017h, 1029h; error 8130h.
+Source: CiA 301, "Error control services", objects 1016h and 1017h.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ class HeartbeatConsumer:
     """Watches the producers of 1016h, each from its first heartbeat on."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
+        """`on_loss(t_ns)` is called when a producer is lost."""
         self._core, self._emcy, self._on_loss = core, emcy, on_loss
         self._timers: dict[int, Timer] = {}
         self._periods: dict[int, int] = {}
-        self._lost: set[int] = set()
         core.dictionary.on_check(0x1016, self._check)
         core.dictionary.on_write(0x1016, lambda _sub, _value: self._configure())
 
@@ -94,12 +94,11 @@ class HeartbeatConsumer:
 
     def _configure(self) -> None:
         periods = {node_id: period * 1_000_000 for node_id, period in self._entries().values()}
-        for timer in self._timers.values():
+        for node_id, timer in self._timers.items():
             timer.cancel()
+            self._emcy.clear(HEARTBEAT_LOST, node_id)
         self._periods = periods
-        self._lost.clear()
         self._timers = {node_id: self._core.timers.new(self._timed_out(node_id)) for node_id in periods}
-        self._emcy.clear(HEARTBEAT_LOST)
         self._core.reroute()
 
     def _heard(self, node_id: int) -> Route:
@@ -109,17 +108,14 @@ class HeartbeatConsumer:
             if len(data) != 1:
                 return
             timer.arm(t_ns + period)
-            if node_id in self._lost:
-                self._lost.discard(node_id)
-                if not self._lost:
-                    self._emcy.clear(HEARTBEAT_LOST)
+            if self._emcy.any:
+                self._emcy.clear(HEARTBEAT_LOST, node_id)
 
         return heard
 
     def _timed_out(self, node_id: int) -> Callable[[int], None]:
         def timed_out(due_ns: int) -> None:
-            self._lost.add(node_id)
-            self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)))
+            self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
             self._on_loss(due_ns)
 
         return timed_out

@@ -20,6 +20,7 @@ from canprobe.emulator.core import NodeCore, Route, Service
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.error_control import HeartbeatConsumer, HeartbeatProducer
+from canprobe.emulator.guarding import NodeGuarding
 from canprobe.emulator.nmt import NMT_TRANSITIONS
 from canprobe.emulator.pdo_engine import PdoEngine
 from canprobe.emulator.sdo_server import SdoServer
@@ -60,9 +61,8 @@ class SlaveNode:
         self.rerouted: Callable[[], None] = _nothing
         self.emcy = Emergency(core)
         self.pdos = PdoEngine(core, self.emcy, self.application)
-        self.store = Store(core)
+        self.store = Store(core, self.application)
         self._heartbeat = HeartbeatProducer(core)
-        consumer = HeartbeatConsumer(core, self.emcy, self._communication_error)
         servers = [SdoServer(core, index) for index in _sdo_servers(core)]
         sync = SyncConsumer(core, self.emcy, self.pdos.sync)
         self._services: tuple[Service, ...] = (
@@ -70,7 +70,8 @@ class SlaveNode:
             self.pdos,
             self.store,
             sync,
-            consumer,
+            HeartbeatConsumer(core, self.emcy, self._communication_error),
+            NodeGuarding(core, self.emcy, self._communication_error),
             *servers,
             self._heartbeat,
         )
@@ -109,7 +110,7 @@ class SlaveNode:
         return self._taken()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        """A frame from the bus, of anyone to anyone. Never raises, whatever the bytes."""
+        """A frame from the bus, of anyone to anyone (a remote request has RTR_FLAG). Never raises, whatever it is."""
         route = self._routes.get(can_id)
         if route is None:
             return []
@@ -154,6 +155,7 @@ class SlaveNode:
         for service in self._services:
             service.reset(t_ns)
         if not communication_only:
+            self.application.recall(self.store.kept)
             self.application.reset(t_ns)
         self._reroute()
         if self._boot_ns:

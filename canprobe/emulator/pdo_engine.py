@@ -15,7 +15,7 @@ from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.pdo_rules import PdoRules
 from canprobe.emulator.rpdo import Rpdo
-from canprobe.emulator.tpdo import Tpdo
+from canprobe.emulator.tpdo import BUFFERED, Tpdo
 from canprobe.protocol.frames import NmtState
 
 Sampler = Callable[[int], None]
@@ -45,6 +45,7 @@ class PdoEngine:
         self._waiting: list[Rpdo] = []
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
+        self._buffered: list[Tpdo] = []
         self._count = self._sync_ns = self._window_ns = 0
         for rules in _discover(core, 0x1400, transmits=False):
             self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
@@ -58,6 +59,8 @@ class PdoEngine:
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
         def reconfigure(subindex: int, value: Value) -> None:
             pdo.configure()
+            if isinstance(pdo, Tpdo) and self._core.state is NmtState.OPERATIONAL:
+                pdo.reconfigured(self._core.now_ns)
             self._rebuild()
             self._core.reroute()
 
@@ -83,18 +86,22 @@ class PdoEngine:
         for pdo in self._all:
             pdo.stop()
         if self._core.state is NmtState.OPERATIONAL:
+            self._groups = []
             self._rebuild()
             for tpdo in self._on_event:
                 tpdo.started(t_ns)
 
     def routes(self) -> Mapping[int, Route]:
-        """RPDO identifiers, in operational only; PDOs that share one are all served."""
+        """RPDOs and remote requests for TPDOs, in operational only; PDOs that share an identifier are all served."""
         if self._core.state is not NmtState.OPERATIONAL:
             return NO_ROUTES
         routes: dict[int, Route] = {}
         for rpdo in self._rpdos:
             if rpdo.cob_id is not None:
                 routes[rpdo.cob_id] = _both(routes.get(rpdo.cob_id), self._route(rpdo))
+        for tpdo in self._tpdos:
+            if tpdo.remote_id is not None:
+                routes[tpdo.remote_id] = _both(routes.get(tpdo.remote_id), tpdo.remote)
         return routes
 
     @property
@@ -153,6 +160,8 @@ class PdoEngine:
                     sampler(t_ns)
                 for tpdo in group.tpdos:
                     tpdo.send()
+        for tpdo in self._buffered:
+            tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
                 tpdo.before(t_ns)
@@ -164,18 +173,20 @@ class PdoEngine:
         self._waiting = [rpdo for rpdo in self._rpdos if rpdo.cob_id is not None and rpdo.synchronous]
         active = [tpdo for tpdo in self._tpdos if tpdo.active]
         self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
+        self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED]
         counted = bool(dictionary.number(0x1019))
         groups: dict[tuple[int, int], _Group] = {}
         for tpdo in active:
             if 1 <= tpdo.type <= 240:
                 key = tpdo.type, tpdo.start if counted else 0
                 groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
-        for tpdo in self._on_event:
-            tpdo.before = _all(self._samplers_of([tpdo]))
+            else:
+                tpdo.before = _all(self._samplers_of([tpdo]))
+        phases = {(group.every, group.start): group.first for group in self._groups}
         self._groups = list(groups.values())
-        for group in self._groups:
+        for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
             group.samplers = self._samplers_of(group.tpdos)
-            group.first = None if group.start else self._count
+            group.first = phases.get((group.every, group.start), None if group.start else self._count)
 
     def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:
         indices = dict.fromkeys(key >> 8 for tpdo in tpdos for key in tpdo.keys)

@@ -56,6 +56,8 @@ class Rpdo:
         except SdoAbort:
             entries = ()
         self.stop()
+        if self._emcy.any:
+            self._forgive()  # what was wrong with the old parameters
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, entries)
         keys = [key_of(signal.index, signal.subindex) for signal in self._layout.signals]
@@ -83,14 +85,12 @@ class Rpdo:
         length = self._layout.length
         if len(data) != length:
             if len(data) < length:
-                self._emcy.report(PDO_TOO_SHORT)
+                self._emcy.report(PDO_TOO_SHORT, source=self)
                 return
-            self._emcy.report(PDO_TOO_LONG)
+            self._emcy.report(PDO_TOO_LONG, source=self)
             data = data[:length]
         elif self._emcy.any:
-            self._emcy.clear(PDO_TOO_SHORT)
-            self._emcy.clear(PDO_TOO_LONG)
-            self._emcy.clear(RPDO_TIMEOUT)
+            self._forgive()
         if self._event_ns:
             self._timer.arm(t_ns + self._event_ns)
         if self.synchronous:
@@ -111,5 +111,10 @@ class Rpdo:
             except SdoAbort:
                 continue
 
+    def _forgive(self) -> None:
+        for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):
+            self._emcy.clear(code, self)
+        self._emcy.clear(RPDO_TIMEOUT)  # a drive's, which misses targets whatever PDO brings them
+
     def _timed_out(self, due_ns: int) -> None:
-        self._emcy.report(RPDO_TIMEOUT)
+        self._emcy.report(RPDO_TIMEOUT, source=self)

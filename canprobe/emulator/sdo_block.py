@@ -10,6 +10,7 @@ from binascii import crc_hqx
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.entries import Entry
+from canprobe.emulator.sdo_states import SdoState
 from canprobe.emulator.sdo_transfers import Reception, Writer
 
 BLOCK_SIZE = 127
@@ -29,12 +30,11 @@ class BlockDownload:
         self._with_crc = with_crc
         self._write = write
         self._sequence = 0
-        self.streaming = True
-        self.done = False
+        self.state = SdoState.BLOCK_DOWNLOAD
 
     def receive(self, data: bytes) -> list[bytes]:
         """One segment, or after the last one the end of the transfer."""
-        return self._segment(data) if self.streaming else self._end(data)
+        return self._segment(data) if self.state is SdoState.BLOCK_DOWNLOAD else self._end(data)
 
     def _segment(self, data: bytes) -> list[bytes]:
         number, last = data[0] & 0x7F, bool(data[0] & 0x80)
@@ -46,25 +46,22 @@ class BlockDownload:
             self._reception.add(data[1:8], slack=6)
         if not last and number < BLOCK_SIZE:
             return []
-        self.streaming = not (last and accepted)
+        if last and accepted:
+            self.state = SdoState.BLOCK_DOWNLOAD_END
         acknowledged, self._sequence = self._sequence, 0
         return [bytes((0xA2, acknowledged, BLOCK_SIZE, 0, 0, 0, 0, 0))]
 
     def _end(self, data: bytes) -> list[bytes]:
-        if data[0] & 0xE3 != 0xC1:
-            raise SdoAbort(Abort.COMMAND)
         value = self._reception.complete(unused=data[0] >> 2 & 7)
         if self._with_crc and crc_hqx(value, 0) != data[1] | data[2] << 8:
             raise SdoAbort(Abort.CRC)
         self._write(value)
-        self.done = True
+        self.state = SdoState.IDLE
         return [b"\xa1".ljust(8, b"\0")]
 
 
 class BlockUpload:
     """Server → client in blocks as long as the client asks for."""
-
-    streaming = False
 
     def __init__(self, value: bytes, block_size: int, with_crc: bool) -> None:
         self._value = value
@@ -72,21 +69,17 @@ class BlockUpload:
         self._crc = crc_hqx(value, 0) if with_crc else 0
         self._position = 0
         self._sent = 0
-        self._started = False
-        self._ending = False
-        self.done = False
+        self.state = SdoState.BLOCK_UPLOAD_START
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Start (A3h), acknowledge (A2h) or end (A1h) from the client."""
-        if data[0] == 0xA3 and not self._started:
-            self._started = True
-            return self._block()
-        if data[0] == 0xA2 and self._started and not self._ending:
+        """Start (A3h), acknowledge (A2h) or end (A1h) from the client, as the state wants it."""
+        if self.state is SdoState.BLOCK_UPLOAD:
             return self._acknowledged(data[1], data[2])
-        if data[0] == 0xA1 and self._ending:
-            self.done = True
-            return []
-        raise SdoAbort(Abort.COMMAND)
+        if self.state is SdoState.BLOCK_UPLOAD_START:
+            self.state = SdoState.BLOCK_UPLOAD
+            return self._block()
+        self.state = SdoState.IDLE
+        return []
 
     def _block(self) -> list[bytes]:
         frames: list[bytes] = []
@@ -106,6 +99,6 @@ class BlockUpload:
         self._position += sequence * 7
         if sequence < self._sent or self._position < len(self._value):
             return self._block()
-        self._ending = True
+        self.state = SdoState.BLOCK_UPLOAD_END
         unused = self._position - len(self._value)
         return [struct.pack("<BH5x", 0xC1 | unused << 2, self._crc)]

@@ -10,6 +10,7 @@ from typing import Protocol
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.entries import Entry
+from canprobe.emulator.sdo_states import SdoState
 
 MAX_BYTES = 1 << 20
 _TOGGLE = 0x10
@@ -19,15 +20,13 @@ class Transfer(Protocol):
     """A transfer in progress.
 
     Attributes:
-        done: the last answer has been given.
-        streaming: client frames are numbered data, not commands (block download).
+        state: where the transfer is; IDLE when the last answer has been given.
     """
 
-    done: bool
-    streaming: bool
+    state: SdoState
 
     def receive(self, data: bytes) -> list[bytes]:
-        """Answer one client frame. Raises SdoAbort."""
+        """Answer one client frame, which `SDO_TRANSITIONS` allows in this state. Raises SdoAbort."""
 
 
 def check_size(entry: Entry, size: int) -> None:
@@ -65,25 +64,21 @@ class Reception:
 class SegmentedDownload:
     """Client → server, 7 bytes a segment; `write` stores the value when the last one is there."""
 
-    streaming = False
-
     def __init__(self, entry: Entry, announced: int | None, write: Writer) -> None:
         self._reception = Reception(entry, announced)
         self._write = write
         self._toggle = 0
-        self.done = False
+        self.state = SdoState.DOWNLOAD
 
     def receive(self, data: bytes) -> list[bytes]:
-        """One segment (ccs 0)."""
+        """One segment."""
         command = data[0]
-        if command >> 5 != 0:
-            raise SdoAbort(Abort.COMMAND)
         if command & _TOGGLE != self._toggle:
             raise SdoAbort(Abort.TOGGLE)
         self._reception.add(data[1 : 8 - (command >> 1 & 7)])
         if command & 1:
             self._write(self._reception.complete())
-            self.done = True
+            self.state = SdoState.IDLE
         answer = bytes((0x20 | self._toggle, 0, 0, 0, 0, 0, 0, 0))
         self._toggle ^= _TOGGLE
         return [answer]
@@ -92,22 +87,20 @@ class SegmentedDownload:
 class SegmentedUpload:
     """Server → client, 7 bytes a segment."""
 
-    streaming = False
-
     def __init__(self, value: bytes) -> None:
         self._rest = value
         self._toggle = 0
-        self.done = False
+        self.state = SdoState.UPLOAD
 
     def receive(self, data: bytes) -> list[bytes]:
-        """One request for a segment (ccs 3)."""
-        if data[0] >> 5 != 3:
-            raise SdoAbort(Abort.COMMAND)
+        """One request for a segment."""
         if data[0] & _TOGGLE != self._toggle:
             raise SdoAbort(Abort.TOGGLE)
         piece, self._rest = self._rest[:7], self._rest[7:]
-        self.done = not self._rest
-        command = self._toggle | (7 - len(piece)) << 1 | self.done
+        last = not self._rest
+        if last:
+            self.state = SdoState.IDLE
+        command = self._toggle | (7 - len(piece)) << 1 | last
         self._toggle ^= _TOGGLE
         return [bytes((command,)) + piece.ljust(7, b"\0")]
 

@@ -5,9 +5,10 @@ Source: CiA 301, objects 1010h and 1011h.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from canprobe.emulator.aborts import Abort, SdoAbort
+from canprobe.emulator.application import Application
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
 from canprobe.emulator.entries import Value
 
@@ -16,6 +17,7 @@ LOAD = int.from_bytes(b"load", "little")
 _ALL = range(0x1000, 0x10000)
 _COMMUNICATION = range(0x1000, 0x2000)
 _APPLICATION = range(0x2000, 0x10000)
+_COMMUNICATION_ONLY = 2
 _GROUPS = {1: _ALL, 2: _COMMUNICATION, 3: _APPLICATION}
 _NEVER = frozenset({0x1003, 0x1010, 0x1011})
 
@@ -25,12 +27,16 @@ class Store:
 
     Attributes:
         saved: stored values by dictionary key; hand it to another node's store to model a power cycle.
+        kept: what the application stored beside the dictionary.
         volatile: indices that are process data, never stored.
+        changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
     """
 
-    def __init__(self, core: NodeCore) -> None:
-        self._core = core
+    def __init__(self, core: NodeCore, application: Application) -> None:
+        self._core, self._application = core, application
         self.saved: dict[int, Value] = {}
+        self.kept = b""
+        self.changed: Callable[[], None] = _nothing
         self.volatile: set[int] = set()
         core.dictionary.on_check(0x1010, self._save)
         core.dictionary.on_check(0x1011, self._load)
@@ -60,16 +66,32 @@ class Store:
         if value != SAVE or subindex not in _GROUPS:
             raise SdoAbort(Abort.CANNOT_STORE)
         dictionary, skip = self._core.dictionary, _NEVER | self.volatile
+        saved = dict(self.saved)
         for key, entry in dictionary.entries.items():
             if entry.writable and entry.readable and key >> 8 in _GROUPS[subindex] and key >> 8 not in skip:
-                self.saved[key] = dictionary.values[key]
+                saved[key] = dictionary.values[key]
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._application.keep())
 
     def _load(self, subindex: int, value: Value) -> None:
         if value != LOAD or subindex not in _GROUPS:
             raise SdoAbort(Abort.CANNOT_STORE)
-        self.saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
+        saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"")
+
+    def _replace(self, saved: dict[int, Value], kept: bytes) -> None:
+        before = self.saved, self.kept
+        self.saved, self.kept = saved, kept
+        try:
+            self.changed()
+        except SdoAbort:
+            self.saved, self.kept = before
+            raise
 
     def _show(self, subindex: int, value: Value) -> None:
         for index in (0x1010, 0x1011):
             for sub in _GROUPS:
                 self._core.dictionary.put(index, sub, 1)
+
+
+def _nothing() -> None:
+    return None

@@ -19,14 +19,16 @@ from canprobe.emulator.application import Application
 from canprobe.emulator.entries import Value
 from canprobe.emulator.node import SlaveNode
 from canprobe.emulator.tactile_image import Image, compute_features, correct, follow, is_overloaded
+from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
-from canprobe.protocol.tactile import Features, TactileHeader, TactileMode, pack_frame
+from canprobe.protocol.tactile import SIDE, Features, TactileHeader, TactileMode, pack_frame
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
 IMAGE_ROWS, WINDOW_ROWS, HEADER, FEATURES = 0x2100, 0x2110, 0x2120, 0x2130
 _CONTENT = {TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
 _MAX_AGE_US = 0xFFFF
+_TARE_BYTES = SIDE * SIDE * 8
 
 
 class TactilePlant(Protocol):
@@ -54,7 +56,6 @@ class TactileApplication(Application):
         self._latency, self._tare_images = latency_frames, tare_images
         self._pipeline: deque[tuple[int, Image]] = deque()
         self._tare: NDArray[np.float64] | None = None
-        self._kept_tare: NDArray[np.float64] | None = None
         self._taring: list[Image] | None = None
         self._frames = 0
         self._origin = (4, 4)
@@ -68,13 +69,21 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
-        node.dictionary.on_write(0x1010, lambda _sub, _value: self._keep_tare(self._tare))
-        node.dictionary.on_write(0x1011, lambda _sub, _value: self._keep_tare(None))
+
+    def keep(self) -> bytes:
+        """The tare."""
+        return b"" if self._tare is None else self._tare.tobytes()
+
+    def recall(self, kept: bytes) -> None:
+        """The tare as it was stored, if any."""
+        if len(kept) not in (0, _TARE_BYTES):
+            raise UsageError(f"{self._node.name}: stored tare: expected {_TARE_BYTES} bytes, got {len(kept)}")
+        self._tare = np.frombuffer(kept).reshape(SIDE, SIDE) if kept else None
 
     def reset(self, t_ns: int) -> None:
         """Power on."""
         self._pipeline.clear()
-        self._tare, self._taring = self._kept_tare, None
+        self._taring = None
         self._frames = 0
         self._origin = (4, 4)
 
@@ -140,9 +149,6 @@ class TactileApplication(Application):
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []
-
-    def _keep_tare(self, tare: NDArray[np.float64] | None) -> None:
-        self._kept_tare = tare
 
 
 def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1) -> SlaveNode:

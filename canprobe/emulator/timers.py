@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
+
+_ROOM = 64
 
 
 class Timer:
@@ -38,6 +40,14 @@ class Timer:
         """Do not fire."""
         self.due_ns = None
 
+    def holds(self, queued_ns: int) -> bool:
+        """Whether the entry of `queued_ns` is still needed; if it is not, it counts as taken off the heap."""
+        if queued_ns != self._queued_ns:
+            return False
+        if self.due_ns is None:
+            self._queued_ns = None
+        return self.due_ns is not None
+
     def surfaced(self, queued_ns: int) -> bool:
         """Take the entry of `queued_ns` off the heap; queue again when it was re-armed. True when it is due then."""
         if queued_ns != self._queued_ns:
@@ -62,11 +72,12 @@ class Timers:
         now_ns: the time up to which `run` was last called.
     """
 
-    __slots__ = ("_count", "_heap", "now_ns")
+    __slots__ = ("_count", "_heap", "_most", "now_ns")
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
         self._count = 0
+        self._most = _ROOM
         self.now_ns = 0
 
     def new(self, callback: Callable[[int], None]) -> Timer:
@@ -77,6 +88,15 @@ class Timers:
         """Put an entry on the heap (for `Timer`)."""
         self._count += 1
         heappush(self._heap, (due_ns, self._count, timer))
+        if len(self._heap) > self._most:
+            self._compact()
+
+    def _compact(self) -> None:
+        """Drop the entries of deadlines that were moved or cancelled, which else stay until their time."""
+        heap = self._heap
+        heap[:] = {timer: (due, count, timer) for due, count, timer in heap if timer.holds(due)}.values()
+        heapify(heap)
+        self._most = 2 * len(heap) + _ROOM
 
     @property
     def next_ns(self) -> int | None:

@@ -1,4 +1,4 @@
-"""One TPDO: packing, and the events that send it outside the SYNC cycle.
+"""One TPDO: packing, and the events and remote requests that send it outside the SYNC cycle.
 
 Source: CiA 301, "TPDO", objects 1800h and 1A00h.
 """
@@ -13,7 +13,11 @@ from canprobe.emulator.aborts import SdoAbort
 from canprobe.emulator.core import NodeCore
 from canprobe.emulator.entries import key_of
 from canprobe.emulator.pdo_rules import COB_ID, EVENT, INHIBIT, START, TYPE, PdoRules
+from canprobe.protocol.frames import RTR_FLAG
 from canprobe.protocol.pdo import PdoLayout
+
+BUFFERED, ON_REQUEST = 252, 253
+_NO_RTR = 1 << 30  # of the COB-ID
 
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
 
@@ -30,13 +34,16 @@ class Tpdo:
 
     Attributes:
         active: valid and with something mapped.
+        before: samples what is mapped, at a time.
         keys: mapped dictionary keys.
         type: transmission type.
         start: SYNC start value (18xxh:06).
+        remote_id: identifier of the remote request that is answered, or None.
         requested: an event waits for the next SYNC (type 0).
     """
 
     __slots__ = (
+        "_buffer",
         "_cob_id",
         "_core",
         "_earliest_ns",
@@ -50,6 +57,7 @@ class Tpdo:
         "active",
         "before",
         "keys",
+        "remote_id",
         "requested",
         "start",
         "type",
@@ -63,7 +71,9 @@ class Tpdo:
         self._fetch: Fetch = _no_values
         self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
         self.active = self.requested = False
+        self._buffer: bytes | None = None
         self.keys: tuple[int, ...] = ()
+        self.remote_id: int | None = None
         self.type = self.start = 0
         self.before: Callable[[int], None] = _nothing
 
@@ -75,8 +85,10 @@ class Tpdo:
         except SdoAbort:
             entries = ()
         self.stop()
-        self._cob_id = number(index, COB_ID) & 0x7FF
+        cob_id = number(index, COB_ID)
+        self._cob_id = cob_id & 0x7FF
         self.active = self._rules.valid and bool(entries)
+        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & _NO_RTR else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
         self.type, self.start = number(index, TYPE), number(index, START)
         self._inhibit_ns = number(index, INHIBIT) * 100_000
@@ -94,12 +106,18 @@ class Tpdo:
         self._event_timer.cancel()
         self._inhibit_timer.cancel()
         self.requested = False
+        self._buffer = None
 
     def started(self, t_ns: int) -> None:
         """Operational: an event-driven PDO tells its first values."""
         if self.active and self.by_event:
             self._earliest_ns = t_ns
             self.event(t_ns)
+
+    def reconfigured(self, t_ns: int) -> None:
+        """New parameters in operational: the event timer runs from now on."""
+        if self.active and self.by_event and self._event_ns:
+            self._event_timer.arm(t_ns + self._event_ns)
 
     def event(self, t_ns: int) -> None:
         """A mapped value changed."""
@@ -117,6 +135,25 @@ class Tpdo:
         self.requested = False
         core = self._core
         core.out.append((self._cob_id, self._pack(*self._fetch(core.dictionary.values))))
+
+    def sample(self, t_ns: int) -> None:
+        """Type 252: pack the values of this SYNC, for the next remote request."""
+        self.before(t_ns)
+        self._buffer = self._packed()
+
+    def remote(self, data: bytes, t_ns: int) -> None:
+        """A remote request. Synchronous PDOs answer with the values of the last SYNC, the others with the present."""
+        if self.by_event:
+            self.event(t_ns)
+        elif self._buffer is not None:
+            self._core.send(self._cob_id, self._buffer)
+        else:
+            if self.type in (BUFFERED, ON_REQUEST):
+                self.before(t_ns)
+            self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
+
+    def _packed(self) -> bytes:
+        return self._pack(*self._fetch(self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
         self.before(t_ns)

@@ -9,6 +9,9 @@ from canprobe.errors import ProtocolError
 Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
+RTR_FLAG = 0x40000000
+"""On the identifier of a remote request (which has no data), as in Linux's `struct can_frame`."""
+
 NMT_ID = 0x000
 SYNC_ID = 0x080
 EMCY_BASE = 0x080

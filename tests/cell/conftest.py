@@ -21,10 +21,10 @@ from canprobe.session import resolve_scene
 DURATION_S = 1.1
 
 
-def short_scan(**task):
+def short_scan(*, patch=True, **task):
     """The cylinder with a scan of a second or so, and the online estimator alone."""
     scene = resolve_scene(canprobe.load_scene("cylinder"), duration_s=DURATION_S)
-    scene = replace(scene, shape=replace(scene.shape, also=()))
+    scene = replace(scene, shape=replace(scene.shape, also=(), patch=patch))
     return replace(scene, task=replace(scene.task, clearance_mm=0.8, **task))
 
 
@@ -88,13 +88,22 @@ class Stalling:
         return command
 
 
+def undrawn_run(scene, out):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("canprobe.api._draw", lambda result, folder: None)
+        return canprobe.run(scene, out=out)
+
+
 @pytest.fixture(scope="session")
 def lockstep_run(tmp_path_factory):
     """A run in lockstep, with all its files."""
-    out = tmp_path_factory.mktemp("recorded") / "lockstep"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("canprobe.api._draw", lambda result, folder: None)
-        return canprobe.run(short_scan(), out=out)
+    return undrawn_run(short_scan(), tmp_path_factory.mktemp("recorded") / "lockstep")
+
+
+@pytest.fixture(scope="session")
+def motion_run(tmp_path_factory):
+    """The same without the contact patch, whose share in an answer is taken or left: a small change may decide it."""
+    return undrawn_run(short_scan(patch=False), tmp_path_factory.mktemp("recorded") / "motion")
 
 
 @pytest.fixture(scope="session")

@@ -45,14 +45,24 @@ def settled(records):
     return np.array([r.t_s for r in late]), np.array([r.estimate.curvature_tensor_base() for r in late])
 
 
-def largest_deviation(records, reference):
-    """Of the curvature, relative, at the reference's instants; the last may be before the replay's first or last."""
+def stated_sigmas(records):
+    """Root of the summed variances of (K11, √2 K12, K22), 1/m, of the estimates after 10 mm."""
+    late = [r for r in records if r.travelled_m > 0.010]
+    return np.sqrt([np.diag(r.estimate.covariance) @ (1.0, 2.0, 1.0) for r in late])
+
+
+def largest_deviation(records, reference, *, in_sigmas=False):
+    """Of the curvature, at the reference's instants; the last may be before the replay's first or last.
+
+    Relative to the curvature, or to the standard deviation that the reference states.
+    """
     times, K = settled(records)
     t_ref, K_ref = settled(reference)
     nearest = np.abs(times[:, None] - t_ref).argmin(axis=0)
     near = np.abs(times[nearest] - t_ref) < 0.021  # half of the time between two estimates
     assert np.count_nonzero(~near) <= 1 and len(near) > 10
-    deviation = np.linalg.norm(K[nearest] - K_ref, axis=(1, 2)) / np.linalg.norm(K_ref, axis=(1, 2))
+    scale = stated_sigmas(reference) if in_sigmas else np.linalg.norm(K_ref, axis=(1, 2))
+    deviation = np.linalg.norm(K[nearest] - K_ref, axis=(1, 2)) / scale
     return float(deviation[near].max())
 
 
@@ -66,7 +76,7 @@ def test_the_log_alone_gives_the_online_result_to_the_last_bit(lockstep_run):
     assert json.loads(json.dumps(result.summary["shape"])) == online["shape"]
     assert "the scene's task drove: its scan is replayed\n" in result.text()
     assert result.summary["online"]["K_max_difference_per_m"] == 0.0
-    assert result.summary["online"]["replayed"] == 20
+    assert result.summary["online"]["replayed"] == result.summary["online"]["estimates"] >= 20
 
 
 def test_a_log_whose_lines_are_in_another_order_is_sorted_by_its_stamps(lockstep_run, copy_of):
@@ -103,7 +113,7 @@ def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path
     assert result.summary["shape"]["kappa_true_per_m"] is None
 
 
-def test_lost_lines_are_counted_and_cost_little(lockstep_run, copy_of):
+def test_lost_lines_are_counted_and_cost_little(motion_run, copy_of):
     lost = {"tpdo": 0, "taxels": 0}
 
     def drop(lines):
@@ -117,15 +127,15 @@ def test_lost_lines_are_counted_and_cost_little(lockstep_run, copy_of):
             else:
                 yield line
 
-    result = canprobe.replay(copy_of(lockstep_run.out, drop))
+    result = canprobe.replay(copy_of(motion_run.out, drop))
     cycle = result.summary["cycle"]
     assert lost["tpdo"] > 10 and cycle["missed_pdos"] <= lost["tpdo"] < cycle["missed_pdos"] + 5  # a few at the end
     assert cycle["torn_frames"] == cycle["lost_frames"] == lost["taxels"] == 1
     assert result.summary["driven_by"] == "task" and result.summary["targets"]["differing"] > 0
-    assert largest_deviation(result.estimates["recursive"], lockstep_run.estimates["recursive"]) < 0.03
+    assert largest_deviation(result.estimates["recursive"], motion_run.estimates["recursive"], in_sigmas=True) < 1.0
 
 
-def test_lost_syncs_are_known_from_the_counter(lockstep_run, copy_of):
+def test_lost_syncs_are_known_from_the_counter(motion_run, copy_of):
     lost = []
 
     def drop(lines):
@@ -137,10 +147,10 @@ def test_lost_syncs_are_known_from_the_counter(lockstep_run, copy_of):
             else:
                 yield line
 
-    result = canprobe.replay(copy_of(lockstep_run.out, drop))
+    result = canprobe.replay(copy_of(motion_run.out, drop))
     assert len(lost) - 1 <= result.summary["cycle"]["lost_syncs"] <= len(lost)
     assert result.summary["shape"]["position_rms_mm"] < 0.15  # against the truth's row of the right SYNC
-    assert largest_deviation(result.estimates["recursive"], lockstep_run.estimates["recursive"]) < 0.02
+    assert largest_deviation(result.estimates["recursive"], motion_run.estimates["recursive"], in_sigmas=True) < 1.0
 
 
 def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_run, copy_of):

@@ -383,15 +383,18 @@ def test_what_cannot_be_loaded_is_named(source, node_id, words):
     "content, words",
     [
         (b"no section\n", "usable"),
-        (b"", "[DeviceInfo]"),
+        (b"", "no object"),
         (b"[DeviceInfo]\n", "no object"),
         (b"\xff\xfe\x00", "text"),
-        (b"[DeviceInfo]\n[1000]\nObjectType=0x7\n", "ParameterName"),
+        (b"[DeviceInfo]\n[2000]\nObjectType=0x7\n", "line 2 [2000] DataType: missing"),
         (b"[DeviceInfo]\n[1000]\nParameterName=x\nDataType=seven\nAccessType=ro\n", "seven"),
-        (b"[DeviceInfo]\n[1000sub1]\nParameterName=x\nDataType=0x7\nAccessType=ro\n", "1000"),
+        (
+            b"[DeviceInfo]\n[1000sub1]\nParameterName=x\nDataType=0x7\nAccessType=ro\n",
+            "[1000]: the standard has a variable",
+        ),
         (
             b"[DeviceInfo]\n[1000]\nParameterName=x\nDataType=0x7\nAccessType=ro\nDefaultValue=many\n",
-            "DefaultValue=many",
+            "line 6 [1000] DefaultValue: 'many'",
         ),
     ],
 )

@@ -18,6 +18,7 @@ from canprobe.emulator.plant.motor import MotorDynamics
 
 U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5
+OFF = 0x80000000
 
 Row = tuple[int, int | None, int, str, str, int, str, str]
 # index, sub (None: plain variable), data type, access, default, mappable, low, high
@@ -28,6 +29,8 @@ _ROWS: list[Row] = [
     (0x1005, None, U32, "rw", "0x80", 0, "", ""),
     (0x1006, None, U32, "rw", "0", 0, "", ""),
     (0x1007, None, U32, "rw", "0", 0, "", ""),
+    (0x100C, None, U16, "rw", "0", 0, "", ""),
+    (0x100D, None, U8, "rw", "0", 0, "", ""),
     (0x1008, None, STRING, "const", "a name longer than seven", 0, "", ""),
     *[(0x1010, sub, U32 if sub else U8, "rw" if sub else "ro", "1" if sub else "3", 0, "", "") for sub in range(4)],
     *[(0x1011, sub, U32 if sub else U8, "rw" if sub else "ro", "1" if sub else "3", 0, "", "") for sub in range(4)],
@@ -37,6 +40,7 @@ _ROWS: list[Row] = [
     (0x1017, None, U16, "rw", "0", 0, "", ""),
     (0x1019, None, U8, "rw", "0", 0, "", ""),
     *[(0x1029, sub, U8, "rw" if sub else "ro", "0" if sub else "1", 0, "", "") for sub in range(2)],
+    *[(0x1201, sub, U32 if sub else U8, "rw" if sub else "ro", f"{OFF if sub else 2}", 0, "", "") for sub in range(3)],
     (0x2000, None, U8, "rw", "50", 0, "10", "100"),
     (0x2001, None, U32, "rw", "0x01020304", 1, "", ""),
     (0x2002, None, I16, "rw", "-2", 1, "-100", "100"),
@@ -196,18 +200,24 @@ class FakePlant:
         return {"q": np.full(6, state * 1e-9), "force": 2.0}
 
 
+@pytest.fixture(scope="session")
+def tiny_od() -> ObjectDictionary:
+    """The tiny node's dictionary, parsed once; nodes keep their values elsewhere."""
+    return make_tiny_od()
+
+
 @pytest.fixture
-def bench() -> Bench:
+def bench(tiny_od: ObjectDictionary) -> Bench:
     """The tiny node, booted, pre-operational at time 0."""
-    made = Bench(SlaveNode(make_tiny_od(), NODE_ID))
+    made = Bench(SlaveNode(tiny_od, NODE_ID))
     assert spell(made.node.start(0)) == [(0x705, "00")]
     return made
 
 
 @pytest.fixture
-def make_bench() -> Callable[..., Bench]:
+def make_bench(tiny_od: ObjectDictionary) -> Callable[..., Bench]:
     """Make tiny nodes with options of SlaveNode; not started."""
-    return lambda **options: Bench(SlaveNode(make_tiny_od(), NODE_ID, **options))
+    return lambda **options: Bench(SlaveNode(tiny_od, NODE_ID, **options))
 
 
 @pytest.fixture

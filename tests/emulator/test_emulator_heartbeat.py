@@ -75,6 +75,29 @@ def test_cia301_heartbeat_44_removed_producer_is_forgotten(bench):
     assert bench.node.next_deadline_ns is None
 
 
+def test_cia301_heartbeat_44_the_error_ends_when_the_last_of_two_lost_is_back(bench):
+    bench.write(0x1029, 1, 1, 1)
+    for sub, node_id in ((1, 127), (2, 126)):
+        bench.write(0x1016, sub, node_id << 16 | 250, 4)
+    bench.write(0x100C, 0, 100, 2)
+    bench.write(0x100D, 0, 2, 1)
+    for can_id in (0x77F, 0x77E, 0x40000705):
+        bench.send(can_id, "05" if can_id < 0x800 else "", 0)
+    assert bench.advance(200 * MS) == [(0x85, "3081110000000000")]  # life guarding
+    assert bench.advance(250 * MS) == []  # both producers: the error is there already
+    assert bench.send(0x77F, "05", 260 * MS) == bench.send(0x77E, "05", 260 * MS) == []
+    assert bench.send(0x40000705, "", 270 * MS) == [(0x705, "ff"), (0x85, "0000000000000000")]
+
+
+def test_cia301_guarding_09_a_heartbeat_that_is_switched_on_ends_life_guarding(bench):
+    bench.write(0x100C, 0, 100, 2)
+    bench.write(0x100D, 0, 2, 1)
+    bench.send(0x40000705, "", 0)
+    bench.send(0x605, "2b171000e8030000")  # 1000 ms
+    assert bench.send(0x40000705, "") == []
+    assert bench.advance(900 * MS) == []
+
+
 def test_cia301_store_46_needs_its_signature(bench):
     assert bench.write(0x1010, 1, 1, 4) == 0x08000020
     assert bench.write(0x1011, 1, SAVE, 4) == 0x08000020

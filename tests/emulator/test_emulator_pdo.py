@@ -196,3 +196,23 @@ def test_cia301_pdo_rpdo_identifier_changes_are_heard(bench):
     assert bench.read(0x2001) == 0x01020304
     bench.send(0x333, "112233440500")
     assert bench.read(0x2001) == 0x44332211
+
+
+def test_cia301_pdo_35_one_pdo_that_is_back_does_not_hide_another_that_is_lost(bench):
+    configure(bench, 0x1400, cob_id=0x205, words=[0x20010020], type=255, event=20)
+    configure(bench, 0x1401, cob_id=0x305, words=[0x20070008], type=255, event=30)
+    bench.nmt(0x01, 0)
+    bench.send(0x205, "11223344", 0)
+    bench.send(0x305, "55", 0)
+    assert bench.advance(20 * MS) == [(0x85, "5082110000000000")]
+    assert bench.advance(30 * MS) == []  # the same error, of the other one
+    assert bench.send(0x305, "55", 35 * MS) == []
+    assert bench.send(0x205, "11223344", 36 * MS) == [(0x85, "0000000000000000")]
+
+
+def test_cia301_pdo_33_the_error_of_a_pdo_ends_when_it_is_switched_off(bench):
+    bench.nmt(0x01)
+    assert bench.send(0x205, "1122334405") == [(0x85, "1082110000000000")]
+    head = bytes((0x23, 0x00, 0x14, 1)).hex()
+    assert bench.send(0x605, head + "05020080") == [(0x85, "0000000000000000"), (0x585, "6000140100000000")]
+    assert bench.read(0x1001) == 0

@@ -55,6 +55,22 @@ def test_missed_periods_are_skipped_and_the_phase_kept():
     assert (fired, timers.next_ns) == ([100, 200], 1300)
 
 
+def test_the_heap_does_not_grow_by_deadlines_that_come_and_go():
+    """A far deadline, then a near one that fires, again and again: as when 1017h is written long, short, long."""
+    fired: list[int] = []
+    timers = Timers()
+    timer = timers.new(fired.append)
+    for t_ns in range(10_000):
+        timer.arm(t_ns + 10**9)
+        forgotten = timers.new(fired.append)
+        forgotten.arm(t_ns + 10**9)
+        forgotten.cancel()
+        timer.arm(t_ns + 1)
+        timers.run(t_ns + 1)
+    assert fired == list(range(1, 10_001))
+    assert len(timers._heap) < 200
+
+
 @given(st.lists(st.tuples(st.integers(0, 3), st.one_of(st.none(), st.integers(0, 40))), max_size=30))
 def test_next_is_the_minimum_of_what_is_armed(orders):
     timers = Timers()

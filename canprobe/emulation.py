@@ -1,0 +1,145 @@
+"""Emulated nodes on a real interface: those of a scene, or one from each EDS file."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.errors import NodeError, UsageError
+from canprobe.rehearsal import rehearse
+from canprobe.scene import Scene
+from canprobe.session import resolve_scene
+
+if TYPE_CHECKING:
+    from canprobe.bus.port import Port
+    from canprobe.emulator.node import SlaveNode
+    from canprobe.emulator.serve import Participant
+
+Say = Callable[[str], None]
+
+
+def _quiet(_: str) -> None:
+    return
+
+
+def emulate(
+    scene: Scene,
+    *,
+    interface: str,
+    channel: str,
+    bitrate: int,
+    node_ids: tuple[int, ...],
+    seed: int | None = None,
+    truth_path: Path | None = None,
+    store_folder: Path | None = None,
+    say: Say = _quiet,
+) -> None:
+    """Serve emulated nodes on a real interface until interrupted, for any master.
+
+    Args:
+        scene: whose nodes.
+        interface, channel, bitrate: of the bus.
+        node_ids: which nodes.
+        seed: in the place of the scene's.
+        truth_path: file for the plant's true values, written at the end.
+        store_folder: folder with a file for each node, where its 1010h stores; None forgets at the end.
+        say: called when the nodes are about to be served.
+
+    Raises:
+        UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+    """
+    from canprobe.emulator.build import make_world
+    from canprobe.planning import make_plan
+
+    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    plan = make_plan(resolved)
+    with _free_port(interface, channel, bitrate, node_ids, "end that node, or name others with --nodes") as port:
+        rehearse(resolved)
+        world = make_world(plan, node_ids)
+        _keep(world.nodes, store_folder)
+        try:
+            _serve(world.participants, node_ids, port, channel, say)
+        finally:
+            if truth_path is not None:
+                world.recorder.save(truth_path)
+
+
+def emulate_eds(
+    files: Sequence[tuple[str | Path, int]],
+    *,
+    interface: str,
+    channel: str,
+    bitrate: int,
+    store_folder: Path | None = None,
+    say: Say = _quiet,
+) -> None:
+    """Serve a node from each EDS file on a real interface until interrupted, for any master.
+
+    Args:
+        files: (name or path of an EDS or DCF file, node id) of each node.
+        interface, channel, bitrate: of the bus.
+        store_folder: as for :func:`emulate`.
+        say: called with what is odd about the files, and when the nodes are there.
+
+    Raises:
+        EdsError: a file cannot be served; one line a fault.
+        UsageError: a node id is given twice, or a file of `store_folder` is not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+    """
+    from canprobe.eds import check_eds
+    from canprobe.emulator.any_eds import make_eds_node
+
+    node_ids = tuple(node_id for _, node_id in files)
+    if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
+        raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
+    nodes = []
+    for name, node_id in files:
+        reading = check_eds(name, node_id)
+        nodes.append(make_eds_node(reading.usable(), node_id))
+        if warnings := len(reading.warnings):
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
+    with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
+        _keep(nodes, store_folder)
+        _serve(nodes, node_ids, port, channel, say)
+
+
+@contextlib.contextmanager
+def _free_port(interface: str, channel: str, bitrate: int, node_ids: tuple[int, ...], way_out: str) -> Iterator[Port]:
+    """A port on a bus where nobody has these node ids."""
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.bus.probe import answering_nodes
+
+    port = open_port(interface, channel, bitrate, MonotonicClock())
+    try:
+        if busy := answering_nodes(port, node_ids, 0.1):
+            raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")
+        yield port
+    finally:
+        port.close()
+
+
+def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, channel: str, say: Say) -> None:
+    from canprobe.bus.memory import reserve_memory
+    from canprobe.bus.priority import ask_for_processor
+    from canprobe.emulator.serve import serve
+
+    reserve_memory()
+    port.drain()  # what passed meanwhile
+    ask_for_processor()
+    say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
+    serve(nodes, port, lambda: False)
+
+
+def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
+    """Let each node keep what a master stores by 1010h in a file of its own."""
+    from canprobe.emulator.store_file import keep_in_file
+
+    if folder is not None:
+        for node in nodes:
+            keep_in_file(node, folder / f"node{node.node_id:03}.json")

@@ -1,0 +1,48 @@
+"""What the builders of a dictionary share: the sections, the node, and where they tell what is odd."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from canprobe.eds.faults import Faults
+from canprobe.eds.lines import Section, Sections
+from canprobe.eds.numbers import parse_integer
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    """An EDS file in pieces.
+
+    Attributes:
+        sections: of the file.
+        node_id: for $NODEID.
+        faults: collects what is wrong.
+    """
+
+    sections: Sections
+    node_id: int
+    faults: Faults
+
+    def warn(self, section: Section, key: str, text: str) -> None:
+        """A warning at a key, or at its section where the key is missing."""
+        self.faults.warn(section.line_of(key), section.name, key, text)
+
+    def fault(self, section: Section, key: str, text: str) -> None:
+        """A fault at a key, or at its section where the key is missing."""
+        self.faults.fault(section.line_of(key), section.name, key, text)
+
+    def remark(self, section: Section, key: str) -> Callable[[str], None]:
+        """What a parser calls with what is odd about a value."""
+        return lambda text: self.warn(section, key, text)
+
+    def number(self, section: Section, key: str, default: int = 0) -> int:
+        """An integer that does no harm when it is wrong; `default` where it is missing, empty or none."""
+        text = section.value(key)
+        if not text:
+            return default
+        try:
+            return parse_integer(text, self.remark(section, key))
+        except ValueError as error:
+            self.warn(section, key, f"{error}; read as {default}")
+            return default

@@ -1,0 +1,281 @@
+"""can-utils and tshark as witnesses: what they see on the bus, and what they read in it, is what our logs say."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+import canprobe
+from canprobe.bus.candump import read_candump
+from canprobe.protocol.timing import best_case_bits, worst_case_bits
+
+pytestmark = pytest.mark.vcan
+ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
+NODES = (5, 16)
+MARKER = 0x7E6
+"""Identifier of the frames by which a test sees that candump listens."""
+SCENES = Path(canprobe.__file__).parent / "scenes"
+Frames = list[tuple[int, bytes]]
+
+
+def tool(name: str) -> str:
+    """Where a tool is; without it the test is skipped, or fails where nothing may be skipped."""
+    path = shutil.which(name)
+    if path is None:
+        package = "tshark" if name == "tshark" else "can-utils"
+        told = f"{name} is NOT INSTALLED, so it bears no witness; type:  apt-get install -y {package}"
+        if os.environ.get("CANPROBE_REQUIRE_VCAN") == "1":
+            pytest.fail(told, pytrace=False)
+        pytest.skip(told)
+    return path
+
+
+class Tool:
+    """A tool that runs beside the test, its output in a file. A context manager: leaving it interrupts the tool."""
+
+    def __init__(self, path: Path, *words: str) -> None:
+        self._path = path
+        with path.open("wb") as file:
+            self._process = subprocess.Popen(words, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
+
+    @property
+    def out(self) -> str:
+        return self._path.read_text()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._process.send_signal(signal.SIGINT)
+        try:
+            self._process.wait(20)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Candump(Tool):
+    """candump in its log format; it listens when the constructor returns."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, tool("candump"), "-L", "-r", "10000000", "vcan0")
+        while f"{MARKER:03X}#" not in self.out:
+            send(f"{MARKER:03X}#")
+            time.sleep(0.1)
+
+    @property
+    def frames(self) -> Frames:
+        return [frame for frame in read_log(self._path) if frame[0] != MARKER]
+
+
+class Load(Tool):
+    """canbusload, one line a second; it counts when the constructor returns."""
+
+    def __init__(self, path: Path, *options: str) -> None:
+        super().__init__(path, tool("stdbuf"), "-oL", tool("canbusload"), *options, "vcan0@1000000")
+        self.wait_lines(1)
+
+    def wait_lines(self, count: int) -> None:
+        """Until it has counted for so many seconds more."""
+        wanted = len(self.rows) + count
+        while len(self.rows) < wanted:
+            time.sleep(0.1)
+
+    @property
+    def rows(self) -> list[tuple[int, ...]]:
+        """Frames, bits and data bits of each second."""
+        found = re.findall(r"vcan0@1000000 +(\d+) +(\d+) +(\d+)", self.out)
+        return [tuple(map(int, row)) for row in found]
+
+    @property
+    def total(self) -> tuple[int, ...]:
+        return tuple(map(sum, zip(*self.rows, strict=True)))
+
+
+def send(frame: str) -> None:
+    """One frame as cansend writes it."""
+    subprocess.run([tool("cansend"), "vcan0", frame], check=True)
+
+
+@pytest.fixture(scope="module")
+def emulator(start_shared: Any) -> Any:
+    """A drive and a sensor from their EDS files, started once."""
+    pairs = ("--eds", "puma260_joint", "--node-id", 5, "--eds", "tactile_array", "--node-id", 16)
+    command = start_shared("emulate", *pairs, "--channel", "vcan0")
+    while not command.err.startswith("serving nodes"):
+        assert command.running, command.err
+        time.sleep(0.1)
+    return command
+
+
+@pytest.fixture
+def served(emulator: Any, bench: Any) -> Iterator[Any]:
+    """The two nodes, their heartbeats off so that the bus is silent."""
+    for node_id in NODES:
+        send(f"{0x600 + node_id:03X}#2B17100000000000")
+        done = 0x580 + node_id, bytes.fromhex("6017100000000000")
+        bench.bus.until(lambda frame, d=done: frame[:2] == d, emulator)
+    bench.bus.hear()
+    yield emulator
+    assert emulator.running, emulator.err
+
+
+def by_id(frames: Frames) -> dict[int, list[bytes]]:
+    found: dict[int, list[bytes]] = {}
+    for can_id, data in frames:
+        found.setdefault(can_id, []).append(data)
+    return found
+
+
+def read_log(path: Path) -> Frames:
+    return [(can_id, data) for _, _, can_id, data in read_candump(path)]
+
+
+# ---------------------------------------------------------------- a bring-up, seen by candump and read by tshark
+
+
+def slow_scene(path: Path) -> Path:
+    """The packaged scene `press` at 100 Hz: a slow machine must not decide what is found here."""
+    text = (SCENES / "press.toml").read_text().replace("[sensor]\n", "[sensor]\nrate_hz = 50\n")
+    path.write_text(f"{text}\n[cycle]\nrate_hz = 100\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def bring_up(start_shared: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Frames, Frames, Path]:
+    """Our log of a bring-up with drives and sensor, candump's of the same, and the path of ours."""
+    folder = tmp_path_factory.mktemp("witness")
+    with Candump(folder / "candump.log") as candump:
+        scene = slow_scene(folder / "press-slow.toml")
+        command = start_shared("run", scene, *ON_VCAN0, "--duration", "0.2", "--out", folder / "results")
+        status = command.wait()
+        assert status == 0, command.err
+    ours = folder / "results" / "bus.log"
+    return read_log(ours), candump.frames, ours
+
+
+def test_candump_saw_every_frame_that_we_logged(bring_up: tuple[Frames, Frames, Path]) -> None:
+    ours, theirs = by_id(bring_up[0]), by_id(bring_up[1])
+    assert len(bring_up[0]) > 1000
+    assert set(ours) == set(theirs)
+    for can_id, frames in ours.items():
+        assert theirs[can_id][: len(frames)] == frames, f"{can_id:03X}"
+        rest = theirs[can_id][len(frames) :]
+        assert all(can_id > 0x700 for _ in rest), f"{can_id:03X}: {len(rest)} frames that only candump saw"
+
+
+FIELDS = (
+    *("can.id", "can.len", "canopen.cob_id", "canopen.function_code", "canopen.node_id"),
+    *("canopen.nmt_ctrl.cd", "canopen.nmt_ctrl.node_id", "canopen.nmt_guard.state", "canopen.sync.counter"),
+    *("canopen.em.err_code", "canopen.em.err_reg", "canopen.em.err_field", "canopen.pdo.data.bytes"),
+    *("canopen.sdo.cmd", "canopen.sdo.main_idx", "canopen.sdo.sub_idx", "canopen.sdo.data.bytes"),
+    *("canopen.sdo.abort_code", "canopen.reserved", "_ws.malformed"),
+)
+LENGTHS = {  # bytes that a field stands for, in the order of the frame
+    "canopen.nmt_ctrl.cd": 1,
+    "canopen.nmt_ctrl.node_id": 1,
+    "canopen.nmt_guard.state": 1,
+    "canopen.sync.counter": 1,
+    "canopen.em.err_code": 2,
+    "canopen.em.err_reg": 1,
+    "canopen.em.err_field": 0,
+    "canopen.pdo.data.bytes": 0,
+    "canopen.sdo.cmd": 1,
+    "canopen.sdo.main_idx": 2,
+    "canopen.sdo.sub_idx": 1,
+    "canopen.sdo.data.bytes": 0,
+    "canopen.sdo.abort_code": 4,
+    "canopen.reserved": 0,
+}
+
+
+def rebuild(row: dict[str, str]) -> bytes:
+    """A frame's data out of what tshark read in it."""
+    data = b""
+    for field, length in LENGTHS.items():
+        if text := row[field]:
+            data += int(text, 0).to_bytes(length, "little") if length else bytes.fromhex(text.replace(",", ""))
+    return data
+
+
+def test_tshark_reads_every_frame_of_the_bring_up_as_we_wrote_it(bring_up: tuple[Frames, Frames, Path]) -> None:
+    ours, _, path = bring_up
+    words = [tool("tshark"), "-r", str(path), "-d", "can.subdissector,canopen", "-T", "fields", "-E", "separator=/t"]
+    done = subprocess.run(
+        [*words, *(word for field in FIELDS for word in ("-e", field))], capture_output=True, text=True, check=True
+    )
+    rows = [dict(zip(FIELDS, line.split("\t"), strict=True)) for line in done.stdout.splitlines()]
+    assert len(rows) == len(ours)
+    kinds: dict[int, int] = {}
+    for row, (can_id, data) in zip(rows, ours, strict=True):
+        assert row["_ws.malformed"] == ""
+        assert (int(row["can.id"]), int(row["can.len"])) == (can_id, len(data))
+        assert (int(row["canopen.function_code"], 0), int(row["canopen.node_id"], 0)) == divmod(can_id, 128)
+        assert rebuild(row) == data, f"{can_id:03X}#{data.hex()} {row}"
+        kinds[can_id >> 7] = kinds.get(can_id >> 7, 0) + 1
+    assert kinds.keys() >= {0, 1, 3, 4, 0xB, 0xC, 0xE}, "NMT, SYNC, PDOs, SDO both ways, heartbeats"
+
+
+# ---------------------------------------------------------------- can-utils against served nodes
+
+
+def test_cansend_asks_and_candump_hears_the_answer(served: Any, bench: Any) -> None:
+    vendor, product = bytes.fromhex("431810015eca0000"), bytes.fromhex("4318100216160000")
+    absent, heartbeat_off = bytes.fromhex("80ff5f0000000206"), bytes.fromhex("4b17100000000000")
+    wanted = {0x585: [vendor, absent, heartbeat_off], 0x590: [product]}
+    heard: Frames = []
+
+    def complete(frame: tuple[int, bytes, int]) -> bool:
+        heard.append(frame[:2])
+        return {can_id: by_id(heard).get(can_id) for can_id in wanted} == wanted
+
+    with Candump(bench.folder / "candump.log") as candump:
+        bench.bus.hear()
+        for request in ("605#4018100100000000", "610#4018100200000000", "605#40FF5F0000000000"):
+            send(request)
+        send("000#0105")
+        send("605#4017100000000000")
+        bench.bus.until(complete, served)
+    assert candump.frames == heard
+    assert 0x185 not in by_id(heard), "TPDO1 of the drive is synchronous, and nobody sends a SYNC"
+
+
+def test_canbusload_counts_the_frames_and_bits_that_we_count(served: Any, bench: Any) -> None:
+    """Bits for the worst stuffing, as canbusload counts unless it is told to leave stuffing out."""
+    with Load(bench.folder / "worst.txt") as worst, Load(bench.folder / "best.txt", "-i") as best:
+        subprocess.run([tool("cangen"), "vcan0", "-g", "5", "-n", "150", "-I", "7E5", "-L", "r", "-D", "r"], check=True)
+        sizes = [len(data) for can_id, data, _ in bench.bus.hear() if can_id == 0x7E5]
+        worst.wait_lines(2)
+        best.wait_lines(1)
+        assert bench.bus.hear() == [], "a silent bus"
+    assert len(sizes) == 150
+    assert worst.total == (150, sum(map(worst_case_bits, sizes)), 8 * sum(sizes))
+    assert best.total == (150, sum(map(best_case_bits, sizes)), 8 * sum(sizes))
+
+
+def test_nodes_survive_what_cangen_throws_at_them(served: Any, bench: Any) -> None:
+    """Random identifiers and lengths, NMT commands and broken SDO requests among them."""
+    words = [tool("cangen"), "vcan0", "-g", "1", "-n", "1500", "-I", "r", "-L", "r", "-D", "r", "-v"]
+    out = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    lines = [line.split()[1].partition("#") for line in out.splitlines()]
+    thrown = [(int(can_id, 16), bytes.fromhex(data.replace(".", ""))) for can_id, _, data in lines]
+    assert len(thrown) == 1500
+    heard = by_id([frame[:2] for frame in bench.bus.hear()])
+    for can_id, datas in by_id(thrown).items():
+        left = iter(heard[can_id])
+        assert all(data in left for data in datas), f"{can_id:03X}: in this order in what we heard"
+    for node_id in NODES:
+        send(f"000#81{node_id:02X}")
+        bench.bus.until(lambda frame, n=node_id: frame[:2] == (0x700 + n, b"\0"), served)
+        send(f"{0x600 + node_id:03X}#4018100100000000")
+        answer = 0x580 + node_id, bytes.fromhex("431810015eca0000")
+        bench.bus.until(lambda frame, a=answer: frame[:2] == a, served)
