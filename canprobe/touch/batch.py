@@ -13,13 +13,15 @@ from canprobe.touch._arrays import Array, checked
 from canprobe.touch.anchor import anchor, solution
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.noise import Noise
+from canprobe.touch.noise import Correlation, Noise
 from canprobe.touch.nonlinear import fit
 from canprobe.touch.prior import Prior, path_extent
 from canprobe.touch.quadric import design
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
+
+_MEAN_OF = 8
 
 
 class Touches(NamedTuple):
@@ -30,6 +32,7 @@ class Touches(NamedTuple):
         noise: of the n samples.
         extent: length of the path (`path_extent`), m.
         distance: length along the path, m.
+        correlation: of the noise along the path; None for independent samples.
     """
 
     points: Array
@@ -37,14 +40,28 @@ class Touches(NamedTuple):
     noise: Noise
     extent: float
     distance: float
+    correlation: Correlation | None = None
+
+    def whitener(self) -> Array | None:
+        """(3, n, n) that makes the whitened samples independent; None where they are."""
+        if self.correlation is None:
+            return None
+        return self.correlation.whitener(np.linspace(0.0, self.distance, len(self.points)))
 
 
-def make_touches(points: Array, normals: Array, noise: Noise) -> Touches:
+def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
     """Extent and length of arrays that are already checked."""
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
-    steps = np.diff(points, axis=0)
-    distance = float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
-    return Touches(points, normals, noise, path_extent(points, floor), distance)
+    return Touches(points, normals, noise, path_extent(points, floor), travelled(points), correlation)
+
+
+def travelled(points: Array) -> float:
+    """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
+    each = min(_MEAN_OF, max(1, len(points) // 20))
+    means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
+    steps = np.diff(means, axis=0)
+    share = (len(points) - 1) / max(len(points) - each, 1)  # the ends that the means cut off
+    return share * float(np.sqrt(np.einsum("ij,ij->i", steps, steps)).sum())
 
 
 def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
@@ -84,7 +101,7 @@ def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
     T = working_frame(touches)
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
-    result = fit(d, stated.rows(length))
+    result = fit(d, stated.rows(length), touches.whitener())
     a = anchor(result.c, T, np.zeros(3), length)
     singular = np.linalg.svd(result.root, compute_uv=False)
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from canprobe.touch._arrays import Array, upper_root
 from canprobe.touch.batch import checked_arrays, make_touches
-from canprobe.touch.noise import make_noise
+from canprobe.touch.noise import Correlation, make_noise, mixed
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import UNIT, curvature_jacobian, design, parameters_of, rows
 from canprobe.touch.rank import decide
@@ -24,6 +24,7 @@ def cramer_rao(
     sigma_point: ArrayLike,
     sigma_normal: ArrayLike,
     prior: Prior | None = None,
+    correlation: Correlation | None = None,
 ) -> Array:
     """Least covariance that an unbiased estimate of local curvature can have.
 
@@ -36,6 +37,7 @@ def cramer_rao(
         S: (4, 4) the true surface in the frame of the points.
         sigma_point, sigma_normal: noise as for `fit_surface`.
         prior: the same prior as the estimator's; None for the same default.
+        correlation: of the noise along the path; None for independent samples.
 
     Returns:
         (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,
@@ -47,7 +49,7 @@ def cramer_rao(
     Source: Kay, "Fundamentals of statistical signal processing: estimation theory", ch. 3.
     """
     p, n = checked_arrays(points, normals, 1)
-    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal))
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal), correlation)
     surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(np.asarray(S, dtype=np.float64))
     origin = surface.project(p[-1])
     T = surface.contact_frame(origin)
@@ -56,7 +58,9 @@ def cramer_rao(
     in_contact[:3, :3] *= length
     c = parameters_of(in_contact)
     d = design((p - origin) @ R / length, n @ R, touches.noise.scaled(length, R))
-    J = rows(c, d).J.reshape(-1, 9)
+    J = rows(c, d).J
+    independent = touches.whitener()
+    J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
     stated = Prior.weak(length) if prior is None else prior
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)

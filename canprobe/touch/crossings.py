@@ -15,7 +15,7 @@ Which σ: the patches' covariances rest on the σ's that the estimator was *told
 independent, and on its prior; they are not rescaled by the innovation. On independent noise of the stated size `ml`
 gives uniform p-values where c13, c23, c33 are what the prior expects; a surface on which they vanish (plane, saddle at
 its middle) is granted more spread than it has (χ² per degree of freedom 0.85), and so is all that the filter with
-forgetting says (0.75). Generous σ's (innovation well below 1) make p-values crowd towards 1. Errors that are correlated
+forgetting says (0.83). Generous σ's (innovation well below 1) make p-values crowd towards 1. Errors that are correlated
 along a pass do the opposite: hysteresis of the pad lags behind the motion, so that passes in different directions
 differ by more than white noise says; creep and indentation shift whole passes. A small p is therefore no proof of two
 surfaces, but of a difference that the stated noise does not explain; `Crossing.angle` tells which passes ran alike.

@@ -16,7 +16,7 @@ from canprobe.touch.differences import chord_pairs, lag_pairs, solve_pairs
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.estimators import unknown_method
 from canprobe.touch.estimators.recursive import RecursiveEstimator
-from canprobe.touch.noise import make_noise
+from canprobe.touch.noise import Correlation, make_noise
 from canprobe.touch.prior import Prior
 
 
@@ -29,6 +29,7 @@ def fit_surface(
     method: str = "ml",
     prior: Prior | None = None,
     lag: int = 10,
+    correlation: Correlation | None = None,
 ) -> SurfaceEstimate:
     """Local shape at the last of a series of contact points.
 
@@ -44,6 +45,8 @@ def fit_surface(
             points and normals `lag` apart, (16) with the object at rest.
         prior: for "ml" and "recursive"; None for `Prior.weak` over the path, nothing on curvature itself.
         lag: for "chen1996".
+        correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
+            covariance grows by it; None for independent samples.
 
     Returns:
         The estimate; what the points did not observe is marked, not guessed.
@@ -62,11 +65,13 @@ def fit_surface(
         [20.0, 20.0]
     """
     p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
-    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal))
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal), correlation)
     if method == "ml":
         return fit_ml(touches, prior)
     if method == "recursive":
         return _run_filter(touches, prior)
+    if correlation is not None:
+        raise UsageError(f"correlation: expected none for {method!r}, which has no noise model, got {correlation}")
     if method == "chord":
         return solve_pairs(touches, chord_pairs(touches), "chord")
     if method == "chen1996":
@@ -85,6 +90,7 @@ def _run_filter(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
         memory_m=memory,
         window=len(point),
         prior=prior,
+        correlation=touches.correlation,
     )
     for sample in _samples(touches, point, normal):
         estimator.add(sample)

@@ -8,7 +8,55 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, positive
+
+
+@dataclass(frozen=True, slots=True)
+class Correlation:
+    """Noise that is alike from sample to sample: hysteresis, aliasing of a moving centroid, an arm that bends.
+
+    Between samples a path of s apart the noise of points and normals, whitened to unit variance, has the correlation
+    `share · exp(−s / length)`; the rest of the variance, 1 − share, is independent (a first-order autoregression over
+    the path plus white noise). Where the contact comes back to the same place its error is taken for a new one.
+
+    Attributes:
+        length: correlation length, m (the unit of the points).
+        share: of the variance, 0 to 1.
+        point_share: that of the points along the normal, where it is another than that of the normals.
+    """
+
+    length: float
+    share: float = 1.0
+    point_share: float | None = None
+
+    def __post_init__(self) -> None:
+        positive("correlation.length", self.length)
+        for name, share in (("share", self.share), ("point_share", self.shares[0])):
+            if not 0.0 <= share <= 1.0:
+                raise UsageError(f"correlation.{name}: expected a number from 0 to 1, got {share}")
+
+    @property
+    def shares(self) -> Array:
+        """(3,) of a sample's three rows: height, and the two parts of the normal."""
+        return np.array([self.share if self.point_share is None else self.point_share, self.share, self.share])
+
+    def matrix(self, path: Array) -> Array:
+        """Correlations (3, n, n) of the rows of samples at places (n,) along the path, m."""
+        R: Array = self.shares[:, None, None] * np.exp(-np.abs(path[:, None] - path) / self.length)
+        here = np.arange(len(path))
+        R[:, here, here] = 1.0
+        return R
+
+    def whitener(self, path: Array) -> Array:
+        """(3, n, n): inverse lower Cholesky factors of `matrix`; samples at one place are told apart by 1e-9."""
+        R = self.matrix(path) + 1e-9 * np.eye(len(path))
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(R)), dtype=np.float64)
+
+
+def mixed(matrices: Array, rows: Array) -> Array:
+    """Rows (n, 3, k) mixed among the samples by the matrices (3, n, n) of their kinds."""
+    result: Array = (matrices @ rows.transpose(1, 0, 2)).transpose(1, 0, 2)
+    return result
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch._arrays import Array, solved, upper_root
+from canprobe.touch.noise import mixed
 from canprobe.touch.quadric import UNIT, Design, linear_rows, rows
 from canprobe.touch.rank import Decision, decide, spread_of
 
@@ -20,6 +21,8 @@ _MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
 _START_ROUNDS = 8
+_PINNED = 10.0
+"""How much narrower the linear start takes the prior on c13, c23, c33."""
 _GROSS = 60.0
 """Squared residual over its scale, of some sample, at which the linear start is made robust."""
 
@@ -44,12 +47,13 @@ class Fit(NamedTuple):
     converged: bool
 
 
-def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
+def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None) -> Fit:
     """Fit the model to a design.
 
     Args:
         d: constant parts (`quadric.design`).
         prior: rows (6, 9) and right-hand side (6,) (`Prior.rows`).
+        independent: (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
     """
     spread = spread_of(d.X, d.point_variance)
     c, root, decision = _start(d, prior, spread)
@@ -59,31 +63,42 @@ def fit(d: Design, prior: tuple[Array, Array]) -> Fit:
         r, J, log_det = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
         weight, cost = robust(square)
-        cost += log_det  # without it a large K, which explains any residual by noise of the points, would look good
+        w = np.sqrt(weight)[:, None]
+        rw, Jw = r * w, J * w[:, :, None]
+        if independent is not None:
+            beyond = cost - float(weight @ square)
+            rw, Jw = mixed(independent, rw[:, :, None])[:, :, 0], mixed(independent, Jw)
+            cost = float(np.sum(rw * rw)) + beyond
+        # without log_det a large K, which explains any residual by noise of the points, would look good; without the
+        # prior's part a large c33 on a short path, which flattens f/|∇f|, would
+        assumed = prior[0] @ c - prior[1]
+        cost += log_det + float(assumed @ assumed)
         if cost > best_cost + 1e-3 * len(square) and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
             continue
         best, best_cost, halvings = c, cost, 0
-        w = np.sqrt(weight)[:, None]
-        rw, Jw = (r * w).reshape(-1), (J * w[:, :, None]).reshape(-1, 9)
-        target, root, decision = _solve(Jw, Jw @ c - rw, prior, spread, _size(c), known=decision)
+        chi2, rows_of_r, rows_of_J = float(np.sum(rw * rw)), rw.reshape(-1), Jw.reshape(-1, 9)
+        target, root, decision = _solve(rows_of_J, rows_of_J @ c - rows_of_r, prior, spread, _size(c), known=decision)
         step = target - best
         c = target
         if np.abs(step).max() < _TOLERANCE:
-            final = _solve(Jw, Jw @ best - rw, prior, spread, _size(c))
+            final = _solve(rows_of_J, rows_of_J @ best - rows_of_r, prior, spread, _size(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
                 converged = True
                 break
             decision = final[2]
+    c = c if converged else best
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
-    return Fit(c, root, decision, float(weight @ square) / freedom, int(np.sum(weight < 1.0)), converged)
+    return Fit(c, root, decision, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
 
 
 def _start(d: Design, prior: tuple[Array, Array], spread: Array) -> tuple[Array, Array, Decision]:
     """The linear solution; where some samples are far off, again with weights that fall with the square."""
     A, b = linear_rows(d)
+    # the points' noise in z² and its kin would draw c13, c23, c33 far off, from where there is no way back
+    prior = np.concatenate([_PINNED * prior[0][:3], prior[0][3:]]), prior[1]
     answer = _solve(A, b, prior, spread, 0.0)
     for _ in range(_START_ROUNDS):
         square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)

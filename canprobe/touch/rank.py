@@ -59,17 +59,24 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
         curvature: ‖K‖, dimensionless.
     """
     small, large, axes = _axes(spread)
+    if small >= SPREAD:  # spread for everything, the usual case
+        values, vectors = np.linalg.eigh(root_q.T @ root_q)
+        return Decision(np.maximum(values, 0.0), vectors, values >= _least(curvature, float(values[-1])))
     wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
     seen = axes[:, wide]
     root = root_q @ seen
     values, turn = np.linalg.eigh(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
-    least = max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * float(values.max(initial=0.0)))
+    least = _least(curvature, float(values.max(initial=0.0)))
     unseen = int(np.count_nonzero(~wide))
     return Decision(
         np.concatenate([np.zeros(unseen), values]),
         np.concatenate([axes[:, ~wide], seen @ turn], axis=1),
         np.concatenate([np.zeros(unseen, dtype=bool), values >= least]),
     )
+
+
+def _least(curvature: float, largest: float) -> float:
+    return max(1.0 / (SIGMA_LIMIT * max(curvature, 1.0)) ** 2, NUMERIC * largest)
 
 
 def _axes(spread: Array) -> tuple[float, float, Array]:

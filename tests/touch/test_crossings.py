@@ -52,7 +52,7 @@ def test_p_values_of_one_surface_are_uniform(truth, name):
 
 
 def test_the_filter_is_on_the_safe_side(truth):
-    """Forgetting weighs samples down: stated covariances are above the true ones, p-values above uniform."""
+    """Its stated covariances are somewhat above the true ones, p-values above uniform."""
     surface = truth.surface("cylinder")
     found = crossed(woven(truth, surface, 0.3), woven(truth, surface, 2.0, (1e-3, -0.5e-3)), range(14), "recursive")
     chi2_per_dof = np.mean([crossing.joint.chi2 for crossing in found]) / 6

@@ -6,6 +6,7 @@ import difflib
 
 from canprobe.errors import UsageError
 from canprobe.touch.estimators.base import Dropped, Estimator
+from canprobe.touch.noise import Correlation
 from canprobe.touch.prior import Prior
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
@@ -23,6 +24,7 @@ def make_estimator(
     window: int = 160,
     prior: Prior | None = None,
     lag: int = 10,
+    correlation: Correlation | None = None,
 ) -> Estimator:
     """An online estimator.
 
@@ -35,6 +37,7 @@ def make_estimator(
         memory_m: path that `recursive` remembers (e-folding), m.
         window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
         prior: of `ml` and `recursive`; None for the weak default.
+        correlation: of the noise along the path, `recursive` only; the deviations are then those of one sample.
         lag: samples between the two of a difference, `chen1996` only.
 
     Raises:
@@ -46,7 +49,12 @@ def make_estimator(
         from canprobe.touch.estimators.recursive import RecursiveEstimator
 
         return RecursiveEstimator(
-            sigma_point=sigma_point, sigma_normal=sigma_normal, memory_m=memory_m, window=window, prior=prior
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            memory_m=memory_m,
+            window=window,
+            prior=prior,
+            correlation=correlation,
         )
     if method == "ml":
         from canprobe.touch.estimators.ml import MlEstimator

@@ -82,9 +82,11 @@ class Gate:
 
     def passes(self, sample: ContactSample, dropped: Dropped) -> bool:
         """Whether to use a sample; counts it where not."""
-        p, n, t = sample.p_base, sample.n_base, sample.t_s
-        square = float(n @ n)
-        if not math.isfinite(float(p @ p) + square + t):
+        t = sample.t_s
+        x, y, z = sample.p_base.tolist()
+        nx, ny, nz = sample.n_base.tolist()
+        square = nx * nx + ny * ny + nz * nz
+        if not math.isfinite(x * x + y * y + z * z + square + t):
             dropped.not_finite += 1
         elif abs(square - 1.0) > 1e-6:
             dropped.not_unit += 1

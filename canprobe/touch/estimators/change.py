@@ -7,8 +7,6 @@ measured by what it usually is, since stated standard deviations are often gener
 
 from __future__ import annotations
 
-import numpy as np
-
 from canprobe.touch._arrays import Array
 from canprobe.touch.nonlinear import CHI2_999
 
@@ -32,29 +30,37 @@ class ChangeTest:
 
     def __init__(self) -> None:
         self.alarms = 0
-        self._running = np.array([1.0, BETTER_HALF])
-        self._usual = self._running.copy()
+        self._running = self._usual = (1.0, BETTER_HALF)
 
     @property
     def innovation(self) -> float:
         """Mean squared whitened innovation per degree of freedom over the last samples; about 1."""
-        return float(self._running[0])
+        return self._running[0]
 
     @property
     def usual(self) -> float:
         """The same in the long term, within `USUAL`."""
-        return min(max(float(self._usual[0]), USUAL[0]), USUAL[1])
+        return _bounded(self._usual[0])
 
     def take(self, d2: Array) -> bool:
         """Take the squared innovations (n,) of a step, χ² of 3 each; whether they say that the surface has changed."""
         n = len(d2)
-        capped = np.sort(np.minimum(d2, CHI2_999)) / 3.0
-        now = np.array([capped.mean(), capped[: (n + 1) // 2].mean()])
-        self._running = self._running + min(1.0, RUNNING * n) * (now - self._running)
-        limits = ALARM * np.clip(self._usual, *np.outer(USUAL, (1.0, BETTER_HALF)))
-        if not (self._running >= limits).all():
-            self._usual = self._usual + min(1.0, LONG_TERM * n) * (now - self._usual)
+        capped = sorted([min(d, CHI2_999) / 3.0 for d in d2.tolist()])
+        half = (n + 1) // 2
+        now = sum(capped) / n, sum(capped[:half]) / half
+        self._running = _moved(self._running, now, min(1.0, RUNNING * n))
+        better = BETTER_HALF * _bounded(self._usual[1] / BETTER_HALF)
+        if self._running[0] < ALARM * self.usual or self._running[1] < ALARM * better:
+            self._usual = _moved(self._usual, now, min(1.0, LONG_TERM * n))
             return False
-        self._running = self._usual.copy()
+        self._running = self._usual
         self.alarms += 1
         return True
+
+
+def _bounded(usual: float) -> float:
+    return min(max(usual, USUAL[0]), USUAL[1])
+
+
+def _moved(old: tuple[float, float], now: tuple[float, float], share: float) -> tuple[float, float]:
+    return old[0] + share * (now[0] - old[0]), old[1] + share * (now[1] - old[1])

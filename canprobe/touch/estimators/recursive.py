@@ -3,7 +3,7 @@
 Constant work per sample whatever the memory. Samples are collected until the contact has moved on by a step, then
 taken in together: one QR of the forgotten root, the new whitened rows and what the prior has lost. Forgetting is per
 millimetre travelled, never per second; a contact that does not move adds nothing and forgets nothing. The information
-is carried along from contact frame to contact frame by `S' = Tᵀ S T`.
+is carried along from contact frame to contact frame by `S' = Tᵀ S T`. The covariance is the sandwich of `score`.
 """
 
 from __future__ import annotations
@@ -15,20 +15,21 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, positive, solved, upper_root
-from canprobe.touch.anchor import anchor, foot, solution
+from canprobe.touch._arrays import Array, inverted, positive, solved, upper_root
+from canprobe.touch.anchor import Anchor, anchor, foot
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.change import ChangeTest
+from canprobe.touch.estimators.score import Score
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation, transported_rotation
-from canprobe.touch.noise import Noise
-from canprobe.touch.nonlinear import CHI2_999, fit
+from canprobe.touch.noise import Correlation, Noise
+from canprobe.touch.nonlinear import CHI2_999, fit, robust
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric import UNIT, Design, design, transport
+from canprobe.touch.quadric import UNIT, Design, curvature_jacobian, design, rows, transport
 from canprobe.touch.quadric_row import sample_rows
-from canprobe.touch.rank import SPREAD, decide, spread_of
+from canprobe.touch.rank import SPREAD, Decision, decide, spread_of
 
 DIFFUSE = 1e-2
 """Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
@@ -62,6 +63,8 @@ class RecursiveEstimator:
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
+            is what such an answer has under correlated noise.
     """
 
     def __init__(
@@ -72,6 +75,7 @@ class RecursiveEstimator:
         memory_m: float = 0.02,
         window: int = 160,
         prior: Prior | None = None,
+        correlation: Correlation | None = None,
     ) -> None:
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
@@ -81,6 +85,7 @@ class RecursiveEstimator:
         if math.isfinite(self._prior.sigma_curvature):
             raise UsageError("prior: expected none on curvature itself for 'recursive', got " + self._prior.name)
         self._prior_rows = self._make_prior_rows()
+        self._score = Score(self._prior_rows.T @ self._prior_rows, correlation)
         self.reset()
 
     def reset(self) -> None:
@@ -103,9 +108,9 @@ class RecursiveEstimator:
         self._last = sample
         moved = self._travel.add(sample.p_base)
         if moved > 0.0:
-            self._absorb(moved)
+            crowd = self._absorb(moved)
             if self._next_start < math.inf:
-                self._start_up()
+                self._start_up(1.0 / math.sqrt(crowd))
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
@@ -118,14 +123,13 @@ class RecursiveEstimator:
         # what only the linear start says is not called observed
         spread = tangent.T @ self._spread.covariance @ tangent * (float(self._settled) / self._gate.sigma_point**2)
         size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
-        root = upper_root(solved(a.M.T, self._root.T).T)
-        decision = decide(root[6:, 6:] * UNIT, spread, size)
+        q = a.M[6:] @ self._inverse / UNIT[:, None]
+        decision = decide(inverted(upper_root(q.T)).T, spread, size)
         known = decision.vectors[:, decision.passed]
         a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-        here = a._replace(M=np.eye(9), turn=0.0)
         singular = np.linalg.svd(self._root, compute_uv=False)
         return build_estimate(
-            solution(here, root, decision, has_prior=False),
+            self._solution(a, decision),
             length=L,
             T_frame_contact=a.T_frame_contact,
             condition_number=float(singular[0] / singular[-1]),
@@ -137,6 +141,15 @@ class RecursiveEstimator:
             notes=self._notes(),
         )
 
+    def _solution(self, a: Anchor, decision: Decision) -> Solution:
+        root = solved(a.M.T, self._root.T).T
+        if decision.rank < 3:
+            return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
+        noise = self._inverse.T @ self._score.matrix @ self._inverse
+        D = curvature_jacobian(a.c) @ a.M @ self._inverse
+        sandwich = solved(np.asarray(np.linalg.cholesky(noise), dtype=np.float64), root)
+        return Solution(a.c, D @ noise @ D.T, decision, has_prior=False, root=sandwich)
+
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
         notes = (f"the surface changed {changes} times: memory shortened",) if changes else ()
@@ -144,26 +157,31 @@ class RecursiveEstimator:
 
     def _make_prior_rows(self) -> Array:
         A, _ = self._prior.rows(self._memory)
-        rows = DIFFUSE * np.eye(9)
-        rows[3:6] = A[:3]
-        return rows
+        own = DIFFUSE * np.eye(9)
+        own[3:6] = A[:3]
+        return own
 
     def _begin(self, sample: _Pending) -> None:
         """Start from nothing at a sample."""
         self._T = homogeneous(tangent_rotation(-sample.normal), sample.point)
         self._c = np.zeros(9)
-        self._root = self._prior_rows.copy()
+        self._set_root(self._prior_rows)
+        self._score.reset()
         self._start: list[_Pending] = []
         self._started = self._travel.total
         self._next_start = START[0] * self._memory
         self._settled = False
 
-    def _absorb(self, moved: float) -> None:
+    def _set_root(self, root: Array) -> None:
+        self._root, self._inverse = root, inverted(root)
+
+    def _absorb(self, moved: float) -> float:
+        """Take in what is pending; the weight of each sample where they are crowded, else 1."""
         kept = math.exp(-moved / self._memory)
         block = self._rows_of_pending()
         weight = np.ones(len(self._pending))
         if self._settled:
-            d2 = _innovations(block, math.sqrt(kept) * self._root)
+            d2 = _innovations(block, self._inverse * (1.0 / math.sqrt(kept)))
             weight = CHI2_999 / np.maximum(d2, CHI2_999)  # falls with the square: the further off, the less it pulls
             if self._change.take(d2):
                 self._drop_agreeing(d2)
@@ -173,9 +191,10 @@ class RecursiveEstimator:
         self._doubtful = math.exp(-moved / self._memory) * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)
         self._spread.add(np.array([s.point for s in self._pending]), crowd * weight)
-        self._update(kept, block * np.sqrt(crowd * weight).repeat(3)[:, None])
+        self._update(kept, block * np.sqrt(crowd * weight).repeat(3)[:, None], moved)
+        return crowd
 
-    def _update(self, kept: float, block: Array) -> None:
+    def _update(self, kept: float, block: Array, moved: float) -> None:
         """One QR of the forgotten root, what the prior has lost, and new rows (m, 10)."""
         lost = math.sqrt(1.0 - kept) * self._prior_rows
         stacked = np.empty((18 + len(block), 10))
@@ -183,8 +202,9 @@ class RecursiveEstimator:
         stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self._c)
         stacked[18:] = block
         full = upper_root(stacked)
-        self._root = full[:9, :9]
-        self._c = self._c + solved(self._root, full[:9, 9])
+        self._set_root(full[:9, :9])
+        self._c = self._c + self._inverse @ full[:9, 9]
+        self._score.take(block[:, :9], moved, kept)
         if self._settled:
             self._move_frame()
 
@@ -194,9 +214,11 @@ class RecursiveEstimator:
         for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
             self._pending.popleft()
 
-    def _start_up(self) -> None:
+    def _start_up(self, wider: float) -> None:
         """Solve the first samples again as a batch: until then the filter is linear, as if |∇f| were 1 everywhere."""
-        self._start += self._pending
+        self._start += [
+            s._replace(sigma_point=wider * s.sigma_point, sigma_normal=wider * s.sigma_normal) for s in self._pending
+        ]
         if len(self._start) > START_SAMPLES:
             self._start = self._start[::2]
         travelled = self._travel.total - self._started
@@ -211,7 +233,8 @@ class RecursiveEstimator:
         fitted = fit(d, self._prior.rows(self._memory))
         if fitted.converged and (last or fitted.decision.rank == 3):
             self._T, self._c = T, fitted.c
-            self._root = upper_root(np.concatenate([fitted.root, DIFFUSE * np.eye(9)]))
+            self._set_root(upper_root(np.concatenate([fitted.root, DIFFUSE * np.eye(9)])))
+            self._score.start(self._root, _weighted_rows(fitted.c, d), travelled)
             self._settled = True
         if last:
             self._next_start, self._start, self._settled = math.inf, [], True
@@ -229,10 +252,10 @@ class RecursiveEstimator:
         c = self._c.tolist() if self._settled else [0.0] * 9
         normals = np.array([s.normal for s in self._pending]) @ R
         x = (np.array([s.point for s in self._pending]) - origin) @ (R / L)
-        rows: list[list[float]] = []
+        equations: list[list[float]] = []
         for s, xi, ni in zip(self._pending, x.tolist(), normals.tolist(), strict=True):
-            rows += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
-        block = np.array(rows)
+            equations += sample_rows(c, xi, ni, (s.sigma_point / L) ** 2, s.sigma_normal**2)
+        block = np.array(equations)
         if not self._settled:
             block[:, 9] -= block[:, :9] @ self._c
         return block
@@ -247,13 +270,23 @@ class RecursiveEstimator:
         turned = transported_rotation(np.eye(3), z)
         self._c, M = transport(self._c, homogeneous(turned, x))
         self._c[:3] = 0.0
-        self._root = solved(M.T, self._root.T).T
+        back = inverted(M)
+        self._root, self._inverse = self._root @ back, M @ self._inverse
+        self._score.carry(back)
         self._T = homogeneous(R @ turned, origin + R @ (L * x))
 
 
-def _innovations(block: Array, root: Array) -> Array:
-    """Squared innovations (n,), χ² of 3 each, of whitened rows (3n, 10) under a root of information."""
-    predicted = solved(root.T, block[:, :9].T)
-    square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->j", predicted, predicted))
+def _weighted_rows(c: Array, d: Design) -> Array:
+    """(n, 3, 9): whitened rows of a batch solution, weighted as it did."""
+    r, J, _ = rows(c, d)
+    weight, _ = robust(np.einsum("ij,ij->i", r, r))
+    result: Array = J * np.sqrt(weight)[:, None, None]
+    return result
+
+
+def _innovations(block: Array, inverse: Array) -> Array:
+    """Squared innovations (n,), χ² of 3 each, of whitened rows (3n, 10) under an inverse root of information."""
+    predicted = block[:, :9] @ inverse
+    square = block[:, 9] ** 2 / (1.0 + np.einsum("ij,ij->i", predicted, predicted))
     result: Array = square.reshape(-1, 3).sum(axis=1)
     return result

@@ -55,34 +55,33 @@ class Travel:
 
 
 class Spread:
-    """Weighted covariance of points, with forgetting.
-
-    Attributes:
-        weight: sum of weights.
-    """
+    """Weighted covariance of points, with forgetting: second moments about the first point."""
 
     def __init__(self) -> None:
-        self.weight = 0.0
-        self._mean = np.zeros(3)
-        self._sum = np.zeros((3, 3))
+        self._origin: Array | None = None
+        self._moments = np.zeros((4, 4))
+
+    @property
+    def weight(self) -> float:
+        """Sum of weights."""
+        return float(self._moments[3, 3])
 
     @property
     def covariance(self) -> Array:
         """(3, 3), m²."""
-        return self._sum / max(self.weight, 1e-300)
+        M = self._moments / max(self.weight, 1e-300)
+        mean = M[:3, 3]
+        result: Array = M[:3, :3] - mean[:, None] * mean
+        return result
 
     def fade(self, kept: float) -> None:
         """Weigh everything so far by a factor."""
-        self.weight *= kept
-        self._sum = self._sum * kept
+        self._moments *= kept
 
     def add(self, points: Array, weights: Array) -> None:
         """Take points (n, 3) with weights (n,)."""
-        added = float(weights.sum())
-        mean = weights @ points / added
-        inner = points - mean
-        offset = mean - self._mean
-        total = self.weight + added
-        self._sum = self._sum + (inner.T * weights) @ inner + np.outer(offset, offset) * (self.weight * added / total)
-        self._mean = self._mean + offset * (added / total)
-        self.weight = total
+        if self._origin is None:
+            self._origin = points[0].copy()
+        X = np.ones((len(points), 4))
+        X[:, :3] = points - self._origin
+        self._moments += (X.T * weights) @ X

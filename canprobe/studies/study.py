@@ -1,0 +1,76 @@
+"""What a study is: a table with its facts and findings, and a picture. `canprobe study` runs and writes them."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from canprobe.errors import UsageError
+
+Say = Callable[[str], None]
+Row = Mapping[str, Any]
+
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {
+        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
+        "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
+    }
+)
+"""Name → what it shows. The module of that name in this package has `run(quick, say) -> StudyResult`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a study's table.
+
+    Attributes:
+        key: of the rows, and the heading in the CSV; ends in the unit.
+        heading: in the printed table.
+        form: how a value is printed, as for `format`.
+    """
+
+    key: str
+    heading: str
+    form: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyResult:
+    """What a study found.
+
+    Attributes:
+        name: of the study.
+        columns: of the table.
+        rows: one a case; None where a value does not apply.
+        findings: plain sentences with figures, right or wrong ones.
+        facts: what it was measured with.
+        draw: writes the picture to a path; needs matplotlib.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    findings: Sequence[str]
+    facts: Mapping[str, Any]
+    draw: Callable[[Path], None]
+
+
+def run_study(name: str, *, quick: bool, say: Say) -> StudyResult:
+    """Run a study.
+
+    Args:
+        name: one of `STUDIES`.
+        quick: fewer repeats and cases.
+        say: called with each step.
+
+    Raises:
+        UsageError: for an unknown name.
+    """
+    if name not in STUDIES:
+        raise UsageError(f"study: expected one of {', '.join(STUDIES)}, got {name!r}")
+    result: StudyResult = importlib.import_module(f"canprobe.studies.{name}").run(quick=quick, say=say)
+    return result

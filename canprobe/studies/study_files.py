@@ -1,0 +1,121 @@
+"""A study's result as text, CSV, JSON and picture, and the facts that go with every measurement."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import canprobe
+from canprobe.studies.study import StudyResult
+
+
+def measuring_facts(quick: bool, seeds: int) -> dict[str, Any]:
+    """Machine, versions and settings of a study."""
+    return {
+        "canprobe": canprobe.__version__,
+        "commit": _commit(),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "machine": _processor(),
+        "quick": quick,
+        "seeds": seeds,
+    }
+
+
+def table_lines(result: StudyResult) -> list[str]:
+    """The table, one line a row, numbers flush right."""
+    cells = [[c.heading for c in result.columns]]
+    cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
+    return [
+        "  ".join(
+            t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)
+        ).rstrip()
+        for line in cells
+    ]
+
+
+def text_of(result: StudyResult) -> str:
+    """Facts, table and findings."""
+    facts = ", ".join(f"{name} {value}" for name, value in result.facts.items() if value is not None)
+    return "\n".join([f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""])
+
+
+def as_document(result: StudyResult) -> dict[str, Any]:
+    """For `--json`: no NaN, what does not apply is null."""
+    return {
+        "study": result.name,
+        "facts": dict(result.facts),
+        "findings": list(result.findings),
+        "rows": [{key: _plain(value) for key, value in row.items()} for row in result.rows],
+    }
+
+
+def write_study(result: StudyResult, out: Path) -> list[Path]:
+    """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
+
+    Returns:
+        The files, the picture last where there is one.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    with paths[0].open("w", newline="", encoding="utf-8") as file:
+        _write_csv(csv.writer(file), result)
+    paths[1].write_text(text_of(result), encoding="utf-8")
+    document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
+    paths[2].write_text(document + "\n", encoding="utf-8")
+    if importlib.util.find_spec("matplotlib") is not None:
+        paths.append(out / f"{result.name}.png")
+        result.draw(paths[-1])
+    return paths
+
+
+def _write_csv(writer: Any, result: StudyResult) -> None:
+    keys: Sequence[str] = list(dict.fromkeys(key for row in result.rows for key in row))
+    writer.writerow(keys)
+    for row in result.rows:
+        writer.writerow(["" if (v := _plain(row.get(key))) is None else v for key in keys])
+
+
+def _shown(value: Any, form: str) -> str:
+    value = _plain(value)
+    if value is None:
+        return "–"
+    return "yes" if value is True else "no" if value is False else format(value, form)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _commit() -> str | None:
+    where = Path(canprobe.__file__).parent
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(where), "describe", "--always", "--dirty"],
+            capture_output=True, text=True, check=False, timeout=5.0,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

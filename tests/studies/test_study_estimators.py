@@ -1,0 +1,106 @@
+"""Study `estimators`, and `canprobe study` round it."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from canprobe.cli import main
+from canprobe.studies import estimators
+from canprobe.studies.estimators import GROUNDS, NOISES, Setting, findings, measure_costs, measure_errors, on_the_move
+from canprobe.studies.study import STUDIES, Column, StudyResult
+from canprobe.studies.study_files import as_document, table_lines, write_study
+
+FEW = [Setting("chen1996", 160, 10), Setting("ml", 160), Setting("recursive", 160)]
+
+
+@pytest.fixture
+def few(monkeypatch):
+    monkeypatch.setattr(estimators, "settings", lambda: list(FEW))
+
+
+def test_errors_and_costs_of_every_setting(few):
+    ground = on_the_move(*GROUNDS[0])
+    errors = measure_errors(ground, NOISES[1], 3)
+    assert set(errors) == set(FEW)
+    size = np.linalg.norm(ground.K)
+    worst = {s.method: max(np.linalg.norm(e) for e in found) / size for s, found in errors.items()}
+    assert worst["recursive"] < 0.03
+    assert worst["ml"] < 0.05
+    costs = measure_costs(ground, NOISES[1], 2)
+    assert all(add.shape == answer.shape == (2,) and (answer > 0).all() for add, answer in costs.values())
+
+
+def test_ratios_are_to_the_paper_in_the_same_run():
+    shared = {"surface": GROUNDS[0][0], "error_percent": 1.0, "answer_us": 100.0}
+    rows = [
+        shared | {"method": s.method, "window_samples": s.window, "lag_samples": s.lag, "sample_us": cost,
+                  "sigma_point_um": noise[0] * 1e6}
+        for noise in NOISES
+        for s, cost in zip(FEW, (50.0, 25.0, 5.0), strict=True)
+    ]  # fmt: skip
+    said = findings(rows)
+    assert [r["ratio_to_chen1996"] for r in rows[:3]] == [1.0, 0.5, 0.1]
+    assert any("1/20 of an answer of ml" in line for line in said)
+
+
+def result(draw=lambda path: path.write_bytes(b"")):
+    columns = (Column("name", "name"), Column("x_mm", "x mm", ".1f"))
+    return StudyResult(
+        "demo", columns, [{"name": "a", "x_mm": 1.25}, {"name": "b", "x_mm": float("nan")}], ["so"], {}, draw
+    )
+
+
+def test_what_does_not_apply_is_null_and_a_dash(tmp_path):
+    assert as_document(result())["rows"][1]["x_mm"] is None
+    assert table_lines(result())[1:] == ["a      1.2", "b        –"]
+    names = [path.name for path in write_study(result(), tmp_path / "deep")]
+    assert names[:3] == ["demo.csv", "demo.txt", "demo.json"]
+    assert (tmp_path / "deep/demo.csv").read_text().splitlines() == ["name,x_mm", "a,1.25", "b,"]
+
+
+def test_list(capsys):
+    assert main(["study", "--list"]) == 0
+    out = capsys.readouterr().out
+    assert all(name in out for name in STUDIES)
+    assert main(["study", "--list", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == dict(STUDIES)
+
+
+@pytest.mark.parametrize(("argv", "said"), [(["study", "bond"], "did you mean bound?"), (["study"], "expected NAME")])
+def test_a_wrong_name_is_told(argv, said, capsys):
+    assert main(argv) == 2
+    complaint = capsys.readouterr().err
+    assert said in complaint
+    assert complaint.count("\n") == 1
+
+
+def test_run_prints_the_table_and_writes_files(monkeypatch, tmp_path, capsys):
+    def run(*, quick, say):
+        return result()
+
+    monkeypatch.setattr(estimators, "run", run)
+    assert main(["study", "estimators", "--out", str(tmp_path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["rows"][0] == {"name": "a", "x_mm": 1.25}
+    assert main(["study", "estimators", "--out", str(tmp_path)]) == 0
+    assert "a      1.2" in capsys.readouterr().out
+
+
+def test_pictures_are_drawn(tmp_path):
+    from canprobe.studies.bound_figure import draw_bound
+    from canprobe.studies.estimators_figure import draw_estimators
+
+    shared = {"surface": "plane", "sigma_point_um": 5.0, "sigma_normal_mrad": 1.0}
+    draw_estimators(
+        [shared | {"method": s.method, "window_samples": s.window, "lag_samples": s.lag, "error_percent": 1.0,
+                   "bound_percent": 0.5, "add_us": 10.0, "answer_us": 100.0} for s in FEW],
+        tmp_path / "a.png",
+    )  # fmt: skip
+    draw_bound(
+        [shared | {"method": m, "path": "weave", "inside": m == "ml", "size_mm": 5.0, "ratio": 1.0, "coverage": 0.9}
+         for m in ("ml", "recursive")],
+        tmp_path / "b.png",
+    )  # fmt: skip
+    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("a.png", "b.png"))

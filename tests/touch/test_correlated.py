@@ -1,0 +1,97 @@
+"""Correlated noise along the path: intervals that know of it cover, intervals that do not know of it do not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from canprobe.errors import UsageError
+from canprobe.touch.bound import cramer_rao
+from canprobe.touch.fit import fit_surface
+from canprobe.touch.noise import Correlation
+
+SIGMA = {"sigma_point": 5e-5, "sigma_normal": 3e-3}
+LENGTH, SHARE, STEP = 1.5e-3, 0.9, 0.125e-3
+SEEDS = 50
+CHI2_95 = 7.815
+WEIGHT = np.array([1.0, 2.0, 1.0])
+KNOWN = Correlation(LENGTH, SHARE)
+
+
+def autoregression(n, rng):
+    """(n, 3) of unit variance: a first-order autoregression over the path plus white noise."""
+    rho = math.exp(-STEP / LENGTH)
+    x = rng.normal(size=(n, 3))
+    for i in range(1, n):
+        x[i] = rho * x[i - 1] + math.sqrt(1.0 - rho * rho) * x[i]
+    return math.sqrt(SHARE) * x + math.sqrt(1.0 - SHARE) * rng.normal(size=(n, 3))
+
+
+def felt(path, seed):
+    rng = np.random.default_rng(seed)
+    n = len(path.points)
+    points = path.points + SIGMA["sigma_point"] * autoregression(n, rng)
+    normals = path.normals + SIGMA["sigma_normal"] * autoregression(n, rng)
+    return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def scores(path, method, correlation, seeds=SEEDS):
+    """Share of the 95 % regions that hold the truth, and the RMS error."""
+    answers = [fit_surface(*felt(path, s), **SIGMA, method=method, correlation=correlation) for s in range(seeds)]
+    errors = [path.error(a) for a in answers]
+    held = [e @ np.linalg.solve(a.covariance, e) < CHI2_95 for e, a in zip(errors, answers, strict=True)]
+    return float(np.mean(held)), math.sqrt(float(np.mean(np.square(errors) @ WEIGHT)))
+
+
+@pytest.mark.parametrize("method", ["ml", "recursive"])
+def test_intervals_cover_when_they_know(method, truth):
+    path = truth.path("ellipsoid")
+    cover, _ = scores(path, method, KNOWN)
+    # 50 seeds: three standard deviations of the count of a true 95 % are 9 %
+    assert cover >= 0.86
+    blind, _ = scores(path, method, None, seeds=20)
+    assert blind < 0.75
+
+
+def test_ml_reaches_the_bound_of_its_noise(truth):
+    path = truth.path("cylinder")
+    C = cramer_rao(path.points, path.normals, path.surface, **SIGMA, correlation=KNOWN)
+    white = cramer_rao(path.points, path.normals, path.surface, **SIGMA)
+    _, rms = scores(path, "ml", KNOWN, seeds=40)
+    bound = math.sqrt(WEIGHT @ np.diag(C))
+    # 40 seeds of about three independent entries: two standard deviations of an RMS are 13 %
+    assert 0.8 * bound < rms < 1.1 * 1.13 * bound
+    assert bound > 1.5 * math.sqrt(WEIGHT @ np.diag(white))
+
+
+def test_no_share_is_independent_noise(truth):
+    path = truth.path("ellipsoid")
+    points, normals = path.noisy(5e-5, 3e-3, 1)
+    a = fit_surface(points, normals, **SIGMA, correlation=Correlation(LENGTH, 0.0))
+    b = fit_surface(points, normals, **SIGMA)
+    assert np.allclose(a.K, b.K, rtol=1e-5, atol=1e-4)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-5)
+
+
+def test_whitening_is_the_inverse_of_the_correlation():
+    path = np.cumsum(np.random.default_rng(0).uniform(0.0, 1e-3, 30))
+    W = KNOWN.whitener(path)
+    expected = SHARE * np.exp(-np.abs(np.subtract.outer(path, path)) / LENGTH) + (1.0 - SHARE) * np.eye(30)
+    assert np.allclose(W.mT @ W @ expected, np.eye(30), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("length", "share", "field"), [(0.0, 0.5, "length"), (1e-3, 1.5, "share"), (1e-3, -0.1, "share")]
+)
+def test_a_wrong_correlation_is_named(length, share, field):
+    with pytest.raises(UsageError, match=f"correlation.{field}"):
+        Correlation(length, share)
+
+
+@pytest.mark.parametrize("method", ["chord", "chen1996"])
+def test_methods_without_a_noise_model_refuse(method, truth):
+    path = truth.path("sphere")
+    with pytest.raises(UsageError, match="correlation"):
+        fit_surface(path.points, path.normals, **SIGMA, method=method, correlation=KNOWN)
