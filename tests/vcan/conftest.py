@@ -204,7 +204,7 @@ class Bench:
         self.start = Starter(folder)
 
     def scene(
-        self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", missed_syncs: int = 5
+        self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", missed_syncs: int = 20
     ) -> Path:
         """Write a packaged scene with another rate or patience, with its nodes left to somebody else, or another EDS.
 
