@@ -18,6 +18,7 @@ from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
 
 if TYPE_CHECKING:
+    from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
 __all__ = ["Command", "Measurement", "RunResult", "emulate", "emulate_eds", "open_cell", "run", "scan", "up"]
@@ -95,8 +96,8 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
 def _finish(session: Session, controller: object, failure: BaseException | None) -> RunResult:
     estimates = _estimates(session.scene, controller)
     reason = None if failure is None else (str(failure) or "interrupted")
-    surface_map = _surface_map(session.scene, controller)
-    summary = summarise(session, controller, estimates, reason, surface_map)
+    surface_map, consistency, map_summary = _mapped(session.scene, controller)
+    summary = summarise(session, controller, estimates, reason, map_summary)
     result = RunResult(
         session.plan,
         summary,
@@ -105,6 +106,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None)
         estimates,
         getattr(controller, "taxels", None),
         surface_map,
+        consistency,
         session.out,
     )
     if session.out is not None:
@@ -123,13 +125,17 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     return estimates_of(scene, tracker, (scene.shape.method, *scene.shape.also))
 
 
-def _surface_map(scene: Scene, controller: object) -> SurfaceMap | None:
+def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
+    """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
-        return None
-    from canprobe.cell.mapping import map_of_scan
+        return None, None, None
+    from canprobe.cell.mapping import map_of_scan, summarise_map
+    from canprobe.touch.consistency import check_consistency
 
-    return map_of_scan(tracker, scene.shape.method)
+    surface_map = map_of_scan(tracker, scene.shape.method)
+    consistency = check_consistency(surface_map)
+    return surface_map, consistency, summarise_map(surface_map, consistency)
 
 
 def _draw(result: RunResult, out: Path) -> None:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.log_cycles import LogCycles
-from canprobe.cell.mapping import map_of_scan
+from canprobe.cell.mapping import map_of_scan, summarise_map
 from canprobe.cell.recording import Recording
 from canprobe.cell.replay import TaskReplay
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.planning import Plan
 from canprobe.results import curvature_text, finite_or_none, shape_lines, summarise_shape
-from canprobe.touch.surface_map import SurfaceMap
+from canprobe.touch.consistency import check_consistency
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -62,14 +62,17 @@ def summarise_replay(
             estimates,
             truth,
             np.array(cycles.sync_times_s),
-            surface_map=_surface_map(plan, tracker),
+            map_summary=_map_summary(plan, tracker),
         ),
         "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
     }
 
 
-def _surface_map(plan: Plan, tracker: ShapeTracker) -> SurfaceMap | None:
-    return map_of_scan(tracker, plan.scene.shape.method) if plan.scene.shape is not None else None
+def _map_summary(plan: Plan, tracker: ShapeTracker) -> dict[str, Any] | None:
+    if plan.scene.shape is None:
+        return None
+    surface_map = map_of_scan(tracker, plan.scene.shape.method)
+    return summarise_map(surface_map, check_consistency(surface_map))
 
 
 def _arrays(path: Path) -> dict[str, Array]:

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.cell import Cell
-from canprobe.cell.mapping import summarise_map
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.planning import Plan
@@ -20,6 +19,7 @@ from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
+from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
 
 Array = NDArray[np.float64]
@@ -38,6 +38,7 @@ class RunResult:
         estimates: what each estimator said, by name; the online one first.
         taxels: (16, 16) counts of the task's last tactile frame, or None.
         surface_map: the local patches of the online estimator, or None where no shape was felt.
+        consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
     """
 
@@ -48,6 +49,7 @@ class RunResult:
     estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
     taxels: NDArray[np.uint8] | None = None
     surface_map: SurfaceMap | None = None
+    consistency: Consistency | None = None
     out: Path | None = None
 
     def text(self) -> str:
@@ -60,7 +62,7 @@ def summarise(
     controller: object,
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
-    surface_map: SurfaceMap | None = None,
+    map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
@@ -80,7 +82,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], surface_map=surface_map
+            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
         "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
@@ -119,7 +121,7 @@ def summarise_shape(
     truth: Mapping[str, Array],
     sync_times: Array,
     *,
-    surface_map: SurfaceMap | None = None,
+    map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The section ``shape`` of ``summary.json``; the first of the estimates is the one that is summed up.
 
@@ -129,7 +131,7 @@ def summarise_shape(
         estimates: what each estimator said, by name.
         truth: columns of the plant's truth, one row a SYNC; empty where there is none.
         sync_times: time of each SYNC on the master's clock (n,), s.
-        surface_map: of the scan, to be summed up.
+        map_summary: of the scan's surface map.
     """
     names = (
         *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
@@ -141,8 +143,8 @@ def summarise_shape(
     method = next(iter(estimates))
     records = estimates[method]
     shape["method"] = method
-    if surface_map is not None:
-        shape["map"] = summarise_map(surface_map)
+    if map_summary is not None:
+        shape["map"] = map_summary
     if records:
         shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
         shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.tasks.shape import ShapeTracker
-from canprobe.touch.consistency import PARTS, Consistency, check_consistency
+from canprobe.touch.consistency import PARTS, Consistency
 from canprobe.touch.local_patch import LocalPatch
 from canprobe.touch.surface_map import SurfaceMap, merge_patches
 
@@ -28,9 +28,8 @@ def map_of_scan(tracker: ShapeTracker, method: str) -> SurfaceMap:
     return merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
 
 
-def summarise_map(surface_map: SurfaceMap) -> dict[str, Any]:
+def summarise_map(surface_map: SurfaceMap, consistency: Consistency) -> dict[str, Any]:
     """Patches, crossings and their tests for ``summary.json``; None where there was nothing to test."""
-    consistency = check_consistency(surface_map)
     return {
         "patches": len(surface_map),
         "crossings": len(consistency.crossings),

@@ -14,7 +14,7 @@ from canprobe.results import RunResult
 from canprobe.scene_geometry import true_object
 from canprobe.studies.surface_tiles import draw_tiles
 from canprobe.studies.surface_view import ACCENT, FAINT, INK, SECOND, THIRD, MapView, rejected, view_of
-from canprobe.touch.consistency import Consistency
+from canprobe.touch.consistency import Consistency, check_consistency
 from canprobe.touch.objects import PlacedShape
 from canprobe.touch.surface_map import SurfaceMap
 
@@ -23,27 +23,36 @@ PARTS = (("curvature", ACCENT), ("normal", SECOND), ("height", THIRD))
 
 def draw_surface(result: RunResult, path: Path) -> None:
     """Draw a run's surface map and write a PNG; nothing where there is none."""
-    if result.surface_map is None or not len(result.surface_map):
+    if result.surface_map is None or result.consistency is None or not len(result.surface_map):
         return
     settings = result.plan.scene.object
     draw_map(
         result.surface_map,
         path,
+        consistency=result.consistency,
         shape=None if settings is None else true_object(settings),
         title=result.plan.scene.title or result.plan.scene.name,
     )
 
 
-def draw_map(surface_map: SurfaceMap, path: Path, *, shape: PlacedShape | None = None, title: str = "") -> None:
+def draw_map(
+    surface_map: SurfaceMap,
+    path: Path,
+    *,
+    consistency: Consistency | None = None,
+    shape: PlacedShape | None = None,
+    title: str = "",
+) -> None:
     """Draw a map: tiles over the true object, crossings in the plane of the scan, their p-values.
 
     Args:
         surface_map: with at least one patch.
         path: of the PNG.
+        consistency: the tests at its crossings; None for `check_consistency`, which takes a second.
         shape: the true object, for the ghost below the tiles and for errors; None colours by mean curvature.
         title: first line.
     """
-    view = view_of(surface_map, shape)
+    view = view_of(surface_map, consistency or check_consistency(surface_map), shape)
     figure = Figure(figsize=(13.0, 7.6), dpi=110, layout="constrained")
     crossings = len(view.consistency.crossings)
     figure.suptitle(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch.consistency import LEVEL, Consistency, check_consistency
+from canprobe.touch.consistency import LEVEL, Consistency
 from canprobe.touch.frames import tangent_rotation
 from canprobe.touch.objects import PlacedShape
 from canprobe.touch.surface_map import SurfaceMap
@@ -31,8 +31,8 @@ class MapView(NamedTuple):
         return result
 
 
-def view_of(surface_map: SurfaceMap, shape: PlacedShape | None) -> MapView:
-    """The view of a map with at least one patch; `shape` is the true object or None."""
+def view_of(surface_map: SurfaceMap, consistency: Consistency, shape: PlacedShape | None) -> MapView:
+    """The view of a map with at least one patch and of its tests; `shape` is the true object or None."""
     path = surface_map.path if len(surface_map.path) else surface_map.points
     middle = 0.5 * (path.min(axis=0) + path.max(axis=0))
     outward = surface_map.normals.mean(axis=0)
@@ -41,7 +41,7 @@ def view_of(surface_map: SurfaceMap, shape: PlacedShape | None) -> MapView:
     _, _, main = np.linalg.svd(flat - flat.mean(axis=0), full_matrices=False)
     along = R[:, :2] @ main[0]
     axes = np.array([along, np.cross(R[:, 2], along), R[:, 2]])
-    return MapView(surface_map, check_consistency(surface_map), shape, axes, middle)
+    return MapView(surface_map, consistency, shape, axes, middle)
 
 
 def rejected(consistency: Consistency) -> NDArray[np.bool_]:
