@@ -17,7 +17,8 @@ TactileModeName = Literal["window", "image", "features"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
-Fidelity = Literal["ideal"]
+Fidelity = Literal["ideal", "dynamic"]
+Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -28,6 +29,7 @@ NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 TOUCHING = Only("kind", ("scan", "press"))
 SCANNING = Only("kind", ("scan",))
 FREE = Only("kind", ("free",))
+DYNAMIC = Only("fidelity", ("dynamic",))
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,9 +173,20 @@ class ServoSettings:
 
 @dataclass(frozen=True, slots=True)
 class PlantSettings:
-    """`[plant]`: how the emulated arm, contact and array behave."""
+    """`[plant]`: how the emulated arm, contact and array behave.
+
+    Fidelity `ideal`: each drive tracks as a second-order system, whatever it pushes against. `dynamic`: rigid links,
+    friction, drive cascade, and the object pushes back; the keys that say "dynamic" belong to it.
+    """
 
     fidelity: Fidelity = "ideal"
+    arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
+    integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 1250.0  # of the integrator
+    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
     noise: bool = True

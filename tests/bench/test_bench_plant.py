@@ -6,9 +6,10 @@ Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, imag
 import numpy as np
 import pytest
 
+from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.emulator.plant.world import Plant
 from canprobe.robot.damped import damped_step
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset

@@ -1,77 +1,34 @@
 """The plant: arm, probe, object and array as one thing that the emulated nodes share.
 
 Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
-and only when somebody asks. Contact does not push the ideal arm back: the drives are taken as stiff.
+and only when somebody asks. Contact pushes the dynamic arm back, not the ideal one: its drives are taken as stiff.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from math import cos, pi, sin
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from canprobe.emulator.plant.arm import IdealArm
+from canprobe.emulator.plant.arms import make_arm
+from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
 from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
 from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
+from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import chain, point_velocity, tool_z_offset
-from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel, counts_to_joints
-from canprobe.touch.objects import ClosestPoint, ObjectShape
+from canprobe.robot.kinematics import chain, point_velocity
+from canprobe.robot.puma260 import Array, counts_to_joints
+from canprobe.touch.objects import ClosestPoint
+
+if TYPE_CHECKING:
+    from canprobe.emulator.plant.dynamic_arm import DynamicArm
 
 Axes = tuple[Vec, Vec, Vec]
 Truth = dict[str, float | bool | Array]
-
-
-@dataclass(frozen=True, slots=True)
-class PressMotion:
-    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
-
-    Args:
-        force_n: force at the mean depth.
-        swing: amplitude of the depth over its mean.
-        frequency_hz: of the swing.
-    """
-
-    force_n: float = 2.0
-    swing: float = 0.4
-    frequency_hz: float = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlantConfig:
-    """What the plant is made of.
-
-    Args:
-        model: the arm; None for a sensor alone, pressed on the object by ``press``.
-        q0: (6,) joint angles at time 0, rad.
-        T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
-        radius_m: probe radius.
-        stiffness_n_m3: of the elastic layer (K/h).
-        damping_s_m: Hunt-Crossley alpha (assumed).
-        object: what can be touched; None for nothing.
-        taxels: the array's imperfections; None where there is no array.
-        bandwidth_hz: -3 dB frequency of every drive.
-        damping_ratio: of every drive.
-        press: motion of a probe without an arm.
-        seed: of taxel gains and noise.
-    """
-
-    model: PumaModel | None
-    q0: Array = field(default_factory=lambda: ELBOW_FORM)
-    T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
-    radius_m: float = 0.040
-    stiffness_n_m3: float = 1.27e8
-    damping_s_m: float = 0.3
-    object: ObjectShape | None = None
-    taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
-    bandwidth_hz: float = 30.0
-    damping_ratio: float = 1.0
-    press: PressMotion = PressMotion()
-    seed: int = 0
 
 
 class PlantState(NamedTuple):
@@ -132,10 +89,10 @@ class Plant:
     def __init__(self, config: PlantConfig) -> None:
         self.config = config
         self.t_ns = 0
-        self.arm: IdealArm | None = None
+        self.arm: IdealArm | DynamicArm | None = None
         self._pressed: _PressedProbe | None = None
         if config.model is not None:
-            self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+            self.arm = make_arm(config)
         if config.object is not None:
             _refuse_tight_hollow(config)
             if config.model is None:
@@ -148,6 +105,7 @@ class Plant:
         self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
+        self._base: Vec = tuple(config.base_offset_m.tolist())
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
 
@@ -205,7 +163,7 @@ class Plant:
         """
         return self._need_arm().motor_dynamics(axis)
 
-    def _need_arm(self) -> IdealArm:
+    def _need_arm(self) -> IdealArm | DynamicArm:
         if self.arm is None:
             raise RuntimeError("this plant has no arm")
         return self.arm
@@ -291,7 +249,8 @@ class Plant:
             p2 + x2 * a + y2 * b + z2 * d,
         )
         axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
-        return _Probe(centre, axes, point_velocity(c, centre, qd))
+        b0, b1, b2 = self._base
+        return _Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
 
     def _solve(self, state: PlantState) -> _Solution:
         config, q, qd = self.config, np.zeros(6), np.zeros(6)

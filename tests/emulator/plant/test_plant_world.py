@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.contact import depth_for_force
 from canprobe.emulator.plant.field import PITCH_M, pad_direction
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS
-from canprobe.emulator.plant.world import Plant, PlantConfig, PressMotion
+from canprobe.emulator.plant.world import Plant
 from canprobe.errors import PlanError
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
