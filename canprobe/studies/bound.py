@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -75,12 +76,11 @@ class Case:
 
 
 def all_cases() -> Iterator[Case]:
-    """Weaves over every surface and size with every noise, circles with the middle one, and paths of 1.5 radii."""
+    """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
     for surface in SURFACES:
         for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
-            for path, noises in zip(PATHS, (NOISES, NOISES[1:2]), strict=True):
-                for noise in noises:
-                    yield Case(surface, path, size, min(size, LONGEST_M), *noise)
+            for path, noise in product(PATHS, NOISES):
+                yield Case(surface, path, size, min(size, LONGEST_M), *noise)
         if surface != "plane":
             for noise in NOISES[1:]:
                 yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
