@@ -15,7 +15,7 @@ TaskKind = Literal["scan", "press", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
 TactileModeName = Literal["window", "image", "features"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
-ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
+ObjectKind = Literal["plane", "sphere", "cylinder", "ellipsoid", "saddle", "bowl", "torus", "wave", "fillet", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal", "dynamic"]
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
@@ -30,6 +30,8 @@ TOUCHING = Only("kind", ("scan", "press"))
 SCANNING = Only("kind", ("scan",))
 FREE = Only("kind", ("free",))
 DYNAMIC = Only("fidelity", ("dynamic",))
+TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
+WAVE = Only("kind", ("wave",), required=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,17 +99,26 @@ class ProbeSettings:
 class ObjectSettings:
     """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
 
-    The object frame's origin lies on the surface with z outward. The cylinder's axis runs along x; a saddle is
-    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); a bowl is the inside of a
-    sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
+    The object frame's origin lies on the surface with z outward. A cylinder, a wave and a fillet are straight along
+    x: a wave is z = amplitude (cos(2π y/wavelength) − 1), a fillet an arc that turns by angle between two planes. A
+    saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); an ellipsoid has
+    three positive semi-axes; a torus lies flat, the origin on its crown, x outward from its axis; a bowl is the inside
+    of a sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
     radius_mm: Annotated[
-        float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder", "bowl"), required=True)
+        float | None,
+        Range(1, 100_000),
+        Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
     ] = None
-    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
-    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
+    ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None  # half of trough to crest
+    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )

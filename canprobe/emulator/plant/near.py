@@ -8,26 +8,11 @@ from math import pi, sqrt
 import numpy as np
 
 from canprobe.emulator.plant.pushing import Contact, OneTouch, Rubbing
+from canprobe.emulator.plant.pushing_many import ManyTouches
+from canprobe.emulator.plant.resting import LEAST_CURVATURE, NEAR_M, force_laws
 from canprobe.robot.kinematics import forward_jacobian
 from canprobe.robot.puma260 import Array, PumaModel
-from canprobe.touch.objects import ObjectShape
-
-LEAST_CURVATURE = 1e-2
-"""Of the gap, in probe curvatures: a hollow nearer to the probe's own radius counts as this much wider."""
-_REACH_M = 2e-3  # gaps larger than this cannot close within a cycle
-
-
-def point_coefficient(kappa: tuple[float, float], radius: float, stiffness_n_m3: float) -> float:
-    """Force over squared depth of one small patch, N/m^2, see ``contact.elastic_contact``.
-
-    Args:
-        kappa: principal curvatures of the body, 1/m, larger first.
-        radius: of the probe, m.
-        stiffness_n_m3: of the layer.
-    """
-    least = LEAST_CURVATURE / radius
-    A, B = (0.5 * max(least, 1.0 / radius + k) for k in kappa)
-    return pi * stiffness_n_m3 / (2.0 * sqrt(A * B))
+from canprobe.touch.objects import ObjectShape, Touches
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,18 +46,30 @@ class Neighbourhood:
             theta: (6,) motor coordinates, rad.
         """
         T, J = forward_jacobian(self.model, self.joints_per_motor @ theta, self.T_flange_probe)
-        centre = T[:3, 3] + self.base_offset
+        centre, J = T[:3, 3] + self.base_offset, J @ self.joints_per_motor
         foot = self.shape.closest(centre)
         depth = self.radius - foot.distance
-        if depth < -_REACH_M:
+        if depth < -NEAR_M:
             return None
-        n, (d1, d2) = foot.normal, foot.directions
-        J = J @ self.joints_per_motor
-        # Velocity of the probe's material point that touches: centre plus rotation about it, arm -r n.
-        lever = -(self.radius - max(depth, 0.0))
-        rows = np.array((n, d1, d2)) @ J[:3]
-        turning = lever * np.array((d2, -d1)) @ J[3:]  # tangents d1, d2 of omega x lever n
-        rows[1:] += turning
-        k1, k2 = foot.kappa.tolist()
-        coefficient = point_coefficient((k1, k2), self.radius, self.stiffness_n_m3)
-        return OneTouch(theta, depth, rows, coefficient, self.rubbing)
+        touches = self.shape.touches(centre, self.radius + NEAR_M)
+        if touches is not None:
+            return self._many(theta, J, touches)
+        d1, d2 = foot.directions
+        least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa.tolist()
+        A, B = 0.5 * max(least, 1.0 / self.radius + k1), 0.5 * max(least, 1.0 / self.radius + k2)
+        # Velocity of the probe's point that touches: the centre's, and its rotation about the centre by an arm -n r.
+        rows = np.array((foot.normal, d1, d2)) @ J[:3]
+        rows[1:] += (max(depth, 0.0) - self.radius) * np.array((d2, -d1)) @ J[3:]
+        return OneTouch(theta, depth, rows, pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)), self.rubbing)
+
+    def _many(self, theta: Array, J: Array, touches: Touches) -> Contact:
+        """Several places at once."""
+        depth, n = self.radius - touches.distances, touches.normals
+        d1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
+        d1 /= np.linalg.norm(d1, axis=1)[:, None]
+        d2 = np.cross(n, d1)
+        arm = (np.maximum(depth, 0.0) - self.radius)[:, None, None]
+        rows = np.stack((n, d1, d2), axis=1) @ J[:3]
+        rows[:, 1:] += arm * np.stack((d2, -d1), axis=1) @ J[3:]
+        coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
+        return ManyTouches(theta, depth, rows, coefficient=coefficient, exponent=exponent, rubbing=self.rubbing)

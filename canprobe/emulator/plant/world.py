@@ -6,7 +6,7 @@ and only when somebody asks. Contact pushes the dynamic arm back, not the ideal 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import cos, pi, sin
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -18,11 +18,12 @@ from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
 from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
 from canprobe.emulator.plant.motor import MotorDynamics
+from canprobe.emulator.plant.resting import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import chain, point_velocity
 from canprobe.robot.puma260 import Array, counts_to_joints
-from canprobe.touch.objects import ClosestPoint
+from canprobe.touch.objects import ClosestPoint, Touches
 
 if TYPE_CHECKING:
     from canprobe.emulator.plant.dynamic_arm import DynamicArm
@@ -81,9 +82,8 @@ class Plant:
 
     Args:
         config: what the plant is made of.
-
     Raises:
-        PlanError: for an object with a hollow as tight as the probe.
+        PlanError: for a probe without an arm over a hollow as tight as itself.
     """
 
     def __init__(self, config: PlantConfig) -> None:
@@ -93,10 +93,10 @@ class Plant:
         self._pressed: _PressedProbe | None = None
         if config.model is not None:
             self.arm = make_arm(config)
-        if config.object is not None:
+        if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
-            if config.model is None:
-                self._pressed = _PressedProbe(config)
+            self._pressed = _PressedProbe(config)
+        self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)
@@ -181,17 +181,21 @@ class Plant:
         if self.array is None:
             return np.zeros((SIDE, SIDE), dtype=np.uint8)
         if self._image is None or self._image[0] != self.t_ns:
-            s = self._solution()
-            image = self.array.image(
-                s.pad_uv,
-                s.depth,
-                s.kappa,
-                _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
-                1e-9 * self.t_ns,
-                pressure_factor=s.contact.damping_factor,
-            )
-            self._image = (self.t_ns, image)
+            self._image = (self.t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
+
+    def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
+        if s.several and self.config.object is not None:
+            points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
+            return array.image_of(array.field.mean_of(-self.config.object.gaps(points)), 1e-9 * self.t_ns)
+        return array.image(
+            s.pad_uv,
+            s.depth,
+            s.kappa,
+            _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
+            1e-9 * self.t_ns,
+            pressure_factor=s.contact.damping_factor,
+        )
 
     def state(self) -> PlantState:
         """The present state: cheap to take, `truth` can be asked for it at any time."""
@@ -264,13 +268,29 @@ class Plant:
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
         k1, k2 = foot.kappa.tolist()
+        touches = config.object.touches(probe.centre, config.radius_m)
         contact = elastic_contact(
-            depth, (k1, k2), config.radius_m, config.stiffness_n_m3, depth_rate=rate, damping=config.damping_s_m
+            depth,
+            (max(k1, self._tightest), max(k2, self._tightest)),
+            config.radius_m,
+            config.stiffness_n_m3,
+            depth_rate=rate,
+            damping=config.damping_s_m,
         )
+        if touches is not None:
+            contact = self._resting(touches, probe)
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
-        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), pad_coordinates(d, config.radius_m), d)
+        uv = pad_coordinates(d, config.radius_m)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+
+    def _resting(self, touches: Touches, probe: _Probe) -> Contact:
+        """Several places at once, as one contact with the resultant force; it has no patch of its own."""
+        config = self.config
+        rates = -(touches.normals @ np.array(probe.velocity))
+        force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
+        return replace(NO_CONTACT, force=float(np.linalg.norm(force)))
 
 
 def _turned(axes: Axes, R: Array) -> Axes:
@@ -298,6 +318,7 @@ class _Solution:
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
+    several: bool = False  # it touches in several places, and these are of the deepest
 
 
 _POLE = (0.0, 0.0, 1.0)
@@ -305,6 +326,7 @@ _NOWHERE = ClosestPoint(np.zeros(3), np.zeros(3), 0.0, np.zeros(2), np.zeros((2,
 
 
 def _refuse_tight_hollow(config: PlantConfig) -> None:
+    """A probe without an arm is pressed on the object's reference point, which it must be able to reach."""
     assert config.object is not None
     tightest = config.object.tightest_concave_radius()
     if tightest <= config.radius_m:
