@@ -13,6 +13,9 @@ import typing
 from dataclasses import dataclass
 from typing import Any, Literal
 
+UNIONS = (types.UnionType, typing.Union)
+"""Origins of `X | None`: a Literal makes the second."""
+
 
 class MismatchError(ValueError):
     """A value that is not what its annotation says; the text is what was expected."""
@@ -115,7 +118,7 @@ def convert(value: object, annotation: Any) -> Any:
     origin = typing.get_origin(annotation)
     if origin is typing.Annotated:
         return _checked(value, annotation)
-    if origin is types.UnionType:
+    if origin in UNIONS:
         return convert(value, next(part for part in typing.get_args(annotation) if part is not type(None)))
     if origin is Literal:
         if value not in typing.get_args(annotation):
@@ -169,7 +172,7 @@ def expected(annotation: Any) -> str:
     if origin is typing.Annotated:
         base, *checks = typing.get_args(annotation)
         return " ".join([expected(base), *(str(check) for check in checks if not isinstance(check, CONDITIONS))])
-    if origin is types.UnionType:
+    if origin in UNIONS:
         return expected(next(part for part in typing.get_args(annotation) if part is not type(None)))
     if origin is Literal:
         return "one of " + ", ".join(typing.get_args(annotation))
@@ -189,7 +192,7 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
     origin = typing.get_origin(annotation)
     if origin is Literal:
         return typing.get_args(annotation)
-    if origin in (typing.Annotated, types.UnionType, tuple):
+    if origin in (typing.Annotated, *UNIONS, tuple):
         return choices_of(typing.get_args(annotation)[0])
     return ()
 

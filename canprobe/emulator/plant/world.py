@@ -184,6 +184,19 @@ class Plant:
             self._image = (self.t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
 
+    def pressure(self, state: PlantState | None = None) -> Array:
+        """(16, 16) mean pressure of every taxel, Pa, before the array's own imperfections; zeros without an array.
+
+        Args:
+            state: of this plant; the present one by default.
+        """
+        s = self._solution() if state is None else self._solve(state)
+        if self.array is None or s.depth <= 0.0:
+            return np.zeros((SIDE, SIDE))
+        field, directions = self.array.field, _in_pad(s.foot, s.probe, s.direction)
+        means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
+        return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
+
     def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
         if s.several and self.config.object is not None:
             points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
