@@ -64,7 +64,7 @@ def cases(quick: bool) -> list[Case]:
     """All integrations."""
     stiffnesses = STIFFNESSES[1:3] if quick else STIFFNESSES
     steps = STEPS_US[1:4:2] if quick else STEPS_US
-    cycles, repeats = (4, 1) if quick else (40, 5)
+    cycles, repeats = (4, 1) if quick else (20, 2)
     return [
         Case(k, method, step, held, cycles, repeats)
         for k, held, method, step in product(stiffnesses, (True, False), METHODS, steps)

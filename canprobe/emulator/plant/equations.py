@@ -10,10 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import tanh
+from typing import NamedTuple
 
 import numpy as np
 
 from canprobe.emulator.plant.cascade import Cascade
+from canprobe.emulator.plant.integrators import Linearised
 from canprobe.emulator.plant.pushing import Contact
 from canprobe.robot.actuation import COULOMB_NM, REFLECTED_INERTIA, STICTION_RATE, VISCOUS_NMS, joints_per_motor
 from canprobe.robot.dynamics import RigidBody
@@ -21,6 +23,22 @@ from canprobe.robot.puma260 import Array
 
 Touching = Callable[[Array], Contact | None]
 """Motor angles (6,), rad -> the contact near there, None where nothing is near."""
+
+
+_Drives = tuple[list[float], list[float], list[float]]
+"""Velocity error, torque asked for and torque given, of every motor."""
+
+
+class _Motors(NamedTuple):
+    """(6,) each: slope of torque by velocity error, by angle, by rate and by integrator; slope of the integrator's own
+    rate by velocity error and by itself."""
+
+    gain: Array
+    by_theta: Array
+    by_rate: Array
+    by_sum: Array
+    sum_by_error: Array
+    sum_by_sum: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,35 +147,36 @@ class ArmEquations:
             t: s.
             y: (18,) state.
         """
-        return np.array([given for _, _, given in self._drives(t, y.tolist())])
+        return np.array(self._drives(t, y.tolist())[2])
 
-    def _drives(self, t: float, y: list[float]) -> list[tuple[float, float, float]]:
-        """Velocity error, torque asked for and torque given, of every motor."""
-        kp, found = self.cascade.position, []
+    def _drives(self, t: float, y: list[float]) -> _Drives:
+        """What the cascades do."""
+        kp = self.cascade.position
+        errors, asked, given = [], [], []
         for r0, slope, ahead, gain, limit, x, v, s in zip(
             self._r0, self._slope, self._ahead, self._gain, self._limit, y[:6], y[6:12], y[12:], strict=True
         ):
             error = kp * (r0 + slope * t - x) + ahead - v
-            asked = gain * error + s
-            found.append((error, asked, min(max(asked, -limit), limit)))
-        return found
+            torque = gain * error + s
+            errors.append(error)
+            asked.append(torque)
+            given.append(limit if torque > limit else -limit if torque < -limit else torque)
+        return errors, asked, given
 
     def rate(self, t: float, y: Array) -> Array:
         """f(t, y)."""
         if not self.held:
             self.hold(y)
         state = y.tolist()
-        v = state[6:12]
-        drives = self._drives(t, state)
-        unwind = self.cascade.unwind
-        out = np.empty(18)
-        out[:6] = v
-        out[12:] = [i * e - unwind * (a - g) for i, (e, a, g) in zip(self._integral, drives, strict=True)]
+        return self._rate(state, self._drives(t, state))
+
+    def _rate(self, state: list[float], drives: _Drives) -> Array:
+        v, unwind = state[6:12], self.cascade.unwind
         net = np.array(
             [
                 given - b - viscous * rate - coulomb * tanh(rate / STICTION_RATE)
-                for (_, _, given), b, viscous, coulomb, rate in zip(
-                    drives, self._bias, self._viscous, self._coulomb, v, strict=True
+                for given, b, viscous, coulomb, rate in zip(
+                    drives[2], self._bias, self._viscous, self._coulomb, v, strict=True
                 )
             ]
         )
@@ -165,72 +184,78 @@ class ArmEquations:
             push = self._contact.push(state[:6], v)
             if push is not None:
                 net += push
+        out = np.empty(18)
+        out[:6] = v
+        out[12:] = [i * e - unwind * (a - g) for i, e, a, g in zip(self._integral, *drives, strict=True)]
         np.matmul(self._inverse, net, out=out[6:12])
         return out
 
     def drift(self, t: float, y: Array) -> Array:
         """Partial derivative of f by t: the reference moves on."""
-        kp, unwind = self.cascade.position, self.cascade.unwind
-        out, torque = np.zeros(18), np.zeros(6)
-        for i, (_, asked, given) in enumerate(self._drives(t, y.tolist())):
-            pull, gain, free = kp * self._slope[i], self._gain[i], asked == given
-            torque[i] = gain * pull if free else 0.0
-            out[12 + i] = pull * (self._integral[i] if free else self._integral[i] - unwind * gain)
-        np.matmul(self._inverse, torque, out=out[6:12])
+        return self._drift(self._motors(y.tolist(), self._drives(t, y.tolist())))
+
+    def _drift(self, motors: _Motors) -> Array:
+        pull = np.array(self._slope) * self.cascade.position
+        out = np.zeros(18)
+        np.matmul(self._inverse, motors.gain * pull, out=out[6:12])
+        out[12:] = pull * motors.sum_by_error
         return out
 
-    def _slopes(self, t: float, state: list[float]) -> tuple[Array, Array, Array, Array, Array]:
-        """(6,) partial derivatives, one motor each: torque by angle, by rate, by integrator; the integrator's own
-        rate by velocity error and by itself."""
+    def _motors(self, state: list[float], drives: _Drives) -> _Motors:
+        """Slopes of every motor's torque and of its integrator's rate."""
         kp, unwind, found = self.cascade.position, self.cascade.unwind, []
-        for i, (_, asked, given) in enumerate(self._drives(t, state)):
-            free = 1.0 if asked == given else 0.0
-            gain, held = self._gain[i] * free, unwind * (1.0 - free)
+        for i, (asked, given) in enumerate(zip(drives[1], drives[2], strict=True)):
+            gain, held = (self._gain[i], 0.0) if asked == given else (0.0, unwind)
             bent = tanh(state[6 + i] / STICTION_RATE)
             drag = self._viscous[i] + self._coulomb[i] / STICTION_RATE * (1.0 - bent * bent)
-            found.append((-kp * gain, -gain - drag, free, self._integral[i] - held * self._gain[i], -held))
-        columns = np.array(found).T
-        return columns[0], columns[1], columns[2], columns[3], columns[4]
+            free = 0.0 if held else 1.0
+            found.append((gain, -kp * gain, -gain - drag, free, self._integral[i] - held * self._gain[i], -held))
+        return _Motors(*np.array(found).T)
 
     def jacobian(self, t: float, y: Array) -> Array:
         """(18, 18) of f by y; mass matrix, bias and contact geometry held."""
         state = y.tolist()
-        by_theta, by_rate, by_sum, sum_by_error, sum_by_sum = self._slopes(t, state)
-        theta, rate = np.diag(by_theta), np.diag(by_rate)
+        m = self._motors(state, self._drives(t, state))
+        theta, rate = np.diag(m.by_theta), np.diag(m.by_rate)
         push = self._contact.slopes(state[:6], state[6:12]) if self._contact is not None else None
         if push is not None:
             theta -= push.rows.T @ push.by_theta @ push.rows
             rate -= push.rows.T @ push.by_rate @ push.rows
         J = np.zeros((18, 18))
         J[:6, 6:12] = np.eye(6)
-        J[6:12, :6], J[6:12, 6:12], J[6:12, 12:] = self._inverse @ theta, self._inverse @ rate, self._inverse * by_sum
-        J[12:, :6], J[12:, 6:12] = np.diag(-self.cascade.position * sum_by_error), np.diag(-sum_by_error)
-        J[12:, 12:] = np.diag(sum_by_sum)
+        J[6:12, :6], J[6:12, 6:12], J[6:12, 12:] = self._inverse @ theta, self._inverse @ rate, self._inverse * m.by_sum
+        J[12:, :6], J[12:, 6:12] = np.diag(-self.cascade.position * m.sum_by_error), np.diag(-m.sum_by_error)
+        J[12:, 12:] = np.diag(m.sum_by_sum)
         return J
 
-    def shifted(self, t: float, y: Array, g: float) -> Callable[[Array], Array]:
-        """Solver of (I - g J) x = r by elimination: one 6 x 6 system for the rates."""
+    def linearised(self, t: float, y: Array, g: float) -> Linearised:
+        """Rate, drift, and the solver of (I - g J) x = r by elimination: one 6 x 6 system for the rates."""
+        if not self.held:
+            self.hold(y)
         state, kp, mass = y.tolist(), self.cascade.position, self._mass
-        by_theta, by_rate, by_sum, sum_by_error, sum_by_sum = self._slopes(t, state)
-        leak = 1.0 / (1.0 - g * sum_by_sum)
-        fed = g * by_sum * leak  # torque per right-hand side of the integrator
-        back = (g * (1.0 + g * kp)) * sum_by_error
+        drives = self._drives(t, state)
+        m = self._motors(state, drives)
+        leak = 1.0 / (1.0 - g * m.sum_by_sum)
+        fed = g * m.by_sum * leak  # torque per right-hand side of the integrator
+        back = (g * (1.0 + g * kp)) * m.sum_by_error
+        first_back, by_theta = (g * kp) * m.sum_by_error, g * m.by_theta
         inner = mass.copy()
-        inner.flat[::7] += fed * back - g * by_rate - (g * g) * by_theta
+        inner.flat[::7] += fed * back - g * m.by_rate - g * by_theta
         push = self._contact.slopes(state[:6], state[6:12]) if self._contact is not None else None
         if push is not None:
             inner += push.rows.T @ ((g * push.by_rate + (g * g) * push.by_theta) @ push.rows)
+            springs = g * push.by_theta
         inverse = np.linalg.inv(inner)
 
         def solve(r: Array) -> Array:
             x = np.empty(18)
-            first, third = r[:6], r[12:] - (g * kp) * sum_by_error * r[:6]
-            torque = mass @ r[6:12] + g * (by_theta * first) + fed * third
+            first, third = r[:6], r[12:] - first_back * r[:6]
+            torque = mass @ r[6:12] + by_theta * first + fed * third
             if push is not None:
-                torque -= g * (push.by_theta @ (push.rows @ first)) @ push.rows
-            x[6:12] = v = inverse @ torque
-            x[:6] = first + g * v
-            x[12:] = leak * (third - back * v)
+                torque -= (springs @ (push.rows @ first)) @ push.rows
+            v = np.matmul(inverse, torque, out=x[6:12])
+            np.add(first, g * v, out=x[:6])
+            np.multiply(leak, third - back * v, out=x[12:])
             return x
 
-        return solve
+        return Linearised(self._rate(state, drives), self._drift(m), solve)

@@ -126,7 +126,9 @@ def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
     drift = (e.rate(1e-6, y) - e.rate(-1e-6, y)) / 2e-6
     assert e.drift(0.0, y) == pytest.approx(drift, rel=1e-5, abs=1e-5)
     r = np.random.default_rng(0).normal(size=18)
-    assert e.shifted(0.0, y, 7e-4)(r) == pytest.approx(np.linalg.solve(np.eye(18) - 7e-4 * J, r), rel=1e-9, abs=1e-12)
+    assert e.linearised(0.0, y, 7e-4).solve(r) == pytest.approx(
+        np.linalg.solve(np.eye(18) - 7e-4 * J, r), rel=1e-9, abs=1e-12
+    )
 
 
 def test_torque_ends_at_its_limit_and_the_motor_arrives_all_the_same():

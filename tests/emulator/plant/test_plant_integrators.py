@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from canprobe.emulator.plant.integrators import STEPS, adaptive, exponential
+from canprobe.emulator.plant.integrators import STEPS, Linearised, adaptive, exponential
 
 
 class Spring:
@@ -28,8 +28,9 @@ class Spring:
     def jacobian(self, t, y):
         return np.array(((0.0, 1.0), (-self.k - 3.0 * self.cubic * y[0] ** 2, -self.c)))
 
-    def shifted(self, t, y, g):
-        return lambda r: np.linalg.solve(np.eye(2) - g * self.wrong * self.jacobian(t, y), r)
+    def linearised(self, t, y, g):
+        inverse = np.linalg.inv(np.eye(2) - g * self.wrong * self.jacobian(t, y))
+        return Linearised(self.rate(t, y), self.drift(t, y), lambda r: inverse @ r)
 
 
 START, END = np.array((1.0, 0.0)), 2.0
