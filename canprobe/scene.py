@@ -53,6 +53,7 @@ class CycleSettings:
     """`[cycle]`: the rate of SYNC and servo."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
@@ -238,6 +239,8 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
