@@ -14,32 +14,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
+from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
 
-_STUFFED_OVERHEAD = 34  # bits of a standard data frame, besides data, that stuffing can lengthen
-_FIXED_OVERHEAD = 13  # bits it cannot: CRC delimiter, ACK, end of frame, 3 bits interframe space
+__all__ = [
+    "BusAnalysis",
+    "Message",
+    "Response",
+    "best_case_bits",
+    "frame_time_ns",
+    "worst_case_bits",
+    "worst_case_response",
+]
+
 _NS = 1_000_000_000
-
-
-def best_case_bits(n_data: int) -> int:
-    """Bits of a standard (11-bit) data frame without one stuff bit, interframe space included: 47 + 8 n.
-
-    Raises:
-        ProtocolError: not 0..8 data bytes.
-    """
-    if not 0 <= n_data <= 8:
-        raise ProtocolError(f"a CAN frame carries 0..8 data bytes, not {n_data}")
-    return _STUFFED_OVERHEAD + 8 * n_data + _FIXED_OVERHEAD
-
-
-def worst_case_bits(n_data: int) -> int:
-    """Bits of a standard (11-bit) data frame with every stuff bit there can be: 55 + 10 n.
-
-    Raises:
-        ProtocolError: not 0..8 data bytes.
-
-    Source: equation (1).
-    """
-    return best_case_bits(n_data) + (_STUFFED_OVERHEAD + 8 * n_data - 1) // 4
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Frame lengths by bit counting, response times against the paper, the budget table and a simulated bus."""
+"""Response times against the paper, the budget table and a simulated bus."""
 
 import dataclasses
 import itertools
@@ -8,44 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
-from canprobe.protocol.timing import Message, best_case_bits, frame_time_ns, worst_case_bits, worst_case_response
+from canprobe.protocol.timing import Message, frame_time_ns, worst_case_response
 
 MS = 1_000_000
 CYCLE = 2_500_000
-
-
-@pytest.mark.parametrize("n, best, worst", [(0, 47, 55), (1, 55, 65), (2, 63, 75), (6, 95, 115), (8, 111, 135)])
-def test_frame_lengths(n, best, worst):
-    assert (best_case_bits(n), worst_case_bits(n)) == (best, worst)
-
-
-def test_worst_case_is_the_closed_form_of_davis_equation_1():
-    assert [worst_case_bits(n) for n in range(9)] == [55 + 10 * n for n in range(9)]
-
-
-@pytest.mark.parametrize("n", [-1, 9])
-def test_impossible_lengths_are_refused(n):
-    for function in (best_case_bits, worst_case_bits):
-        with pytest.raises(ProtocolError):
-            function(n)
-
-
-@pytest.mark.parametrize("n", range(9))
-def test_stuffing_worst_case_by_stuffing_a_frame(n):
-    """1 + 4 equal bits, then groups of 4 that each begin with the stuff bit before them: the adversary's pattern."""
-    stuffable = 34 + 8 * n
-    bits, level = [0] * 5, 1
-    while len(bits) < stuffable:
-        bits += [level] * 4
-        level ^= 1
-    stuffed = run = 0
-    last = None
-    for bit in bits[:stuffable]:
-        run = run + 1 if bit == last else 1
-        last = bit
-        if run == 5:
-            stuffed, last, run = stuffed + 1, bit ^ 1, 1
-    assert worst_case_bits(n) == best_case_bits(n) + stuffed
 
 
 def test_frame_time():
