@@ -18,6 +18,7 @@ ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
+TransmitQueue = Literal["priority", "fifo"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -46,6 +47,9 @@ class BusSettings:
     interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
+    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +58,7 @@ class CycleSettings:
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
     realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
 
 
 @dataclass(frozen=True, slots=True)

@@ -198,7 +198,7 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        bus = self.lockstep = _lockstep_bus(self.scene)
         bus.recorder = self._writer(0)
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
@@ -245,6 +245,19 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def _lockstep_bus(scene: Scene) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(VirtualClock(), scene.bus.channel)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    return TimedBus(VirtualClock(), bus.channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors)
 
 
 class _Sink:
