@@ -147,7 +147,7 @@ def test_only_declared_packages_are_imported():
     """Base dependencies everywhere; an extra's package only in studies."""
     base = {"can", "canopen", "numpy", "scipy"}
     for path, relative in MODULES.items():
-        extras = {"matplotlib"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
+        extras = {"matplotlib", "distributed"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
         for name, line, _ in imports_of(path, relative):
             top = name.split(".")[0]
             known = top in sys.stdlib_module_names or top in base | extras | {"canprobe"}
