@@ -77,7 +77,7 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
-        self._held_since: int | None = None
+        self._holding = False
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
@@ -215,15 +215,17 @@ class Cell:
     def _supervise(self, measurement: Measurement, retreat: Callable[[str], None] | None) -> bool:
         """Check the table's conditions; True: hold in this cycle."""
         self._look(measurement)
-        self._time_hold()
         finding = self.supervisor.finding()
         if finding is None and retreat is None:
             finding = self.supervisor.guard_contact(measurement)
-        hold = finding is not None and finding.condition.reaction is Reaction.HOLD
-        self._hold(hold)
-        if finding is not None and not hold:
-            self._react(finding, retreat)
-        return hold
+        if finding is None or finding.condition.reaction is not Reaction.HOLD:
+            self._holding = False
+            if finding is not None:
+                self._react(finding, retreat)
+        elif not self._holding:
+            self._holding = True
+            self.faults.append(f"cycle {measurement.cycle}: {finding.error}: hold")
+        return self._holding
 
     def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
         """The command that may be sent."""
@@ -236,19 +238,6 @@ class Cell:
         if finding.condition.reaction is not Reaction.RETREAT or retreat is None:
             raise finding.error
         retreat(str(finding.error))
-
-    def _hold(self, hold: bool) -> None:
-        assert self.cycle is not None
-        if hold and self._held_since is None:
-            self._held_since = self.cycle.t_ns
-            self.faults.append(f"cycle {self.cycle.number}: {self.supervisor.seen.controller_state.name}: hold")
-        elif not hold:
-            self._held_since = None
-
-    def _time_hold(self) -> None:
-        assert self.cycle is not None
-        since = self._held_since
-        self.supervisor.seen.held_ns = self.cycle.t_ns - since if since is not None else 0
 
     def _note_alarms(self) -> None:
         alarms = self.watch.alarms

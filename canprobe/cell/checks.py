@@ -111,15 +111,17 @@ def dropped_frames(seen: Seen) -> int:
 
 
 def error_passive(seen: Seen) -> SafetyStop | None:
-    """The controller may only listen to errors, not signal them."""
-    return SafetyStop("CAN controller error-passive") if seen.controller_state is ControllerState.PASSIVE else None
+    """The controller may only listen to errors, not signal them, and not for long."""
+    if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > seen.limits.hold_ns:
+        return None
+    return SafetyStop("CAN controller error-passive")
 
 
 def held_too_long(seen: Seen) -> SafetyStop | None:
-    """A hold has not ended."""
-    if seen.held_ns <= seen.limits.hold_ns:
+    """The controller has been error-passive for too long."""
+    if seen.passive_ns <= seen.limits.hold_ns:
         return None
-    return SafetyStop(f"CAN controller error-passive for {seen.held_ns * 1e-9:.1f} s: check termination and cabling")
+    return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
 
 
 def bus_off(seen: Seen) -> InterfaceError | None:

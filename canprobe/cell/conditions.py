@@ -9,7 +9,8 @@ from canprobe.cell.supervision import Condition, Limits, Reaction
 
 AGAIN = "run again"
 BY_ITSELF = "by itself"
-MS = 1_000_000
+ARRAY_RECOVERY_NS = 30_000_000
+"""For so long after the touch the array's creep and hysteresis may still show half of the touch force."""
 
 
 def _cycles(number: int, plus_ns: int = 0) -> Callable[[Limits], int]:
@@ -221,7 +222,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "contact lost in a hold or scan",
         "below half of the touch force for 30 ms",
         Reaction.RETREAT,
-        lambda limits: limits.lost_ns + _sample(limits),
+        lambda limits: limits.lost_ns + _sample(limits) + ARRAY_RECOVERY_NS,
         AGAIN,
         check=checks.contact_lost,
         touch=True,

@@ -87,7 +87,7 @@ class Seen:
         first_alarm: number of the first alarm that was raised while the cell cycles.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
-        held_ns: how long the cell has been holding.
+        passive_ns: how long the controller has been error-passive.
         speeding: what a joint did that no joint can do; None where all is well.
         slowed: targets so far that were too far away for one cycle.
         restarts: of a diverging estimator so far.
@@ -105,7 +105,7 @@ class Seen:
     first_alarm: int = 0
     overruns: int = 0
     late_share: float = 0.0
-    held_ns: int = 0
+    passive_ns: int = 0
     speeding: str | None = None
     slowed: int = 0
     restarts: int = 0

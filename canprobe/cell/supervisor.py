@@ -47,6 +47,7 @@ class Supervisor:
         window = max(1, round(1e9 / seen.limits.period_ns))
         self._late: deque[int] = deque([0] * window, maxlen=window)
         self._late_sum = 0
+        self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
 
     def step(
@@ -67,6 +68,9 @@ class Supervisor:
         seen.late_share = self._late_sum / len(self._late)
         seen.overruns = overruns
         seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
+        if controller_state is not ControllerState.PASSIVE:
+            self._active_ns = measurement.t_ns
+        seen.passive_ns = measurement.t_ns - self._active_ns
         seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._joints.measure(measurement)
         for condition in COUNTED:
