@@ -104,6 +104,9 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+
+    Attributes:
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
     def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
@@ -118,6 +121,8 @@ class Session:
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self._log: CandumpWriter | None = None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -148,7 +153,7 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say)
+            self._cell = make_cell(self.plan, port, self._say, log_failure=self._log_failure)
             self._stack.enter_context(garbage_collection_paused())
             self._stack.enter_context(self._cell)
         except BaseException:
@@ -174,6 +179,11 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
+            if self._cell is not None and (failure := self._log_failure()) is not None:
+                self._cell.faults.append(f"the log is not whole: {failure}")
+
+    def _log_failure(self) -> str | None:
+        return self._log.failure if self._log is not None else None
 
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
@@ -188,6 +198,7 @@ class Session:
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
+            self._log = writer
             write = writer.write
         self.traffic = TrafficCounter(write)
         return self.traffic.write
@@ -203,7 +214,7 @@ class Session:
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
         for participant in self.world.participants:
-            bus.attach(participant)
+            bus.attach(self.joins(participant))
         return bus.port()
 
     def _keep_truth(self) -> None:

@@ -5,6 +5,7 @@ Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -12,7 +13,7 @@ from types import TracebackType
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, Port, PortCounters, TimedFrame
 from canprobe.errors import UsageError
 
 _LINE = re.compile(
@@ -28,16 +29,25 @@ _LINES = 256
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
+    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
+    looks at `failure`.
+
     Args:
         path: the file to write; an existing one is replaced.
         channel: the name in each line.
         t0_ns: the time on the frames' clock that is written as 0.
+
+    Attributes:
+        failure: why nothing is written any more; None while all is well.
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
         self._channel = channel
         self._t0_ns = t0_ns
-        self._file = open(path, "w", encoding="ascii", newline="\n", buffering=1 << 16)  # noqa: SIM115 - closed by close
+        self.failure: str | None = None
+        self._path = path
+        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
+        self._size = 0
         self._lines: list[str] = []
         self._t_ns: int | None = None
         self._prefix = ""
@@ -60,8 +70,19 @@ class CandumpWriter:
 
     def flush(self) -> None:
         """Hand what was written to the file."""
-        self._file.write("".join(self._lines))
+        data = "".join(self._lines).encode("ascii")
         self._lines.clear()
+        if self.failure is not None:
+            return
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.failure = f"{self._path}: {error.strerror}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
+        self._size += written
 
     def close(self) -> None:
         """Flush and close the file; twice is allowed."""
@@ -169,6 +190,11 @@ class RecordingPort:
     def counters(self) -> PortCounters:
         """The port's counters."""
         return self._port.counters
+
+    @property
+    def state(self) -> ControllerState:
+        """As the port tells it."""
+        return self._port.state
 
     @property
     def stamps_arrival(self) -> bool:

@@ -14,11 +14,16 @@ from typing import Any
 import can
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
 
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
+_STATES = {
+    can.BusState.ACTIVE: ControllerState.ACTIVE,
+    can.BusState.PASSIVE: ControllerState.PASSIVE,
+    can.BusState.ERROR: ControllerState.BUS_OFF,
+}
 
 
 class PythonCanPort:
@@ -33,6 +38,7 @@ class PythonCanPort:
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames.
+        state: the controller's state as python-can told it at the last error frame.
 
     Raises:
         InterfaceError: python-can cannot open it, with its reason.
@@ -44,6 +50,7 @@ class PythonCanPort:
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters)
 
@@ -101,6 +108,7 @@ class PythonCanPort:
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
             self.counters.error_frames += 1
+            self.state = _STATES.get(self._open_bus().state, self.state)
             return None
         if message.is_fd:
             self.counters.ignored += 1

@@ -126,6 +126,11 @@ class Cycle:
         if rest:
             self._other(rest)
 
+    def skip(self) -> None:
+        """Let this cycle be: wait for the end of its period."""
+        self._deadline += self._s.period_ns
+        self._port.clock.sleep_until_ns(self._deadline)
+
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""
         frames = []
