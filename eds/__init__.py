@@ -55,8 +55,12 @@ def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
     return MISSED_SYNCS in od and od[MISSED_SYNCS].name == _MISSED_SYNCS_NAME
 
 
-def _resolve(source: str | os.PathLike[str]) -> Path:
-    """A path stays a path; a bare word names a packaged file, unless a file of that name lies here."""
+def eds_file(source: str | os.PathLike[str]) -> Path:
+    """The file that a name or path means: a bare word names a packaged one, unless a file of that name lies here.
+
+    Raises:
+        EdsError: no such file.
+    """
     path = Path(source)
     if path.is_file():
         return path
@@ -85,7 +89,7 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
             merely untidy is accepted, see `check_eds`.
     """
     _check_node_id(name_or_path, node_id)
-    path = _resolve(name_or_path)
+    path = eds_file(name_or_path)
     return _parse(path, path.stat().st_mtime_ns, node_id)
 
 
@@ -103,7 +107,7 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
         _check_node_id(name_or_path, node_id)
     from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
 
-    return read_eds(_resolve(name_or_path), node_id)
+    return read_eds(eds_file(name_or_path), node_id)
 
 
 @lru_cache(maxsize=64)
