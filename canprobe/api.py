@@ -15,7 +15,7 @@ from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
+from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.touch.consistency import Consistency
@@ -23,12 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Command", "Measurement", "RunResult", "emulate", "emulate_eds", "open_cell", "run", "scan", "up"]
 
-Say = Callable[[str], None]
 Progress = Callable[[float, float], None]
-
-
-def _quiet(_: str) -> None:
-    return
 
 
 def run(
@@ -41,7 +36,7 @@ def run(
     seed: int | None = None,
     duration_s: float | None = None,
     progress: Progress | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     files: bool = True,
 ) -> RunResult:
     """Carry out a scene's task and write what was measured.
@@ -158,7 +153,7 @@ def open_cell(
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
 ) -> Iterator[Session]:
     """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
 
@@ -188,7 +183,7 @@ def up(
     interface: str | None = None,
     channel: str | None = None,
     bitrate: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
 ) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 

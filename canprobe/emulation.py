@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.errors import NodeError, UsageError
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
-from canprobe.session import resolve_scene
+from canprobe.session import Say, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
     from canprobe.emulator.node import SlaveNode
     from canprobe.emulator.serve import Participant
-
-Say = Callable[[str], None]
-
-
-def _quiet(_: str) -> None:
-    return
 
 
 def emulate(
@@ -34,7 +28,7 @@ def emulate(
     seed: int | None = None,
     truth_path: Path | None = None,
     store_folder: Path | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
@@ -75,7 +69,7 @@ def emulate_eds(
     channel: str,
     bitrate: int,
     store_folder: Path | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
 

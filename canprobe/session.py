@@ -34,6 +34,12 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
+Say = Callable[[str], None]
+"""Is told each step, in words."""
+
+
+def quiet(_: str) -> None:
+    """Tell nobody."""
 
 
 def resolve_scene(
@@ -99,7 +105,7 @@ class Session:
         say: called with each step.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
         self.scene = scene
         self.plan: Plan = make_plan(scene)
         self.out = out

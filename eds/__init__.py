@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 MISSED_SYNCS = 0x2000
 """Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
-_MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
+MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 _FOLDER = Path(__file__).resolve().parent
 
 
@@ -52,7 +52,7 @@ def eds_path(name: str) -> Path:
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
     """Whether 2000h is that object here: another maker's drive may mean something else by the same index."""
-    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == _MISSED_SYNCS_NAME
+    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
 
 
 def eds_file(source: str | os.PathLike[str]) -> Path:

@@ -293,15 +293,20 @@ def _memory() -> tuple[str, int]:
     return tempfile.gettempdir(), _MEMORY
 
 
+def _on_last_processor() -> list[str]:
+    """Words that keep a command on the last of several processors; none where that cannot be."""
+    processors = sorted(os.sched_getaffinity(0))
+    if len(processors) < 2 or shutil.which("taskset") is None:
+        return []
+    return ["taskset", "-c", str(processors[-1])]
+
+
 def _favour() -> list[str]:
     """Words before the guest that keep it on one processor and before others, as far as they are to be had.
 
     A guest that wanders between processors loses half its speed: the host faults its pages anew on each.
     """
-    words = []
-    processors = sorted(os.sched_getaffinity(0))
-    if len(processors) > 1 and shutil.which("taskset") is not None:
-        words += ["taskset", "-c", str(processors[-1])]
+    words = _on_last_processor()
     if os.geteuid() == 0 and shutil.which("nice") is not None:
         words += ["nice", "-n", "-20"]
     return words
@@ -309,10 +314,9 @@ def _favour() -> list[str]:
 
 def _pin() -> tuple[list[str], subprocess.Popen[bytes]]:
     """Return the prefix that pins the guest, and the idle-class process that keeps its processor awake."""
-    processors = sorted(os.sched_getaffinity(0))
-    if len(processors) < 2 or shutil.which("chrt") is None or shutil.which("taskset") is None:
+    pin = _on_last_processor()
+    if not pin or shutil.which("chrt") is None:
         raise GuestError("--realtime needs two processors and util-linux (taskset, chrt)", False)
-    pin = ["taskset", "-c", str(processors[-1])]
     if subprocess.run([*pin, "chrt", "-f", "40", "true"], capture_output=True, check=False).returncode:
         raise GuestError("--realtime needs the right to use SCHED_FIFO (root, or CAP_SYS_NICE)", False)
     spinner = subprocess.Popen([*pin, "chrt", "-i", "0", sys.executable, "-c", "while True: pass"])
