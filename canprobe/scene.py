@@ -46,6 +46,8 @@ class BusSettings:
     interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    fd: bool = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; everything else is classical
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,13 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "schema": SCHEMA,
         "scene": plan.scene.name,
         "title": plan.scene.title,
-        "bus": {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate},
+        "bus": {
+            "interface": bus.interface,
+            "channel": bus.channel,
+            "bitrate": bus.bitrate,
+            "fd": bus.fd,
+            "data_bitrate": bus.data_bitrate if bus.fd else None,
+        },
         "sync": asdict(plan.sync),
         "heartbeat": {
             "master_node_id": MASTER_NODE_ID,

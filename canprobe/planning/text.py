@@ -11,6 +11,7 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.protocol.pdo import PdoEntry
 
 
 def plan_text(plan: Plan) -> str:
@@ -21,7 +22,8 @@ def plan_text(plan: Plan) -> str:
 def _lines(plan: Plan) -> Iterator[str]:
     bus, sync = plan.scene.bus, plan.sync
     yield f"{plan.scene.name}: {plan.scene.title}" if plan.scene.title else plan.scene.name
-    yield f"bus {bus.channel} ({bus.interface}), {bus.bitrate} bit/s"
+    fd = f", CAN FD above 8 bytes, its data at {bus.data_bitrate} bit/s" if bus.fd else ""
+    yield f"bus {bus.channel} ({bus.interface}), {bus.bitrate} bit/s{fd}"
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "
@@ -61,9 +63,6 @@ def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
 def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
     rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline µs", "content"]]
     for pdo in pdos:
-        content = ", ".join(
-            "dummy" if entry.is_dummy else f"{entry.index:04X}h:{entry.subindex:02X}" for entry in pdo.entries
-        )
         rows.append(
             [
                 f"{pdo.cob_id:03X}h",
@@ -75,10 +74,25 @@ def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
                 str(pdo.bits_worst),
                 _us(pdo.response_ns),
                 _us(pdo.deadline_ns),
-                content,
+                _content(pdo.entries),
             ]
         )
     return rows
+
+
+def _content(entries: Sequence[PdoEntry]) -> str:
+    """The objects of a mapping, a row of neighbours as its first and last."""
+    rows: list[list[PdoEntry]] = []
+    for entry in entries:
+        last = rows[-1][-1] if rows else None
+        follows = last is not None and (entry.index, entry.subindex) == (last.index, last.subindex + 1)
+        rows[-1].append(entry) if follows and not entry.is_dummy else rows.append([entry])
+    return ", ".join(
+        "dummy"
+        if row[0].is_dummy
+        else f"{row[0].index:04X}h:{row[0].subindex:02X}" + (f"–{row[-1].subindex:02X}" * (len(row) > 1))
+        for row in rows
+    )
 
 
 def _bus_rows(plan: Plan) -> Iterator[list[str]]:

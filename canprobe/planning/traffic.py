@@ -41,7 +41,7 @@ def plan_traffic(
         bus: its bit rate.
     """
     wire = on_the_wire(pdos)
-    analysis = worst_case_response(_messages(wire, sync, node_ids), bus.bitrate)
+    analysis = worst_case_response(_messages(wire, sync, node_ids, bus.bitrate), bus.bitrate)
     responses = {response.message.cob_id: response for response in analysis.responses}
     traffic = Traffic(
         load=analysis.load,
@@ -54,10 +54,10 @@ def plan_traffic(
     return traffic, timed, _problems(traffic, analysis.responses, bus)
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int]) -> list[Message]:
+def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int) -> list[Message]:
     pdos = [
         Message(f"{pdo.direction.upper()} {pdo.cob_id:03X}h", pdo.cob_id, pdo.layout.length, _period_ns(pdo, sync), 0,
-                pdo.deadline_ns)
+                pdo.deadline_ns, _ns(pdo.bits_worst, bitrate))
         for pdo in wire
     ]  # fmt: skip
     heartbeats = [
