@@ -55,6 +55,7 @@ class CycleSettings:
     """`[cycle]`: the rate of SYNC and servo."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
 
 
 @dataclass(frozen=True, slots=True)

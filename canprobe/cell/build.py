@@ -39,6 +39,7 @@ def make_cell(
         sync_overflow=plan.sync.overflow,
         heartbeat_ns=HEARTBEAT_PRODUCED_MS * 1_000_000,
         master_id=MASTER_NODE_ID,
+        looks_ns=plan.traffic.budget.looks_ns,
     )
     return Cell(
         port,

@@ -9,6 +9,7 @@ from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
+    CycleBudget,
     Demand,
     Plan,
     PlannedNode,
@@ -46,6 +47,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
                 "parts": dict(plan.traffic.parts),
                 "demands": [_demand(demand) for demand in plan.traffic.demands],
                 "sync_response_us": _us(plan.traffic.sync_response_ns),
+                "budget": _budget(plan.traffic.budget),
             }
         },
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
@@ -90,6 +92,15 @@ def _demand(demand: Demand) -> dict[str, Any]:
         "cycles": demand.cycles,
         "used_us": _us(demand.used_ns),
         "available_us": _us(demand.available_ns),
+    }
+
+
+def _budget(budget: CycleBudget) -> dict[str, Any]:
+    """The cycle's budget in µs."""
+    times = asdict(budget) | {"bus_ns": budget.bus_ns}
+    looks = times.pop("looks_ns")
+    return {name.removesuffix("_ns") + "_us": _us(t_ns) for name, t_ns in times.items()} | {
+        "looks_us": [_us(look) for look in looks]
     }
 
 

@@ -79,7 +79,9 @@ def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
     if scene.sensor is not None:
         plan_tactile_pdos(planning, scene, sync, ratio, devices[scene.sensor.node_id])
     planning.problems += identifier_problems(planning.pdos)
-    traffic, pdos, overload = plan_traffic(planning.pdos, sync, _node_ids(scene), scene.bus)
+    traffic, pdos, overload = plan_traffic(
+        planning.pdos, sync, _node_ids(scene), scene.bus, round(scene.cycle.compute_us * 1000)
+    )
     return _BusPlan(sync, tuple(pdos), traffic, planning.problems, overload, tuple(planning.not_available))
 
 

@@ -62,7 +62,8 @@ class PlannedPdo:
         rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
         bits_worst: length on the wire with worst-case stuffing.
         deadline_ns: after the SYNC, or after its own queueing where event-driven.
-        response_ns: worst-case response time; None where the bus is overloaded.
+        response_ns: worst case of its end after the SYNC, or after its own queueing where event-driven; None where
+            the bus is overloaded.
         event_timer_ms: 14xxh:05, 0 without.
     """
 
@@ -129,6 +130,40 @@ class Demand:
 
 
 @dataclass(frozen=True, slots=True)
+class CycleBudget:
+    """The worst course of one cycle, ns after its SYNC is due; None without such a part, or without a bound.
+
+    Attributes:
+        period_ns: of SYNC.
+        looks_ns: when the cell looks for TPDOs.
+        sync_ns: the SYNC is through.
+        feedback_ns: the last TPDO of a drive is in.
+        start_ns: the controller starts, at the first look that finds them all.
+        compute_ns: what it takes at most, as the scene says.
+        commands_ns: the last RPDO is through.
+        tactile_ns: the last PDO of a tactile frame is in.
+        slack_ns: what is left of the period; negative: the next SYNC comes too early.
+    """
+
+    period_ns: int
+    looks_ns: tuple[int, ...]
+    sync_ns: int | None
+    feedback_ns: int | None
+    start_ns: int | None
+    compute_ns: int
+    commands_ns: int | None
+    tactile_ns: int | None
+    slack_ns: int | None
+
+    @property
+    def bus_ns(self) -> int | None:
+        """The period's share of the bus: until the controller starts, and from its end to the last RPDO."""
+        if self.start_ns is None or self.slack_ns is None:
+            return None
+        return self.period_ns - self.compute_ns - self.slack_ns
+
+
+@dataclass(frozen=True, slots=True)
 class Traffic:
     """The bus, worst case.
 
@@ -137,12 +172,14 @@ class Traffic:
         parts: the same by (what, share).
         demands: peaks behind one SYNC.
         sync_response_ns: worst-case response time of SYNC.
+        budget: of one cycle.
     """
 
     load: float
     parts: tuple[tuple[str, float], ...]
     demands: tuple[Demand, ...]
     sync_response_ns: int | None
+    budget: CycleBudget
 
 
 @dataclass(frozen=True, slots=True)

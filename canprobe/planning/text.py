@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
+    CycleBudget,
     Plan,
     PlannedNode,
     PlannedPdo,
@@ -32,6 +33,7 @@ def _lines(plan: Plan) -> Iterator[str]:
     yield from _titled("nodes", _node_rows(plan.nodes))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
     yield from _titled("bus, worst case", list(_bus_rows(plan)))
+    yield from _titled(f"one cycle of {_us(sync.period_ns)} µs, worst case", list(_budget_rows(plan.traffic.budget)))
     if plan.joint_speeds is not None:
         rows = [["joint", "needed", "allowed (deg/s)"]]
         speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
@@ -105,6 +107,19 @@ def _bus_rows(plan: Plan) -> Iterator[list[str]]:
             f"{100 * demand.used_ns / demand.available_ns:.1f} %",
             f"{demand.what}: {_us(demand.used_ns)} of {_us(demand.available_ns)} µs",
         ]
+
+
+def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
+    """When what is done after the SYNC, and what each part takes."""
+    yield ["SYNC through", _us(budget.sync_ns), ""]
+    if budget.feedback_ns is not None:
+        yield ["last TPDO of the drives in", _us(budget.feedback_ns), ""]
+    yield ["controller starts", _us(budget.start_ns), f"and takes {_us(budget.compute_ns)} (cycle.compute_us)"]
+    if budget.commands_ns is not None:
+        yield ["last RPDO through", _us(budget.commands_ns), ""]
+    if budget.tactile_ns is not None:
+        yield ["tactile frame in", _us(budget.tactile_ns), "after the SYNC that triggered it"]
+    yield ["left before the next SYNC", _us(budget.slack_ns), f"bus {_us(budget.bus_ns)} µs"]
 
 
 def _use_rows(plan: Plan) -> Iterator[list[str]]:

@@ -72,9 +72,9 @@ class Level:
     def busy(self) -> int:
         """Length of the busy period. Source: Davis et al., (6), (7)."""
         length = 1
+        level = (self.own, *self.above)
         while True:
-            longer = self.blocking + self.lost(length) + self.own.before(length) * self.own.cost
-            longer += sum(one.before(length) * one.cost for one in self.above)
+            longer = self.blocking + self.lost(length) + _demand(level, length)
             if longer <= length:
                 return length
             length = longer
@@ -91,8 +91,16 @@ class Level:
     def _started(self, delay: int, own: int) -> int:
         """Smallest w at which nothing is before the message, searched upward. Source: Davis et al., (9)."""
         while True:
-            longer = self.blocking + own + self.lost(delay + self.own.cost)
-            longer += sum(one.before(delay + self.bit) * one.cost for one in self.above)
+            longer = self.blocking + own + self.lost(delay + self.own.cost) + _demand(self.above, delay + self.bit)
             if longer <= delay:
                 return delay
             delay = longer
+
+
+def _demand(messages: Sequence[Arrivals], t: int) -> int:
+    """Time that the frames queued in [0, t) take; `Arrivals.before`, where it is called most."""
+    demand = 0
+    for one in messages:
+        later = -((one.first - t) // one.period)
+        demand += (one.early + later if later > 0 else one.early) * one.cost
+    return demand

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
@@ -162,10 +162,9 @@ def worst_case_response(
     ordered = sorted(messages, key=lambda message: message.cob_id)
     _check(ordered, errors)
     timed = [(m, frame_time_ns(m.n_data, bitrate) if m.frame_ns is None else m.frame_ns) for m in ordered]
-    responses = []
-    for rank in range(len(timed)):
-        blocking = max((c for _, c in timed[rank + 1 :]), default=0)
-        responses.append(_respond(blocking, timed[: rank + 1], bitrate, errors))
+    responses = _respond_all(timed, [None] * len(timed), bitrate, errors)
+    if any(m.offset_ns is not None for m in ordered):  # now it is known who can be on the bus when
+        responses = _respond_all(timed, [response.response_ns for response in responses], bitrate, errors)
     return BusAnalysis(tuple(responses), sum(c / m.period_ns for m, c in timed))
 
 
@@ -185,29 +184,62 @@ def _check(ordered: Sequence[Message], errors: Errors) -> None:
 _Timed = tuple[Message, int]
 
 
-def _respond(blocking: int, level: Sequence[_Timed], bitrate: int, errors: Errors) -> Response:
+def _respond_all(timed: Sequence[_Timed], bounds: Sequence[int | None], bitrate: int, errors: Errors) -> list[Response]:
+    """Every response; `bounds` are upper bounds of them, where known."""
+    known = list(zip(timed, bounds, strict=True))
+    return [_respond(timed[: rank + 1], known[rank + 1 :], bitrate, errors) for rank in range(len(timed))]
+
+
+def _respond(
+    level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]], bitrate: int, errors: Errors
+) -> Response:
     message, frame_ns = level[-1]
     error_cost = _ceil_div(errors.overhead_bits * _NS, bitrate) + max(c for _, c in level)
     if _overloaded(level, errors.interval_ns, error_cost):
         return Response(message, frame_ns, None, 0)
     worst = instances = 0
-    for start in _starts(level):
+    for start, blocking in _starts(level, below).items():
         *above, own = (_align(m, c, start) for m, c in level)
-        at = Level(
-            own, above, blocking, _ceil_div(_NS, bitrate), errors.burst, errors.interval_ns, error_cost
-        ).finished()
+        bit = _ceil_div(_NS, bitrate)
+        at = Level(own, above, blocking, bit, errors.burst, errors.interval_ns, error_cost).finished()
         instances = max(instances, len(at))
         worst = max([worst, *((message.offset_ns or 0) + finished - release for release, finished in at)])
     return Response(message, frame_ns, worst, instances)
 
 
-def _starts(level: Sequence[_Timed]) -> Iterable[int]:
-    """Phases of the transaction at which a busy period has to be tried: where one of its messages is at its latest."""
+def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> dict[int, int]:
+    """Where a busy period has to begin in the transaction, and how long a frame from below can block it there.
+
+    It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
+    really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
+    """
+    longest = max((c for (_, c), _ in below), default=0)
     members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
-    cycle = math.lcm(*(m.period_ns for m, _ in members))
-    return sorted(
-        {(offset + m.jitter_ns + k * m.period_ns) % cycle for m, offset in members for k in range(cycle // m.period_ns)}
-    ) or [0]
+    if not members:
+        return {0: longest}
+    cycle = math.lcm(
+        *(m.period_ns for m, _ in members), *(m.period_ns for (m, _), _ in below if m.offset_ns is not None)
+    )
+    unknown = len(members) < len(level) or any(end is None for _, end in below)
+    found: dict[int, int] = {}
+    for message, offset in members:
+        for first in range(offset, offset + cycle, message.period_ns):
+            blocking = longest if unknown else _blocking(below, first, message.jitter_ns)
+            start = (first + message.jitter_ns) % cycle
+            found[start] = max(found.get(start, 0), blocking)
+    return found
+
+
+def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter_ns: int) -> int:
+    return max((c for (m, c), end in below if _on_the_bus(m, end, first, jitter_ns)), default=0)
+
+
+def _on_the_bus(message: Message, end_ns: int | None, first: int, jitter_ns: int) -> bool:
+    """Whether a message, through `end_ns` after its event at the latest, can be on the bus at `first` or in jitter."""
+    if message.offset_ns is None or end_ns is None:
+        return True
+    into = (first - message.offset_ns) % message.period_ns  # since it was last released
+    return into < end_ns - message.offset_ns or into + jitter_ns >= message.period_ns
 
 
 def _align(message: Message, frame_ns: int, start: int) -> Arrivals:
