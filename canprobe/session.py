@@ -114,8 +114,8 @@ class Session:
     """
 
     def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
-        self.scene = scene
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
@@ -205,7 +205,7 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel, fd=self.scene.bus.fd)
+        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel, fd=self.scene.bus.fd is True)
         bus.recorder = self._writer(0)
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)

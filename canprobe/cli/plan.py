@@ -14,6 +14,7 @@ for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
 
 examples:
   canprobe plan cylinder
+  canprobe plan mine.toml --auto
   canprobe plan cylinder --export dbc --export dcf --out config/
 """
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
@@ -26,6 +27,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     add_scene(parser)
     parser.add_argument(
+        "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
+    )
+    parser.add_argument(
         "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
@@ -36,9 +40,11 @@ def add_parser(commands: Commands[Parser]) -> None:
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.planning import make_plan, plan_text
+    from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
-    plan = make_plan(load_scene(args.scene))
+    scene = load_scene(args.scene)
+    plan = make_plan(opened(scene) if args.auto else scene)
     files: list[Path] = []
     if args.export:
         from canprobe.bridge.export import export_plan

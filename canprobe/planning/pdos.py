@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.model import Direction, PlannedPdo, SyncPlan
 from canprobe.planning.wire_bits import frame_bits
-from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry, PdoLayout
 from canprobe.protocol.timing import worst_case_bits
 from canprobe.scene import Scene, TactileModeName
@@ -147,7 +146,7 @@ def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio
             layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
             bits = frame_bits(layout.length, scene.bus)
             pdo = _synchronous(sensor.node_id, "tpdo", number, layout, sync, cycles=cycles, bits=bits)
-            planning.add(device, pdo)
+            planning.add(device, replace(pdo, kind="tactile"))
 
 
 def _parcels(objects: Sequence[tuple[int, int]], long: bool) -> list[Sequence[tuple[int, int]]]:
@@ -177,22 +176,3 @@ def _synchronous(
         bits_worst=worst_case_bits(layout.length) if bits is None else bits,
         deadline_ns=cycles * sync.period_ns,
     )
-
-
-def identifier_problems(pdos: Iterable[PlannedPdo]) -> list[str]:
-    """Restricted identifiers, and identifiers that two producers would send. Source: CiA 301.
-
-    An RPDO's producer is the master, so several drives may read one; a TPDO's identifier belongs to its node alone.
-    """
-    problems, owners = [], dict[int, PlannedPdo]()
-    for pdo in pdos:
-        name = f"node {pdo.node_id} {pdo.direction.upper()}{pdo.number}"
-        if is_restricted(pdo.cob_id):
-            problems.append(f"{name}: COB-ID {pdo.cob_id:03X}h is restricted (CiA 301); choose another node id")
-        other = owners.setdefault(pdo.cob_id, pdo)
-        if other is not pdo and "tpdo" in (pdo.direction, other.direction):
-            problems.append(
-                f"{name}: COB-ID {pdo.cob_id:03X}h is used by node {other.node_id} "
-                f"{other.direction.upper()}{other.number} too; choose other node ids"
-            )
-    return problems

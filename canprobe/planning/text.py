@@ -11,6 +11,7 @@ from canprobe.planning.model import (
     Plan,
     PlannedNode,
     PlannedPdo,
+    Traffic,
 )
 from canprobe.protocol.pdo import PdoEntry
 
@@ -32,8 +33,12 @@ def _lines(plan: Plan) -> Iterator[str]:
     )
     yield from _titled("nodes", _node_rows(plan.nodes))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
-    yield from _titled("bus, worst case", list(_bus_rows(plan)))
+    for one in plan.buses:
+        yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
     yield from _titled(f"one cycle of {_us(sync.period_ns)} µs, worst case", list(_budget_rows(plan.traffic.budget)))
+    if plan.choices:
+        rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
+        yield from _titled("chosen by the plan", rows)
     if plan.joint_speeds is not None:
         rows = [["joint", "needed", "allowed (deg/s)"]]
         speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
@@ -54,11 +59,13 @@ def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
-    rows = [["id", "role", "identity (vendor product revision)", "EDS", ""]]
+    several = len({node.channel for node in nodes}) > 1
+    rows = [["id", "role", "identity (vendor product revision)", "EDS", "", *(["bus"] if several else [])]]
     for node in nodes:
         identity = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in identity)
-        rows.append([str(node.node_id), node.role, numbers, node.eds, "emulated" if node.emulated else "real"])
+        kind = "emulated" if node.emulated else "real"
+        rows.append([str(node.node_id), node.role, numbers, node.eds, kind, *([node.channel] if several else [])])
     return rows
 
 
@@ -97,10 +104,10 @@ def _content(entries: Sequence[PdoEntry]) -> str:
     )
 
 
-def _bus_rows(plan: Plan) -> Iterator[list[str]]:
-    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in plan.traffic.parts)
-    yield ["load", f"{100 * plan.traffic.load:.1f} %", parts]
-    for demand in plan.traffic.demands:
+def _bus_rows(traffic: Traffic) -> Iterator[list[str]]:
+    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in traffic.parts)
+    yield ["load", f"{100 * traffic.load:.1f} %", parts]
+    for demand in traffic.demands:
         cycles = f"{demand.cycles} cycle" + ("s" if demand.cycles > 1 else "")
         yield [
             f"in {cycles}",
