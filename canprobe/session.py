@@ -27,7 +27,7 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.protocol.timing import best_case_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.scene import Scene
 
 if TYPE_CHECKING:
@@ -75,11 +75,17 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
 
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
-        self._by_length = [0] * 9
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -88,8 +94,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far."""
-        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -110,8 +118,8 @@ class Session:
     """
 
     def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
-        self.scene = scene
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
@@ -200,7 +208,7 @@ class Session:
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             self._log = writer
             write = writer.write
-        self.traffic = TrafficCounter(write)
+        self.traffic = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         return self.traffic.write
 
     def _open_lockstep(self) -> Port:
@@ -260,8 +268,8 @@ class Session:
 
 def _lockstep_bus(scene: Scene) -> LockstepBus:
     """A bus in virtual time, with the bit rate of the scene or without one."""
-    if not scene.bus.timed:
-        return LockstepBus(VirtualClock(), scene.bus.channel)
+    if not scene.bus.timed or scene.bus.fd is True:
+        return LockstepBus(VirtualClock(), scene.bus.channel, fd=scene.bus.fd is True)
     from canprobe.bus.timed import TimedBus
     from canprobe.bus.wire_errors import BitErrors
 

@@ -95,9 +95,10 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
     sensor = plan.scene.sensor
     if sensor is None:
         return None
-    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(sensor.node_id, "tpdo")]
+    pdos = plan.pdos_of(sensor.node_id, "tpdo")
+    cob_ids = [pdo.cob_id for pdo in pdos]
     deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
-    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline)
+    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline, [pdo.layout.length for pdo in pdos])
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
 
 

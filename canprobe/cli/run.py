@@ -32,6 +32,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="length of the scene's phase, seconds [the scene's]"
     )
+    parser.add_argument("--blf", action="store_true", help="write the bus as bus.blf too, when the run is over")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -67,6 +68,11 @@ def run(args: argparse.Namespace) -> int:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
         raise
+    finally:
+        if args.blf and (folder / "bus.log").is_file():
+            from canprobe.bus.logfile import convert_log
+
+            convert_log(folder / "bus.log", folder / "bus.blf")
     if args.json:
         print_json(result.summary)
     else:
