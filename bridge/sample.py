@@ -58,7 +58,7 @@ class TaxelImage:
 class Wrench:
     """What the object does to the probe, expressed in the probe's centre frame.
 
-    The array feels pressure only: the force runs along the contact normal, and on a sphere has no torque about its centre.
+    The array feels pressure only: the force runs along the contact normal, without a torque about the sphere's centre.
 
     Attributes:
         t_ns: when the array was sampled.
