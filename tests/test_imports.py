@@ -40,6 +40,7 @@ ALLOWED = {
 # top-level modules that join cell and emulator
 COMPOSITION = {
     "api",
+    "bridging",
     "results",
     "session",
     "child",
