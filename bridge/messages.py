@@ -9,14 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bridge import topics
-from canprobe.bridge.cdr import Encoder
+from canprobe.bridge.cdr import Encoder, encode_can_frame
 from canprobe.bridge.sample import (
     BASE,
     CONTACT,
     FLANGE,
     JOINT_NAMES,
     PROBE,
-    CanFrame,
     ContactFrame,
     Joints,
     Sample,
@@ -60,7 +59,8 @@ class Messages:
     def of(self, sample: Sample) -> Iterator[Message]:
         """Every message of a sample; the time of each is its own."""
         for frame in sample.frames:
-            yield self._message(topics.CAN_FRAMES, frame.t_ns, self._can_frame(frame))
+            t_ns = self._epoch_time(frame.t_ns)
+            yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
         if self._static_due:
             self._static_due = False
             yield self._message(topics.TF_STATIC, sample.t_ns, self._static(sample.t_ns))
@@ -147,20 +147,6 @@ class Messages:
         vector = self._vector(np.array([first, second, 0.5 * (first + second)]))
         return self._make("geometry_msgs/msg/Vector3Stamped", header=self._header(patch.t_ns, CONTACT), vector=vector)
 
-    def _can_frame(self, frame: CanFrame) -> Any:
-        data = np.zeros(8, np.uint8)
-        data[: len(frame.data)] = np.frombuffer(frame.data, np.uint8)
-        return self._make(
-            topics.CAN_FRAMES.type_name,
-            header=self._header(frame.t_ns, ""),
-            id=frame.can_id,
-            is_rtr=frame.remote,
-            is_extended=frame.extended,
-            is_error=False,
-            dlc=len(frame.data),
-            data=data,
-        )
-
     def _diagnostics(self, sample: Sample) -> Any:
         status = [
             self._make(
@@ -178,13 +164,16 @@ class Messages:
     # parts of messages
 
     def _message(self, topic: Topic, t_ns: int, message: Any) -> Message:
-        return topic, max(self.epoch_ns + t_ns, 0), self.encoder.encode(topic.type_name, message)
+        return topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, message)
+
+    def _epoch_time(self, t_ns: int) -> int:
+        return max(self.epoch_ns + t_ns, 0)  # a sample may be a moment older than the bus
 
     def _make(self, type_name: str, **fields: Any) -> Any:
         return self._types[type_name](**fields)
 
     def _header(self, t_ns: int, frame_id: str) -> Any:
-        seconds, ns = divmod(max(self.epoch_ns + t_ns, 0), 1_000_000_000)
+        seconds, ns = divmod(self._epoch_time(t_ns), 1_000_000_000)
         stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=ns)
         return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
 

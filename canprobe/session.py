@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from canprobe.emulator.build import World
 
 Array = NDArray[np.float64]
+Say = Callable[[str], None]
 LOCKSTEP = "lockstep"
 
 

@@ -46,6 +46,7 @@ COMPOSITION = {
     "child",
     "rehearsal",
     "recorded",
+    "recorded_bridges",
     "recorded_summary",
     "surface_file",
     "emulation",

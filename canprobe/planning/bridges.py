@@ -20,6 +20,7 @@ class BridgeInfo:
         module: of `canprobe.bridge`, loaded in the bridge's own process only.
         extra: of this package, which installs what the bridge needs.
         packages: to be imported, by their import names.
+        live: it shows the cell while it runs.
         output: the file that it writes into the run's folder, None where it writes none.
     """
 
@@ -27,6 +28,7 @@ class BridgeInfo:
     module: str
     extra: str
     packages: tuple[str, ...]
+    live: bool = False
     output: str | None = None
 
     @property
@@ -49,10 +51,14 @@ BRIDGES: Mapping[str, BridgeInfo] = {
         output="run.mcap",
     ),
     "foxglove": BridgeInfo(
-        "live view in Foxglove over a WebSocket", "foxglove_live", "foxglove", ("foxglove", "rosbags")
+        "live view in Foxglove over a WebSocket", "foxglove_live", "foxglove", ("foxglove", "rosbags"), live=True
     ),
     "ros2": BridgeInfo(
-        "live ROS 2 topics and commands, without ROS being installed", "ros2_dds", "ros2", ("cyclonedds", "rosbags")
+        "live ROS 2 topics and commands, without ROS being installed",
+        "ros2_dds",
+        "ros2",
+        ("cyclonedds", "rosbags"),
+        live=True,
     ),
 }
 
