@@ -6,7 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,15 +24,18 @@ from canprobe.bus.port import Port
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
+from canprobe.planning.bridges import check_bridges
 from canprobe.protocol.timing import best_case_bits
-from canprobe.scene import Scene
+from canprobe.scene import BridgeSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
 
 Array = NDArray[np.float64]
+Say = Callable[[str], None]
 LOCKSTEP = "lockstep"
 
 
@@ -44,8 +47,9 @@ def resolve_scene(
     bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them."""
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
     bus = replace(
         scene.bus,
         interface=scene.bus.interface if interface is None else interface,
@@ -54,7 +58,16 @@ def resolve_scene(
     )
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    return replace(scene, bus=bus, scene=info, task=task)
+    return replace(scene, bus=bus, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
 def hush_canopen() -> None:
@@ -97,9 +110,16 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Callable[[str], None] = lambda _: None) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        out: Path | None = None,
+        say: Callable[[str], None] = lambda _: None,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+    ) -> None:
         self.scene = scene
         self.plan: Plan = make_plan(scene)
         self.out = out
@@ -111,6 +131,7 @@ class Session:
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
+        self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -141,9 +162,11 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say)
+            self._cell = make_cell(self.plan, port, self._say, observers=self.observers)
             self._stack.enter_context(garbage_collection_paused())
+            self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
+            self._observe_frames(port)
         except BaseException:
             self._close()
             raise
@@ -182,8 +205,16 @@ class Session:
             self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             write = writer.write
+        if self.observers is not None:
+            self.observers.origin_ns = t0_ns
+            write = self.observers.tap(write)
         self.traffic = TrafficCounter(write)
         return self.traffic.write
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world

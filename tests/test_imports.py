@@ -40,11 +40,13 @@ ALLOWED = {
 # top-level modules that join cell and emulator
 COMPOSITION = {
     "api",
+    "bridging",
     "results",
     "session",
     "child",
     "rehearsal",
     "recorded",
+    "recorded_bridges",
     "recorded_summary",
     "surface_file",
     "emulation",

@@ -14,6 +14,7 @@ from canprobe.cell.configuration import make_setups
 from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
 from canprobe.cell.measurement import Controller
+from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
@@ -31,7 +32,11 @@ TACTILE_TIMEOUT_PERIODS = 6
 
 
 def make_cell(
-    plan: Plan, port: Port, say: Callable[[str], None] = lambda _: None, times: BringUpTimes | None = None
+    plan: Plan,
+    port: Port,
+    say: Callable[[str], None] = lambda _: None,
+    times: BringUpTimes | None = None,
+    observers: Observers | None = None,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered."""
     settings = CycleSettings(
@@ -50,6 +55,7 @@ def make_cell(
         missed_limit=arm.missed_syncs if (arm := plan.scene.arm) is not None else 0,
         say=say,
         times=times,
+        observers=observers,
     )
 
 

@@ -12,6 +12,7 @@ from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
@@ -37,6 +38,7 @@ class Cell:
         missed_limit: cycles without a TPDO after which a drive is lost, as many SYNCs as a drive waits for its master.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
+        observers: called after each cycle.
     """
 
     def __init__(
@@ -51,6 +53,7 @@ class Cell:
         missed_limit: int,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
+        observers: Observers | None = None,
     ) -> None:
         self.log = RunLog()
         self.drives = drives
@@ -62,6 +65,7 @@ class Cell:
         self._settings = settings
         self._missed_limit = missed_limit
         self._say = say
+        self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
@@ -207,6 +211,8 @@ class Cell:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
         self.log.add(row)
+        if self._observers is not None and self.cycle is not None:
+            self._observers.cycle(self.cycle.t_first_ns, measurement, command)
 
     # the way out
 
