@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -161,6 +162,10 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
 
 
 def _draw(result: RunResult, out: Path) -> None:
+    (out / "report.html").unlink(missing_ok=True)  # of an earlier run
+    if "report.html" in result.plan.outputs:
+        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
+        page.write_page(recorded.read_run(out), out / "report.html")
     try:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface

@@ -18,7 +18,7 @@ ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
-BridgeName = Literal["mcap", "foxglove", "ros2"]
+BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -194,6 +194,8 @@ class BridgeSettings:
     foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
     ros2_domain: Annotated[int, Range(0, 232)] = 0
     ros2_loopback: bool = True  # false lets other machines see the topics, and command the cell where that is allowed
+    view_port: Annotated[int, Range(0, 65_535)] = 8080  # 0 lets the system choose; where it is taken, the next free one
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
     ros2_commands: bool = False  # start, stop, target force and speed are taken from topics, within the scene's limits
 
 

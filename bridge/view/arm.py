@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from canprobe.bridge.transforms import link_transforms
 from canprobe.bridge.view.meshes import Array, Mesh, cylinder, dome, link, merged, revolved
 from canprobe.robot.puma260 import PumaModel
 
@@ -49,15 +50,11 @@ def link_frames(model: PumaModel, q: ArrayLike) -> Array:
 
     Returns:
         (7, 4, 4) T_base_link; the last is the flange.
-
-    Source: standard Denavit–Hartenberg, T = Rz(q) Tz(d) Tx(a) Rx(alpha).
     """
     frames = np.empty((7, 4, 4))
     frames[0] = np.eye(4)
-    for i, ((a, alpha, d), angle) in enumerate(zip(model.dh, np.asarray(q, dtype=float), strict=True)):
-        c, s, ca, sa = math.cos(angle), math.sin(angle), math.cos(alpha), math.sin(alpha)
-        step = ((c, -s * ca, s * sa, a * c), (s, c * ca, -c * sa, a * s), (0.0, sa, ca, d), (0.0, 0.0, 0.0, 1.0))
-        frames[i + 1] = frames[i] @ np.array(step)
+    for i, (_, _, T) in enumerate(link_transforms(model, np.asarray(q, dtype=np.float64))):
+        frames[i + 1] = frames[i] @ T
     return frames
 
 
@@ -69,13 +66,12 @@ def arm_parts(model: PumaModel) -> list[Part]:
 def _trunk(model: PumaModel) -> list[Part]:
     d1 = model.links[0]
     side = math.copysign(1.0, model.links[2])  # on which side of the trunk the arm hangs, along axis 2
-    foot = merged([cylinder(0.092, 0.0, 0.016, 4e-3), cylinder(0.066, 0.016, 0.034, RIM)])
-    column = cylinder(0.054, 0.030, d1 - 0.072, RIM)
+    foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM)])
+    column = cylinder(0.054, (0.030, d1 - 0.072), RIM)
     # frame 1: z along axis 2, y up along the trunk, origin at the shoulder
-    collar = cylinder(0.056, -0.070, -0.058, 2e-3).moved(_UP)
-    neck = cylinder(0.052, -0.058, 0.0, RIM).moved(_UP)
-    near, far = sorted((-side * 0.062, side * (_reach(model) - 0.002)))
-    drum = cylinder(SHOULDER, near, far, RIM)
+    collar = cylinder(0.056, (-0.070, -0.058), 2e-3).moved(_UP)
+    neck = cylinder(0.052, (-0.058, 0.0), RIM).moved(_UP)
+    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(model) - 0.002)), RIM)
     return [
         Part("foot", 0, foot, DARK),
         Part("column", 0, column, WHITE),
@@ -93,41 +89,42 @@ def _upper_arm(model: PumaModel) -> list[Part]:
     _, a2, offset, _, _, _ = model.links
     side = math.copysign(1.0, offset)
     shift = float(model.dh[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
-    low, high = sorted(shift - offset + side * np.array([_reach(model), _reach(model) + UPPER_ARM]))
-    beam = link((-a2, 0.0), SHOULDER + 0.004, (0.0, 0.0), ELBOW + 0.002, low, high, 8e-3)
-    outer = low if side < 0 else high  # the face away from the trunk
-    cap = cylinder(SHOULDER - 0.014, *sorted((outer, outer + side * 0.006)), 2e-3)
-    T = np.eye(4)
-    T[0, 3] = -a2
-    pin = cylinder(ELBOW - 0.014, *sorted((shift, shift - side * (0.5 * FOREARM + 0.02))))
-    return [Part("upper_arm", 2, beam, WHITE), Part("shoulder_cap", 2, merged([cap.moved(T), pin]), DARK)]
+    trunk = shift - offset
+    near, far = trunk + side * _reach(model), trunk + side * (_reach(model) + UPPER_ARM)
+    shoulder, elbow = (-a2, 0.0), (0.0, 0.0)
+    beam = link((shoulder, SHOULDER + 0.004), (elbow, ELBOW + 0.002), _span(near, far), 8e-3)
+    cap = link((shoulder, SHOULDER - 0.014), (shoulder, SHOULDER - 0.014), _span(far, far + side * 0.006), 2e-3)
+    pin = cylinder(ELBOW - 0.014, _span(shift, shift - side * (0.5 * FOREARM + 0.02)))
+    return [Part("upper_arm", 2, beam, WHITE), Part("shoulder_cap", 2, merged([cap, pin]), DARK)]
 
 
 def _forearm(model: PumaModel) -> list[Part]:
     _, _, offset, a3, d4, _ = model.links
     # frame 3: z along the forearm, y against axis 2; the elbow is at x = −a3
-    half = 0.5 * FOREARM
-    beam = link((-a3, 0.0), ELBOW, (0.0, d4 - 0.062), WRIST + 0.004, -half, half, 8e-3).moved(_ZX)
-    side = math.copysign(1.0, offset)
-    T = np.eye(4)
-    T[0, 3] = -a3
-    cap = cylinder(ELBOW - 0.014, *sorted((side * half, side * (half + 0.006))), 2e-3).moved(_ZX).moved(T)
-    ring = cylinder(WRIST - 0.001, d4 - 0.040, d4 - 0.028, 2e-3)
-    return [Part("forearm", 3, beam, WHITE), Part("elbow_cap", 3, merged([cap, ring]), DARK)]
+    half, elbow = 0.5 * FOREARM, (-a3, 0.0)
+    side = math.copysign(half, offset)
+    beam = link((elbow, ELBOW), ((0.0, d4 - 0.062), WRIST + 0.004), (-half, half), 8e-3)
+    cap = link((elbow, ELBOW - 0.014), (elbow, ELBOW - 0.014), _span(side, 1.2 * side), 2e-3)
+    ring = cylinder(WRIST - 0.001, (d4 - 0.040, d4 - 0.028), 2e-3)
+    return [Part("forearm", 3, beam.moved(_ZX), WHITE), Part("elbow_cap", 3, merged([cap.moved(_ZX), ring]), DARK)]
 
 
 def _wrist(model: PumaModel) -> list[Part]:
     d6 = model.links[5]
     # frame 4: y along the forearm, z along axis 5; frame 5: z along axis 6
-    stem = cylinder(WRIST - 0.003, -0.030, 0.0, 3e-3).moved(_UP)
-    hinge = cylinder(0.021, -0.027, 0.027, 4e-3)
-    hub = link((0.0, 0.0), 0.018, (0.0, d6 - 0.024), 0.015, -0.017, 0.017, 3e-3).moved(_ZX)
-    flange = cylinder(0.021, -0.016, 0.0, 2e-3)
+    stem = cylinder(WRIST - 0.003, (-0.030, 0.0), 3e-3).moved(_UP)
+    hinge = cylinder(0.021, (-0.027, 0.027), 4e-3)
+    hub = link(((0.0, 0.0), 0.018), ((0.0, d6 - 0.024), 0.015), (-0.017, 0.017), 3e-3).moved(_ZX)
+    flange = cylinder(0.021, (-0.016, 0.0), 2e-3)
     return [
         Part("wrist", 4, merged([stem, hinge]), WHITE),
         Part("hub", 5, hub, GREY),
         Part("flange", 6, flange, DARK),
     ]
+
+
+def _span(a: float, b: float) -> tuple[float, float]:
+    return (a, b) if a <= b else (b, a)
 
 
 def probe_parts(radius: float, T_flange_probe: Array) -> tuple[Mesh, Mesh]:
@@ -138,8 +135,9 @@ def probe_parts(radius: float, T_flange_probe: Array) -> tuple[Mesh, Mesh]:
         T_flange_probe: (4, 4); the holder goes back along z to the flange.
     """
     back = float(T_flange_probe[2, 3])
-    holder = revolved([(0.0, -back), (0.014, -back), (0.014, -0.72 * radius), (0.62 * radius, -0.42 * radius),
-                       (0.9 * radius, -0.42 * radius), (0.9 * radius, -0.34 * radius), (0.0, -0.34 * radius)])  # fmt: skip
+    r = radius
+    outline = [(0.0, -back), (0.014, -back), (0.014, -0.72 * r), (0.62 * r, -0.42 * r), (0.9 * r, -0.42 * r)]
+    holder = revolved([*outline, (0.9 * r, -0.34 * r), (0.0, -0.34 * r)])
     return holder, dome(radius, math.radians(110.0))
 
 

@@ -45,7 +45,7 @@ def row_of(moment: Moment) -> tuple[float, ...]:
     """One row of the plots, in the order of `NAMES`."""
     nan = math.nan
     if moment.patch is None:
-        bands = (nan,) * 6
+        bands: tuple[float, ...] = (nan,) * 6
     else:
         kappa, sigmas = moment.patch.kappa, kappa_sigmas(moment.patch)
         bands = tuple(

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
 
 SECTORS = 48
+Circle = tuple[tuple[float, float], float]
+"""Centre (x, y) and radius, m."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -76,7 +79,7 @@ def prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
     outlines = [np.column_stack([outline, np.full(len(outline), z)]) for outline, z in rings]
     closed = [np.vstack([ring, ring[:1]]) for ring in outlines]
     # a wall seen from outside: round the outline first, then up
-    walls = [grid(np.stack([low, high], axis=1)) for low, high in zip(closed, closed[1:], strict=False)]
+    walls = [grid(np.stack([low, high], axis=1)) for low, high in pairwise(closed)]
     return merged([*walls, _fan(outlines[0][::-1]), _fan(outlines[-1])])
 
 
@@ -88,49 +91,54 @@ def _fan(ring: Array) -> Mesh:
     return Mesh(np.vstack([ring, ring.mean(axis=0)]), faces)
 
 
-def link_outline(first: ArrayLike, r0: float, second: ArrayLike, r1: float, sectors: int = SECTORS) -> Array:
+def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Array:
     """Outline of a link seen along its joint axes: two circles and their common tangents, (sectors + 2, 2).
 
     Args:
-        first, second: (2,) centres, m; the same point for a circle of the larger radius.
-        r0, r1: radii, m.
+        first, second: where the axes pass and the radii round them; where one lies in the other, the larger radius
+            round the first centre.
         sectors: even number of points on the two arcs together.
     """
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
-    length = float(np.linalg.norm(b - a))
+    (a, r0), (b, r1) = first, second
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    length = math.hypot(dx, dy)
     if length <= abs(r0 - r1):
         r0 = r1 = max(r0, r1)
         b, length = a, 0.0
-    heading = math.atan2(b[1] - a[1], b[0] - a[0]) if length else 0.0
+    heading = math.atan2(dy, dx) if length else 0.0
     spread = math.acos((r0 - r1) / length) if length else math.pi / 2
     near = np.linspace(heading - spread, heading + spread, sectors // 2 + 1)
     far = np.linspace(heading + spread, heading + 2 * math.pi - spread, sectors // 2 + 1)
-    circle = lambda centre, r, angles: centre + r * np.column_stack([np.cos(angles), np.sin(angles)])  # noqa: E731
-    outline: Array = np.concatenate([circle(b, r1, near), circle(a, r0, far)])
-    return outline
+    return np.concatenate([_arc(b, r1, near), _arc(a, r0, far)])
 
 
-def link(first: ArrayLike, r0: float, second: ArrayLike, r1: float, low: float, high: float, rim: float = 0.0) -> Mesh:
+def _arc(centre: tuple[float, float], radius: float, angles: Array) -> Array:
+    points: Array = centre + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return points
+
+
+def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 0.0) -> Mesh:
     """A link between two parallel joint axes along z, its rims rounded off.
 
     Args:
-        first, second: (2,) where the axes pass, m.
-        r0, r1: radii round them, m.
-        low, high: its two flat sides, m.
+        first, second: where the axes pass (x, y) and the radii round them, m.
+        span: its two flat sides, lower first, m.
         rim: radius of the rounding, m, below both radii and half the thickness.
     """
-    steps = [0.0] if rim <= 0.0 else [math.radians(a) for a in (0.0, 22.5, 45.0, 67.5, 90.0)]
-    inset = [rim * (1.0 - math.sin(a)) for a in steps] if rim > 0.0 else [0.0]
-    rise = [rim * (1.0 - math.cos(a)) for a in steps]
-    outlines = [link_outline(first, r0 - i, second, r1 - i) for i in inset]
+    (a, r0), (b, r1) = first, second
+    low, high = span
+    steps = [0.0] if rim <= 0.0 else [math.radians(angle) for angle in (0.0, 22.5, 45.0, 67.5, 90.0)]
+    inset = [rim * (1.0 - math.sin(angle)) for angle in steps] if rim > 0.0 else [0.0]
+    rise = [rim * (1.0 - math.cos(angle)) for angle in steps]
+    outlines = [link_outline((a, r0 - i), (b, r1 - i)) for i in inset]
     below = [(outline, low + z) for outline, z in zip(outlines, rise, strict=True)]
     above = [(outline, high - z) for outline, z in zip(outlines, rise, strict=True)][::-1]
     return prism([*below, *above])
 
 
-def cylinder(radius: float, low: float, high: float, rim: float = 0.0) -> Mesh:
-    """A round cylinder along z."""
-    return link((0.0, 0.0), radius, (0.0, 0.0), radius, low, high, rim)
+def cylinder(radius: float, span: tuple[float, float], rim: float = 0.0) -> Mesh:
+    """A round cylinder along z; see :func:`link`."""
+    return link(((0.0, 0.0), radius), ((0.0, 0.0), radius), span, rim)
 
 
 def revolved(profile: ArrayLike, sectors: int = SECTORS) -> Mesh:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,18 +96,3 @@ class Follower:
 
     def _error(self, patch: SurfacePatch) -> float:
         return math.nan if self.shape is None else curvature_error(patch, self.shape)
-
-
-def follow(samples: Iterable[Sample], shape: PlacedShape | None, step_s: float) -> list[Moment]:
-    """Moments of a recorded run, one every `step_s`, the last one included."""
-    follower = Follower(shape)
-    moments: list[Moment] = []
-    due = -math.inf
-    for sample in samples:
-        moment = follower.take(sample)
-        if moment.t_s >= due:
-            moments.append(moment)
-            due = moment.t_s + step_s - 1e-9
-    if moments and moments[-1] is not follower.moment:
-        moments.append(follower.moment)
-    return moments

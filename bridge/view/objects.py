@@ -9,7 +9,7 @@ import numpy as np
 from canprobe.bridge.view.meshes import Array, Mesh, dome, grid
 from canprobe.touch.objects import Bowl, Cylinder, PlacedShape, Sphere
 
-REACH_M = 0.07
+REACH_M = 0.055
 """How much of a surface without end is shown round the object's origin, to each side."""
 WHOLE_M = 0.12
 """Largest radius of a body that is shown whole."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.candump import read_candump
+from canprobe.cell.build import TACTILE_DEADLINE_CYCLES
 from canprobe.planning import make_plan
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
@@ -34,17 +35,14 @@ def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
     if mode is TactileMode.FEATURES or not file.is_file():
         return ()
     plan = make_plan(scene)
-    wanted = {pdo.cob_id for pdo in plan.pdos_of(scene.sensor.node_id, "tpdo")}
-    assembler = FrameAssembler(
-        [pdo.cob_id for pdo in plan.pdos_of(scene.sensor.node_id, "tpdo")], mode, 2 * plan.sync.period_ns
-    )
+    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(scene.sensor.node_id, "tpdo")]
+    assembler = FrameAssembler(cob_ids, mode, TACTILE_DEADLINE_CYCLES * plan.sync.period_ns)
     start: int | None = None
     frames = []
-    for t_ns, _, can_id, data in read_candump(file):
+    for t_ns, _, can_id, data in read_candump(file, only={SYNC_ID, *cob_ids}):
         if start is None and can_id == SYNC_ID:
             start = t_ns
-        if can_id in wanted and start is not None:
-            frame = assembler.push(can_id, data, t_ns)
-            if frame is not None:
-                frames.append(((t_ns - start) * 1e-9, frame.taxels))
+        frame = assembler.push(can_id, data, t_ns)
+        if frame is not None and start is not None:
+            frames.append(((t_ns - start) * 1e-9, frame.taxels))
     return tuple(frames)

@@ -12,7 +12,7 @@ from canprobe.bridge.view.path_nodes import LoadedPath
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale
+from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
 from canprobe.bus.clock import MonotonicClock
 from canprobe.scene_geometry import true_object
 from canprobe.touch.objects import PlacedShape
@@ -85,14 +85,6 @@ class Player:
 def shape_of(run: RecordedRun) -> PlacedShape | None:
     """The true object of a run's scene."""
     return None if run.scene.object is None else true_object(run.scene.object)
-
-
-def true_kappa(shape: PlacedShape | None) -> tuple[float, float] | None:
-    """Principal curvatures at the object's origin, 1/m, larger first."""
-    if shape is None:
-        return None
-    first, second = shape.closest(shape.T_base_object[:3, 3]).kappa.tolist()
-    return first, second
 
 
 def trail_of(run: RecordedRun) -> Trail:

@@ -6,20 +6,20 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.bridge.transforms import quaternion_of
 from canprobe.bridge.view.arm import arm_parts, link_frames, probe_parts
 from canprobe.bridge.view.colours import UNKNOWN
 from canprobe.bridge.view.meshes import Array, Mesh
 from canprobe.bridge.view.moments import Moment
 from canprobe.bridge.view.objects import object_lines, object_mesh
 from canprobe.bridge.view.patch import disc_faces, disc_points, patch_shape
-from canprobe.bridge.view.rotations import quaternion
 from canprobe.bridge.view.taxels import taxel_colours, taxel_poses, tile
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene
 from canprobe.scene_geometry import T_flange_probe, true_object
 
 OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (52, 60, 72), (255, 170, 60), (250, 196, 60), (214, 56, 44)
-FORCE_M_PER_N = 0.025
+FORCE_M_PER_N = 0.02
 """Length of the force arrow."""
 LEAST_FORCE_N = 0.05
 
@@ -69,7 +69,7 @@ class Stage:
         ):
             api.add_light_directional(f"/light/{name}", position=place, intensity=intensity, cast_shadow=shadow)
         api.add_grid(
-            "/floor", width=1.2, height=1.2, cell_size=0.05, section_size=0.2, cell_color=(226, 229, 233),
+            "/floor", width=1.6, height=1.6, cell_size=0.05, section_size=0.2, cell_color=(226, 229, 233),
             section_color=(200, 206, 212), plane_color=(247, 248, 250), plane_opacity=1.0, shadow_opacity=0.25,
         )  # fmt: skip
 
@@ -85,7 +85,7 @@ class Stage:
         self._probe = self._api.add_frame("/probe", show_axes=False)
         holder, elastic = probe_parts(radius, self._tool)
         self._add("/probe/holder", holder, PROBE)
-        self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.35, side="double", cast_shadow=False)
+        self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.25, side="double", cast_shadow=False)
         if taxels:
             places, turns = taxel_poses(radius)
             vertices, faces = tile()
@@ -119,14 +119,14 @@ class Stage:
     def _look(self, server: Any, scene: Scene) -> None:
         target = self.middle(scene)
         server.initial_camera.look_at = target
-        server.initial_camera.position = target + np.array((-0.36, -0.44, 0.26))
+        server.initial_camera.position = target + np.array((-0.44, 0.20, 0.13))
         server.initial_camera.up = (0.0, 0.0, 1.0)
         server.initial_camera.fov = np.radians(42.0)
 
     def middle(self, scene: Scene) -> Array:
         """(3,) what the camera looks at, m: the object, or where the task touches, or the arm."""
         if self._shape is not None:
-            point: Array = self._shape.T_base_object[:3, 3] + np.array((0.0, 0.0, 0.06))
+            point: Array = self._shape.T_base_object[:3, 3] + np.array((0.02, 0.02, 0.03))
             return point
         if scene.task.kind in ("scan", "press"):
             return np.array(scene.task.start_mm) * 1e-3
@@ -178,5 +178,6 @@ class Stage:
 
 
 def _place(handle: Any, T: Array) -> None:
-    handle.wxyz = quaternion(T[:3, :3])
+    x, y, z, w = quaternion_of(T[:3, :3])
+    handle.wxyz = (w, x, y, z)
     handle.position = T[:3, 3]

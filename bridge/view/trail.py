@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from canprobe.touch.objects import PlacedShape
 
 SPACING_M = 4e-4
 """Path between two points that are drawn."""
-LIFT_M = 4e-4
+LIFT_M = 8e-4
 """Off the surface, along the normal, so that the ghost does not hide the path."""
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
@@ -47,6 +48,14 @@ def error_scale(shape: PlacedShape | None) -> ErrorScale:
         return ErrorScale(UNCERTAIN_PER_M, "stated std. deviation of K (1/m)")
     kappa = shape.closest(shape.T_base_object[:3, 3]).kappa
     return ErrorScale(max(SHARE * float(np.linalg.norm(kappa)), LEAST_PER_M), "error ‖K − K true‖ (1/m)")
+
+
+def true_kappa(shape: PlacedShape | None) -> tuple[float, float] | None:
+    """Principal curvatures at the object's origin, 1/m, larger first."""
+    if shape is None:
+        return None
+    first, second = shape.closest(shape.T_base_object[:3, 3]).kappa.tolist()
+    return first, second
 
 
 class Trail:
@@ -102,4 +111,4 @@ class Trail:
         span = max((self.times[-1] - self.times[0]) / most, least_s)
         group = [math.floor((t - self.times[0]) / span) for t in self.times]
         edges = [0, *(i for i in range(1, len(group)) if group[i] != group[i - 1]), len(group)]
-        return [slice(a, b) for a, b in zip(edges, edges[1:], strict=False)]
+        return [slice(a, b) for a, b in pairwise(edges)]
