@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -41,43 +41,62 @@ class Messages:
     Args:
         plan: of the run.
         encoder: the one encoder.
+        wanted: whether anybody takes a topic; nothing is made of the others.
+        static_every_ns: when the fixed frames are told again; by default once is enough.
     """
 
-    def __init__(self, plan: Plan, encoder: Encoder) -> None:
+    def __init__(
+        self,
+        plan: Plan,
+        encoder: Encoder,
+        wanted: Callable[[Topic], bool] = lambda _: True,
+        static_every_ns: int = 1 << 62,
+    ) -> None:
         self.encoder = encoder
         self.epoch_ns = 0
         self._types: Any = encoder.store.types
         arm, probe = plan.scene.arm, plan.scene.probe
         self._model = MODELS[arm.model] if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
-        self._static_due = arm is not None
+        self._wanted = wanted
+        self._static_every_ns = static_every_ns
+        self._static_due_ns = -(1 << 62)
         self._fields = [
             self._make("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=_FLOAT32, count=1)
             for i, name in enumerate(_PATCH_FIELDS)
         ]
 
     def of(self, sample: Sample) -> Iterator[Message]:
-        """Every message of a sample; the time of each is its own."""
-        for frame in sample.frames:
-            t_ns = self._epoch_time(frame.t_ns)
-            yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
-        if self._static_due:
-            self._static_due = False
-            yield self._message(topics.TF_STATIC, sample.t_ns, self._static(sample.t_ns))
-        if sample.joints is not None and self._model is not None:
-            yield self._message(topics.JOINT_STATES, sample.t_ns, self._joint_state(sample.t_ns, sample.joints))
-            yield self._message(topics.TF, sample.t_ns, self._links(sample.t_ns, sample.joints))
-        if sample.taxels is not None:
-            yield self._message(topics.TAXELS, sample.taxels.t_ns, self._image(sample.taxels))
-        if sample.wrench is not None:
-            yield self._message(topics.WRENCH, sample.wrench.t_ns, self._wrench(sample.wrench))
-        if sample.contact is not None:
-            yield self._message(topics.TF, sample.contact.t_ns, self._contact(sample.contact))
-        if sample.patch is not None:
-            yield self._message(topics.PATCH, sample.patch.t_ns, self._cloud(sample.patch))
-            yield self._message(topics.CURVATURE, sample.patch.t_ns, self._curvature(sample.patch))
+        """Every message of a sample that is wanted; the time of each is its own."""
+        if self._wanted(topics.CAN_FRAMES):
+            for frame in sample.frames:
+                t_ns = self._epoch_time(frame.t_ns)
+                yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+        for topic, t_ns, make in self._parts(sample):
+            if self._wanted(topic):
+                yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
+
+    def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
+        """What there is in a sample: topic, time, and how to make the message."""
+        t_ns, joints, patch = sample.t_ns, sample.joints, sample.patch
+        taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
+        if self._model is not None and t_ns >= self._static_due_ns:
+            self._static_due_ns = t_ns + self._static_every_ns
+            yield topics.TF_STATIC, t_ns, lambda: self._static(t_ns)
+        if joints is not None and self._model is not None:
+            yield topics.JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
+            yield topics.TF, t_ns, lambda: self._links(t_ns, joints)
+        if taxels is not None:
+            yield topics.TAXELS, taxels.t_ns, lambda: self._image(taxels)
+        if wrench is not None:
+            yield topics.WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
+        if contact is not None:
+            yield topics.TF, contact.t_ns, lambda: self._contact(contact)
+        if patch is not None:
+            yield topics.PATCH, patch.t_ns, lambda: self._cloud(patch)
+            yield topics.CURVATURE, patch.t_ns, lambda: self._curvature(patch)
         if sample.diagnostics:
-            yield self._message(topics.DIAGNOSTICS, sample.t_ns, self._diagnostics(sample))
+            yield topics.DIAGNOSTICS, t_ns, lambda: self._diagnostics(sample)
 
     # one function a message
 
@@ -162,9 +181,6 @@ class Messages:
         return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header(sample.t_ns, ""), status=status)
 
     # parts of messages
-
-    def _message(self, topic: Topic, t_ns: int, message: Any) -> Message:
-        return topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, message)
 
     def _epoch_time(self, t_ns: int) -> int:
         return max(self.epoch_ns + t_ns, 0)  # a sample may be a moment older than the bus
