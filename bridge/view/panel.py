@@ -16,7 +16,9 @@ from canprobe.bridge.view.trail import ErrorScale
 from canprobe.scene import Scene
 
 INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
-HEIGHT = 150
+HEIGHT = 130
+PIXELS = 8
+"""Of a taxel in its image."""
 
 
 class Panel:
@@ -43,7 +45,7 @@ class Panel:
             gui.add_image(np.ascontiguousarray(bar), label=f"path: 0 … {errors.high:.2g}  {errors.text}", format="png")
         if scene.sensor is not None:
             blank = np.zeros((16, 16), np.uint8)
-            self._taxels = gui.add_image(taxel_image(blank), label="taxel image", format="png")
+            self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
             self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
         if scene.shape is not None:
             names = ("kappa1", "low1", "high1", "kappa2", "low2", "high2")
@@ -58,7 +60,7 @@ class Panel:
             series.append(uplot.Series(label=name, stroke=colour, width=1.0 if thin else 2.0))
         empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.full(2, np.nan) for i in range(len(series)))
         handle = gui.add_uplot(
-            empty, tuple(series), title=title, height=HEIGHT, scales={"x": uplot.Scale(time=False)},
+            empty, tuple(series), title=title, height=HEIGHT, scales=_scales(empty[0], []),
             legend=uplot.Legend(show=False),
         )  # fmt: skip
         self._plots.append((handle, names))
@@ -67,11 +69,13 @@ class Panel:
         """Show a moment, and curves where there are new ones."""
         self._status.content = self._text(moment)
         if self._taxels is not None and moment.taxels is not None:
-            self._taxels.image = taxel_image(moment.taxels)
+            self._taxels.image = taxel_image(moment.taxels, PIXELS)
         if curves is None or len(curves["t_s"]) < 2:
             return
         for handle, names in self._plots:
-            handle.data = (curves["t_s"], *(self._column(curves, name) for name in names))
+            columns = [self._column(curves, name) for name in names]
+            handle.scales = _scales(curves["t_s"], columns)
+            handle.data = (curves["t_s"], *columns)
 
     def _column(self, curves: Curves, name: str) -> Any:
         if name == "target":
@@ -93,3 +97,15 @@ class Panel:
         if moment.dropped:
             rows.append(("samples dropped", str(moment.dropped)))
         return "| | |\n|:--|:--|\n" + "\n".join(f"| {name} | **{text}** |" for name, text in rows)
+
+
+def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:
+    """Fixed ends of the axes: uPlot finds none of its own where a value is missing (NaN)."""
+    scale_of = import_viser().uplot.Scale
+    values = np.concatenate([column[np.isfinite(column)] for column in columns]) if columns else np.empty(0)
+    low, high = np.percentile(values, (1.0, 99.0)).tolist() if len(values) else (0.0, 1.0)
+    low = min(low, 0.0)
+    spare = 0.08 * (high - low) or 1.0
+    ends = (low - spare if low < 0.0 else 0.0, high + spare)
+    span = (float(times[0]), max(float(times[-1]), float(times[0]) + 1e-3))
+    return {"x": scale_of(time=False, auto=False, range=span), "y": scale_of(auto=False, range=ends)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.bridge.transforms import quaternion_of
 from canprobe.bridge.view.arm import arm_parts, link_frames, probe_parts
@@ -91,8 +92,7 @@ class Stage:
             vertices, faces = tile()
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=taxel_colours(np.zeros(256, np.uint8)), side="double", cast_shadow=False, opacity=0.8,
-                lod="off",
+                batched_colors=taxel_colours(np.zeros(256, np.uint8)), batched_opacities=_opacities(np.zeros(256, np.uint8)), side="double", cast_shadow=False, lod="off",
             )  # fmt: skip
         else:
             self._taxels = None
@@ -139,7 +139,9 @@ class Stage:
         if moment.q is not None and self._model is not None:
             self._move_arm(moment.q)
         if moment.taxels is not None and self._taxels is not None:
-            self._taxels.batched_colors = taxel_colours(moment.taxels.reshape(-1))
+            counts = moment.taxels.reshape(-1)
+            self._taxels.batched_colors = taxel_colours(counts)
+            self._taxels.batched_opacities = _opacities(counts)
         self._show_contact(moment)
         self._show_patch(moment)
 
@@ -175,6 +177,11 @@ class Stage:
         self._disc.color = PATCH if all(patch.observed) else UNKNOWN
         for handle, vertices in zip(self._shells, (shape.above, shape.below), strict=True):
             handle.vertices = vertices.astype(np.float32)
+
+
+def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Taxels that feel nothing are hardly there."""
+    return np.where(counts > 0, 0.9, 0.12).astype(np.float32)
 
 
 def _place(handle: Any, T: Array) -> None:
