@@ -21,6 +21,7 @@ ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
 TransmitQueue = Literal["priority", "fifo"]
+BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -200,6 +201,20 @@ class PlantSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class BridgeSettings:
+    """`[bridge]`: the other tools that see this cell, each in a process of its own; `canprobe.planning.bridges`."""
+
+    use: Annotated[tuple[BridgeName, ...], Distinct()] = ()
+    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765  # 0 lets the system choose
+    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_domain: Annotated[int, Range(0, 232)] = 0
+    ros2_loopback: bool = True  # false lets other machines see the topics, and command the cell where that is allowed
+    view_port: Annotated[int, Range(0, 65_535)] = 8080  # 0 lets the system choose; where it is taken, the next free one
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_commands: bool = False  # start, stop, target force and speed are taken from topics, within the scene's limits
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """One experiment. Sections that are None are absent."""
 
@@ -215,6 +230,7 @@ class Scene:
     shape: ShapeSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
+    bridge: BridgeSettings | None = None
 
     @property
     def name(self) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -124,8 +124,12 @@ def _format_id(can_id: int) -> str:
     return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
 
 
-def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
+
+    Args:
+        path: the log.
+        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -136,10 +140,21 @@ def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
     try:
         with Path(path).open(encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
+                if only is not None and _id_of(line) not in only:
+                    continue
                 if text := line.rstrip("\r\n"):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def _id_of(line: str) -> int:
+    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
+    name = line.partition("#")[0].rpartition(" ")[2]
+    try:
+        return int(name, 16) if len(name) == 3 else -1
+    except ValueError:
+        return -1
 
 
 def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:

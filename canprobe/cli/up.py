@@ -7,7 +7,7 @@ import contextlib
 
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_scene
+from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
 from canprobe.cli.target import add_realtime, target_of, with_realtime
 
 _EXAMPLE = """\
@@ -22,6 +22,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser)
     add_bus(parser)
     add_realtime(parser)
+    add_bridge(parser)
     parser.set_defaults(run=run)
 
 
@@ -35,5 +36,12 @@ def run(args: argparse.Namespace) -> int:
     from canprobe import api
 
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
-        api.up(scene, interface=target.interface, channel=target.channel, bitrate=target.bitrate, say=say)
+        api.up(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            bitrate=target.bitrate,
+            say=say,
+            bridge=args.bridge or (),
+        )
     return 0
