@@ -10,11 +10,11 @@ the full scale.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import numpy as np
@@ -109,9 +109,9 @@ def measure(case: Case) -> dict[str, Any]:
     costs: list[float] = []
     states: Array | None = None
     for _ in range(1 + case.repeats):
-        begun = time.process_time()
+        begun = process_time()
         states = integrated(case.stiffness_n_m3, case.cycles, stepping, case.held)
-        costs.append(1e6 * (time.process_time() - begun) / case.cycles)
+        costs.append(1e6 * (process_time() - begun) / case.cycles)
     return {"states": None if states is None else states.tolist(), "cost_us": min(costs[1:])}
 
 

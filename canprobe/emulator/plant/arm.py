@@ -220,6 +220,14 @@ class IdealArm:
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: these motors track as they do, whatever torque that takes.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
+        """
+
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
 

@@ -126,6 +126,20 @@ class DynamicArm:
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive from now on.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+        self._advance_to(self.t_ns)
+        rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
+        self.equations.set_loop(axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille)
+        self._now = None
+
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
 

@@ -90,6 +90,7 @@ class ArmEquations:
         self._gain: list[float] = cascade.velocity.tolist()
         self._integral: list[float] = cascade.integral.tolist()
         self._limit: list[float] = cascade.limit.tolist()
+        self._speed_fed, self._torque_fed = [0.0] * 6, [0.0] * 6
         self._mass, self._bias = self._rotors, [0.0] * 6
         self._inverse: Array = np.array(np.linalg.inv(self._rotors), dtype=np.float64)
         self._contact: Contact | None = None
@@ -106,6 +107,18 @@ class ArmEquations:
         self._r0: list[float] = (theta - slope * t).tolist()
         self._slope: list[float] = slope.tolist()
         self._ahead = [self.cascade.share * x for x in self._slope]
+
+    def set_loop(self, axis: int, limit: float, speed: float, torque: float) -> None:
+        """Torque limit and feed-forwards of one motor from now on.
+
+        Args:
+            axis: 0 to 5.
+            limit: largest torque, N m; the cascade's own if that is less.
+            speed: added behind the position loop, rad/s.
+            torque: added behind the velocity loop, N m.
+        """
+        self._limit[axis] = min(limit, float(self.cascade.limit[axis]))
+        self._speed_fed[axis], self._torque_fed[axis] = speed, torque
 
     def hold(self, y: Array) -> None:
         """Evaluate mass matrix, bias and contact geometry at a state.
@@ -153,11 +166,12 @@ class ArmEquations:
         """What the cascades do."""
         kp = self.cascade.position
         errors, asked, given = [], [], []
-        for r0, slope, ahead, gain, limit, x, v, s in zip(
-            self._r0, self._slope, self._ahead, self._gain, self._limit, y[:6], y[6:12], y[12:], strict=True
-        ):
-            error = kp * (r0 + slope * t - x) + ahead - v
-            torque = gain * error + s
+        for r0, slope, ahead, speed, gain, fed, limit, x, v, s in zip(
+            self._r0, self._slope, self._ahead, self._speed_fed, self._gain, self._torque_fed, self._limit,
+            y[:6], y[6:12], y[12:], strict=True,
+        ):  # fmt: skip
+            error = kp * (r0 + slope * t - x) + ahead + speed - v
+            torque = gain * error + s + fed
             errors.append(error)
             asked.append(torque)
             given.append(limit if torque > limit else -limit if torque < -limit else torque)

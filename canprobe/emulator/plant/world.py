@@ -152,6 +152,18 @@ class Plant:
         """
         return self.arm.torque_permille(axis) if self.arm is not None else 0
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille: of the rated torque.
+            speed: counts/s.
+            torque_permille: of the rated torque.
+        """
+        if self.arm is not None:
+            self.arm.set_loop(axis, limit_permille, speed, torque_permille)
+
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
