@@ -6,6 +6,7 @@ import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -38,6 +39,8 @@ __all__ = [
     "up",
 ]
 
+ROWS_OF_UP = 4000
+"""Cycles that :func:`up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
@@ -183,6 +186,7 @@ def open_cell(
     say: Say = quiet,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
+    rows_kept: int | None = None,
 ) -> Iterator[Session]:
     """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
 
@@ -197,6 +201,7 @@ def open_cell(
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
         observers, bridge: as for :func:`run`.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by 3 KiB a cycle.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
@@ -206,7 +211,7 @@ def open_cell(
     folder = Path(out) if out is not None else None
     with (
         Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
-        Session(resolved, folder, say, (*observers, *bridges.observers)) as session,
+        Session(resolved, folder, say, (*observers, *bridges.observers), rows_kept) as session,
     ):
         yield session
 
@@ -227,7 +232,8 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say, bridge=bridge) as session:
+    session_of = partial(open_cell, interface=interface, channel=channel, bitrate=bitrate, say=say, bridge=bridge)
+    with session_of(scene, rows_kept=ROWS_OF_UP) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())
 

@@ -125,6 +125,7 @@ class Session:
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
         observers: called after each cycle with what it saw, said and had on the bus.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
         joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
@@ -136,7 +137,9 @@ class Session:
         out: Path | None = None,
         say: Say = quiet,
         observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
     ) -> None:
+        self._rows_kept = rows_kept
         self.plan: Plan = make_plan(scene)
         self.scene = self.plan.scene
         self.out = out
@@ -182,7 +185,12 @@ class Session:
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
             self._cell = make_cell(
-                self.plan, port, say=self._say, log_failure=self._log_failure, observers=self.observers
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
             )
             self._stack.enter_context(garbage_collection_paused())
             self._stack.callback(self._observe_frames, port)
@@ -282,7 +290,7 @@ class Session:
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
-            child = EmulatorChild(self.scene, self.out)
+            child = EmulatorChild(self.scene, self.out, truth=self._rows_kept is None)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
