@@ -84,6 +84,12 @@ class EmulatorChild:
             start_new_session=True,
         )
 
+    @property
+    def pid(self) -> int:
+        """Process id, once it is started."""
+        assert self._process is not None
+        return self._process.pid
+
     def await_boot_ups(self, port: Port) -> None:
         """Wait for the boot-up of each of its nodes.
 
