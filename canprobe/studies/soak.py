@@ -175,7 +175,8 @@ def _growth(samples: Sequence[Sample], name: str) -> float:
     if len(samples) < 2:
         return 0.0
     t_h = np.array([s.t_s for s in samples]) / 3600
-    return float(np.polyfit(t_h, [getattr(s, name) for s in samples], 1)[0])
+    slope = np.polyfit(t_h, [getattr(s, name) for s in samples], 1)[0]
+    return round(float(slope), 2) + 0.0  # no minus zero
 
 
 def _drawer(samples: Sequence[Sample]) -> Callable[[Path], None]:
