@@ -86,6 +86,7 @@ def summarise(
         ),
         "cycle": _cycle(cell, controller),
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
+        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "faults": list(cell.faults),
     }

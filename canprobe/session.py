@@ -26,6 +26,7 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
+from canprobe.planning.measured import TrafficMeter
 from canprobe.protocol.timing import best_case_bits
 from canprobe.scene import Scene
 
@@ -114,6 +115,7 @@ class Session:
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: TrafficCounter | None = None
+        self.meter: TrafficMeter | None = None
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
@@ -188,7 +190,13 @@ class Session:
             self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             write = writer.write
-        self.traffic = TrafficCounter(write)
+        self.meter = meter = TrafficMeter(self.plan, exact=False)
+
+        def measured(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.write(can_id, data, t_ns)
+            write(can_id, data, t_ns)
+
+        self.traffic = TrafficCounter(measured)
         return self.traffic.write
 
     def _open_lockstep(self) -> Port:
