@@ -36,8 +36,6 @@ def measure_traffic(log: Path | str, scene: Scene | Plan, *, channel: str | None
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
     for t_ns, name, can_id, data in read_candump(path):
-        if channel is not None and name != channel:
-            continue
         meter = meters.get(name)
         if meter is None:
             meter = meters[name] = TrafficMeter(plan)
@@ -53,10 +51,13 @@ def _chosen(
     path: Path, meters: dict[str, TrafficMeter], syncs: Counter[str], plan: Plan, channel: str | None
 ) -> TrafficMeter:
     with_sync = [name for name in meters if syncs[name]]
-    preferred = channel or plan.scene.bus.channel
-    name = preferred if preferred in with_sync else with_sync[0] if len(with_sync) == 1 else None
-    if name is None:
-        found = ", ".join(sorted(with_sync)) or "none"
-        what = f"channel {channel}" if channel else "any channel" if not with_sync else f"channel {preferred}"
-        raise UsageError(f"{path}: no SYNC (080h) on {what}; channels with SYNC: {found}; name one of them")
-    return meters[name]
+    wanted = plan.scene.bus.channel if channel is None else channel
+    if wanted in with_sync:
+        return meters[wanted]
+    if channel is None and len(with_sync) == 1:
+        return meters[with_sync[0]]
+    if not with_sync:
+        raise UsageError(f"{path}: no SYNC (080h) on any channel; expected the log of a cell that ran")
+    raise UsageError(
+        f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
+    )
