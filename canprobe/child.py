@@ -49,11 +49,13 @@ class EmulatorChild:
     Args:
         scene: the resolved scene.
         out: folder for ``truth.npz``; None uses a temporary one.
+        truth: whether what is true is recorded, which grows with time.
     """
 
-    def __init__(self, scene: Scene, out: Path | None) -> None:
+    def __init__(self, scene: Scene, out: Path | None, *, truth: bool = True) -> None:
         self._scene = scene
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        self._wants_truth = truth
         self._truth = (out or self._folder) / "truth.npz"
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -69,8 +71,10 @@ class EmulatorChild:
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
             *("--bus", bus.interface, "--channel", bus.channel, "--bitrate", str(bus.bitrate)),
-            *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth), "--parent", str(os.getpid())),
+            *("--nodes", ",".join(str(n) for n in nodes), "--parent", str(os.getpid())),
         ]
+        if self._wants_truth:
+            command += ["--truth", str(self._truth)]
         self._errors = (self._folder / "stderr").open("w+b")
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,

@@ -6,7 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,14 +21,17 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
+from canprobe.planning.bridges import check_bridges
 from canprobe.planning.measured import TrafficMeter
-from canprobe.protocol.timing import best_case_bits
-from canprobe.scene import Scene
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.scene import BridgeSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -51,8 +54,9 @@ def resolve_scene(
     bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them."""
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
     bus = replace(
         scene.bus,
         interface=scene.bus.interface if interface is None else interface,
@@ -61,7 +65,16 @@ def resolve_scene(
     )
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    return replace(scene, bus=bus, scene=info, task=task)
+    return replace(scene, bus=bus, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
 def hush_canopen() -> None:
@@ -75,11 +88,17 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
 
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
-        self._by_length = [0] * 9
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -88,8 +107,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far."""
-        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -104,11 +125,24 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+
+    Attributes:
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
+    ) -> None:
+        self._rows_kept = rows_kept
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
@@ -119,6 +153,9 @@ class Session:
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self._log: CandumpWriter | None = None
+        self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -149,9 +186,18 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say)
+            self._cell = make_cell(
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
+            )
             self._stack.enter_context(garbage_collection_paused())
+            self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
+            self._observe_frames(port)
         except BaseException:
             self._close()
             raise
@@ -175,6 +221,11 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
+            if self._cell is not None and (failure := self._log_failure()) is not None:
+                self._cell.faults.append(f"the log is not whole: {failure}")
+
+    def _log_failure(self) -> str | None:
+        return self._log.failure if self._log is not None else None
 
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
@@ -189,15 +240,24 @@ class Session:
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
+            self._log = writer
             write = writer.write
+        if self.observers is not None:
+            self.observers.origin_ns = t0_ns
+            write = self.observers.tap(write)
         self.meter = meter = TrafficMeter(self.plan, exact=False)
 
         def measured(can_id: int, data: bytes, t_ns: int) -> None:
             meter.write(can_id, data, t_ns)
             write(can_id, data, t_ns)
 
-        self.traffic = TrafficCounter(measured)
+        self.traffic = TrafficCounter(measured, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         return self.traffic.write
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world
@@ -210,7 +270,7 @@ class Session:
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
         for participant in self.world.participants:
-            bus.attach(participant)
+            bus.attach(self.joins(participant))
         return bus.port()
 
     def _keep_truth(self) -> None:
@@ -238,7 +298,7 @@ class Session:
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
-            child = EmulatorChild(self.scene, self.out)
+            child = EmulatorChild(self.scene, self.out, truth=self._rows_kept is None)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
@@ -246,6 +306,8 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
@@ -254,8 +316,8 @@ class Session:
 
 def _lockstep_bus(scene: Scene) -> LockstepBus:
     """A bus in virtual time, with the bit rate of the scene or without one."""
-    if not scene.bus.timed:
-        return LockstepBus(VirtualClock(), scene.bus.channel)
+    if not scene.bus.timed or scene.bus.fd is True:
+        return LockstepBus(VirtualClock(), scene.bus.channel, fd=scene.bus.fd is True)
     from canprobe.bus.timed import TimedBus
     from canprobe.bus.wire_errors import BitErrors
 

@@ -16,13 +16,14 @@ from heapq import heapify, heappop, heappush
 from typing import Protocol
 
 from canprobe.bus.clock import VirtualClock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import BusError, InterfaceError
+from canprobe.protocol.frame_bits import FD_LENGTHS
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
 
-_MAX_LENGTH = 8
+_CLASSIC_BYTES = 8
 
 
 class Participant(Protocol):
@@ -77,9 +78,13 @@ class LockstepBus:
         clock: virtual time, possibly shared with other buses.
         channel: the bus's name in messages and logs.
         max_frames: frames at one instant above which the participants are taken to answer each other for ever.
+        fd: frames of up to 64 bytes are carried too.
     """
 
-    def __init__(self, clock: VirtualClock, channel: str = "can0", *, max_frames: int = 20_000) -> None:
+    def __init__(
+        self, clock: VirtualClock, channel: str = "can0", *, max_frames: int = 20_000, fd: bool = False
+    ) -> None:
+        self.fd = fd
         self.clock = clock
         self.channel = channel
         self.recorder: Recorder | None = None
@@ -195,10 +200,9 @@ class LockstepBus:
 
     def _check(self, node: BusNode, frame: Frame) -> None:
         can_id, data = frame
-        if len(data) > _MAX_LENGTH:
-            raise BusError(
-                f"{self.channel}: {name_of(node.owner)} sends {len(data)} bytes with {can_id:03X}; CAN has 8"
-            )
+        if len(data) > _CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
+            has = f"CAN FD has {', '.join(map(str, FD_LENGTHS[9:]))} above 8" if self.fd else "CAN has 8"
+            raise BusError(f"{self.channel}: {name_of(node.owner)} sends {len(data)} bytes with {can_id:03X}; {has}")
 
     @staticmethod
     def _listeners_of(sender: BusNode, can_id: int) -> tuple[Listener, ...]:
@@ -254,9 +258,13 @@ class LockstepBus:
 
 
 class LockstepPort:
-    """A master's `Port` on a `LockstepBus`; see there for the order of frames."""
+    """A master's `Port` on a `LockstepBus`; see there for the order of frames.
 
-    __slots__ = ("_bus", "_open", "counters", "inbox", "node")
+    Attributes:
+        state: of a controller that this bus does not have: as it was set, to see what a cell does about it.
+    """
+
+    __slots__ = ("_bus", "_open", "counters", "inbox", "node", "state")
 
     node: BusNode
 
@@ -265,6 +273,7 @@ class LockstepPort:
         self._open = True
         self.inbox: list[TimedFrame] = []
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
 
     @property
     def clock(self) -> VirtualClock:

@@ -13,10 +13,16 @@ if TYPE_CHECKING:
     from canprobe.planning import Plan
 
 _EXAMPLE = """\
+The files: dcf, one device configuration file a node; dbc and kcd, every frame with its signals (extra `can`); bus.yml,
+for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
+
 examples:
   canprobe plan cylinder
+  canprobe plan mine.toml --auto
   canprobe plan cylinder --measured runs/cylinder-20260101-120000
+  canprobe plan cylinder --export dbc --export dcf --out config/
 """
+EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
 def add_parser(commands: Commands[Parser]) -> None:
@@ -28,20 +34,36 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
     )
+    parser.add_argument(
+        "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
+    )
+    parser.add_argument(
+        "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
     add_json(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the plan; a scene that does not fit raises PlanError with every reason."""
+    """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.planning import make_plan, plan_text
+    from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
-    plan = make_plan(load_scene(args.scene))
+    scene = load_scene(args.scene)
+    plan = make_plan(opened(scene) if args.auto else scene)
     if args.measured is not None:
         return _compare(plan, args.measured, args.json)
+    files: list[Path] = []
+    if args.export:
+        from canprobe.bridge.export import export_plan
+
+        files = export_plan(plan, args.out, args.export)
     if args.json:
-        print_json(plan.as_dict())
+        print_json(plan.as_dict() | ({"files": [str(file) for file in files]} if files else {}))
+    elif files:
+        print("\n".join(str(file) for file in files))
     else:
         print(plan_text(plan), end="")
     return 0

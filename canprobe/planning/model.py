@@ -38,6 +38,7 @@ class PlannedNode:
         eds: name or path of its EDS.
         identity: what 1018h must answer.
         emulated: served by the emulator.
+        channel: of the bus that it is on.
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
     """
 
@@ -47,6 +48,7 @@ class PlannedNode:
     eds: str
     identity: Identity
     emulated: bool
+    channel: str
     switched_off: tuple[tuple[Direction, int], ...]
 
 
@@ -65,6 +67,8 @@ class PlannedPdo:
         response_ns: worst case of its end after the SYNC, or after its own queueing where event-driven; None where
             the bus is overloaded.
         event_timer_ms: 14xxh:05, 0 without.
+        kind: of the node.
+        channel: of the bus that it is on; empty until that is planned.
     """
 
     node_id: int
@@ -76,6 +80,8 @@ class PlannedPdo:
     deadline_ns: int
     response_ns: int | None = None
     event_timer_ms: int = 0
+    kind: NodeKind = "drive"
+    channel: str = ""
 
     @property
     def cob_id(self) -> int:
@@ -183,6 +189,36 @@ class Traffic:
 
 
 @dataclass(frozen=True, slots=True)
+class PlannedBus:
+    """One bus of the cell.
+
+    Attributes:
+        channel: its name in the scene.
+        node_ids: who is on it.
+        traffic: whether it fits, with numbers.
+    """
+
+    channel: str
+    node_ids: tuple[int, ...]
+    traffic: Traffic
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Something that the scene left to the plan.
+
+    Attributes:
+        key: of the scene file.
+        value: what was chosen, as the scene file writes it.
+        why: for people.
+    """
+
+    key: str
+    value: str
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
 class JointSpeeds:
     """Fastest joint motion that the task asks for, (6,) each, deg/s."""
 
@@ -199,7 +235,8 @@ class Plan:
         nodes: ascending node ids.
         pdos: by priority on the bus.
         sync: the cycle.
-        traffic: whether it fits, with numbers.
+        buses: that of the arm first, then one of the sensor's own where it has one.
+        choices: what the scene left open; `scene` has the values.
         joint_speeds: None without an arm.
         estimator: in the loop; None where no shape is estimated.
         offline_estimators: on the same data after the run.
@@ -214,7 +251,8 @@ class Plan:
     nodes: tuple[PlannedNode, ...]
     pdos: tuple[PlannedPdo, ...]
     sync: SyncPlan
-    traffic: Traffic
+    buses: tuple[PlannedBus, ...]
+    choices: tuple[Choice, ...]
     joint_speeds: JointSpeeds | None
     estimator: str | None
     offline_estimators: tuple[str, ...]
@@ -223,6 +261,11 @@ class Plan:
     outputs: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
+
+    @property
+    def traffic(self) -> Traffic:
+        """Traffic of the bus that sets the pace: the arm's, or the only one."""
+        return self.buses[0].traffic
 
     @property
     def node_ids(self) -> tuple[int, ...]:

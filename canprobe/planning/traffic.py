@@ -16,7 +16,6 @@ from canprobe.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.planning.pdos import TACTILE_TPDO1
 from canprobe.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.protocol.timing import Message, Response, best_case_bits, worst_case_bits
 from canprobe.scene import BusSettings
@@ -61,7 +60,7 @@ def plan_traffic(
 def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int) -> CycleMessages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
-    feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.cob_id < TACTILE_TPDO1]
+    feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.kind == "drive"]
     heartbeats = [
         Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
         for node in (*node_ids, MASTER_NODE_ID)
@@ -69,10 +68,10 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
     best_sync = best_case_bits(_SYNC_BYTES)
     return CycleMessages(
         sync=Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns),
-        feedback=tuple(_message(pdo, sync) for pdo in feedback),
-        commands=tuple(_message(pdo, sync) for pdo in cyclic if pdo.direction == "rpdo"),
-        other=tuple(_message(pdo, sync) for pdo in cyclic if pdo.direction == "tpdo" and pdo not in feedback),
-        strangers=(*(_message(pdo, sync) for pdo in wire if pdo not in cyclic), *heartbeats),
+        feedback=tuple(_message(pdo, sync, bitrate) for pdo in feedback),
+        commands=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "rpdo"),
+        other=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "tpdo" and pdo not in feedback),
+        strangers=(*(_message(pdo, sync, bitrate) for pdo in wire if pdo not in cyclic), *heartbeats),
         best_sync_ns=best_sync * 1_000_000_000 // bitrate,
         best_feedback_ns=(best_sync + sum(best_case_bits(pdo.layout.length) for pdo in feedback))
         * 1_000_000_000
@@ -80,9 +79,10 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
     )
 
 
-def _message(pdo: PlannedPdo, sync: SyncPlan) -> Message:
+def _message(pdo: PlannedPdo, sync: SyncPlan, bitrate: int) -> Message:
     name = f"{pdo.direction.upper()} {pdo.cob_id:03X}h"
-    return Message(name, pdo.cob_id, pdo.layout.length, _period_ns(pdo, sync), deadline_ns=pdo.deadline_ns)
+    frame_ns, period_ns = _ns(pdo.bits_worst, bitrate), _period_ns(pdo, sync)
+    return Message(name, pdo.cob_id, pdo.layout.length, period_ns, deadline_ns=pdo.deadline_ns, frame_ns=frame_ns)
 
 
 def _period_ns(pdo: PlannedPdo, sync: SyncPlan) -> int:
@@ -97,8 +97,8 @@ def _parts(
     heartbeats = worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1)
     bits = {
         "SYNC": _SYNC_BITS * sync.rate_hz,
-        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.cob_id < TACTILE_TPDO1),
-        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.cob_id >= TACTILE_TPDO1),
+        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
+        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
         "heartbeats": heartbeats,
     }
     return tuple((what, rate / bitrate) for what, rate in bits.items() if rate > 0)
@@ -107,8 +107,8 @@ def _parts(
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> tuple[Demand, ...]:
     """What one SYNC releases, and what a tactile frame waits for until its last PDO is through."""
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
-    drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.cob_id < TACTILE_TPDO1)
-    tactile = [pdo for pdo in cyclic if pdo.cob_id >= TACTILE_TPDO1]
+    drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
+    tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
     what = "SYNC and drive PDOs" if drives > _SYNC_BITS else "SYNC"
     demands = [Demand(what, 1, _ns(drives, bitrate), sync.period_ns)]
     if tactile:

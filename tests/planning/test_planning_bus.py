@@ -10,8 +10,8 @@ import pytest
 from canprobe.errors import PlanError
 from canprobe.planning import make_plan
 from canprobe.planning.abilities import Abilities
+from canprobe.planning.identifiers import identifier_problems
 from canprobe.planning.model import PlannedPdo
-from canprobe.planning.pdos import identifier_problems
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene_loader import load_scene
 
@@ -84,7 +84,11 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     problems = reasons(change(cylinder, sensor={"mode": "image"}))
     assert any("worst-case load 152 %" in problem for problem in problems)
     (peak,) = [problem for problem in problems if "7585 µs of the 5000 µs in 2 cycles" in problem]
-    for way in ('sensor.mode = "window" (87 %, 4345 of 5000 µs)', "a bus of its own for the sensor (92 %", "250"):
+    for way in (
+        'sensor.mode = "window" (87 %, 4345 of 5000 µs)',
+        'a bus of its own for the sensor (sensor.channel = "can1") (92 %',
+        "250",
+    ):
         assert way in peak
     assert "grouped" not in peak, "grouping alone does not make it fit and must not be named"
 

@@ -14,7 +14,7 @@ SECONDS = 4
 
 
 def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
-    """At 100 Hz. Cycles that the machine could not keep are counted by the run itself and left out of the comparison."""
+    """At 100 Hz. Cycles that the machine could not keep are counted by the run itself and allowed for."""
     scene = bench.scene("press")
     command = bench.start(
         "run", scene, "--bus", "socketcan", "--channel", "vcan0", "--duration", SECONDS, "--out", "results", "--json"
@@ -42,5 +42,5 @@ def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
             assert one.planned_frames is not None and one.planned_bits is not None
             allowed = max(0.02 * one.planned_frames, one.messages) + lost * one.messages
             assert one.frames == pytest.approx(one.planned_frames, abs=allowed), (log, kind)
-            assert one.bits <= one.planned_bits * (1 + 0.02), (log, kind)
+            assert one.bits <= one.planned_bits, (log, kind)
     assert results.summary["traffic"]["unlisted"] == []
