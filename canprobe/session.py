@@ -29,6 +29,7 @@ from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
+from canprobe.planning.measured import TrafficMeter
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.scene import BridgeSettings, Scene
 
@@ -148,6 +149,7 @@ class Session:
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: TrafficCounter | None = None
+        self.meter: TrafficMeter | None = None
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
@@ -243,7 +245,13 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        self.traffic = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        self.meter = meter = TrafficMeter(self.plan, exact=False)
+
+        def measured(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.write(can_id, data, t_ns)
+            write(can_id, data, t_ns)
+
+        self.traffic = TrafficCounter(measured, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         return self.traffic.write
 
     def _observe_frames(self, port: Port) -> None:
