@@ -153,7 +153,7 @@ class Session:
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
             self._cell = make_cell(self.plan, port, self._say, log_failure=self._log_failure)
-            self._stack.enter_context(garbage_collection_paused())
+            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
             self._stack.enter_context(self._cell)
         except BaseException:
             self._close()
