@@ -6,7 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -21,13 +21,16 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.protocol.timing import best_case_bits
-from canprobe.scene import Scene
+from canprobe.planning.bridges import check_bridges
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.scene import BridgeSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -50,8 +53,9 @@ def resolve_scene(
     bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them."""
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
     bus = replace(
         scene.bus,
         interface=scene.bus.interface if interface is None else interface,
@@ -60,7 +64,16 @@ def resolve_scene(
     )
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    return replace(scene, bus=bus, scene=info, task=task)
+    return replace(scene, bus=bus, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
 def hush_canopen() -> None:
@@ -74,11 +87,17 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
 
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
-        self._by_length = [0] * 9
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -87,8 +106,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far."""
-        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -103,14 +124,21 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
 
     Attributes:
         joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+    ) -> None:
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
@@ -122,6 +150,7 @@ class Session:
         self.world: World | None = None
         self.joins: Callable[[Any], Any] = lambda participant: participant
         self._log: CandumpWriter | None = None
+        self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -152,9 +181,13 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say, log_failure=self._log_failure)
+            self._cell = make_cell(
+                self.plan, port, say=self._say, log_failure=self._log_failure, observers=self.observers
+            )
             self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
+            self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
+            self._observe_frames(port)
         except BaseException:
             self._close()
             raise
@@ -199,8 +232,16 @@ class Session:
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
             self._log = writer
             write = writer.write
-        self.traffic = TrafficCounter(write)
+        if self.observers is not None:
+            self.observers.origin_ns = t0_ns
+            write = self.observers.tap(write)
+        self.traffic = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         return self.traffic.write
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world
@@ -208,7 +249,7 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        bus = self.lockstep = _lockstep_bus(self.scene)
         bus.recorder = self._writer(0)
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
@@ -249,10 +290,25 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def _lockstep_bus(scene: Scene) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed or scene.bus.fd is True:
+        return LockstepBus(VirtualClock(), scene.bus.channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    return TimedBus(VirtualClock(), bus.channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors)
 
 
 class _Sink:

@@ -1,5 +1,7 @@
 """candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
 
+CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
+
 Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 """
 
@@ -7,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -18,10 +20,13 @@ from canprobe.errors import UsageError
 
 _LINE = re.compile(
     r"\((?P<s>\d+)\.(?P<us>\d{6})\) (?P<channel>\S+) (?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    r"(?:R(?P<length>[0-8]?)|(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
+    r"(?:R(?P<length>[0-8]?)|#(?P<flags>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
 )
 
 
+CLASSIC_BYTES = 8
+_BIT_RATE_SWITCH = 1
 _LINES = 256
 """Lines that are joined before they go to the file."""
 
@@ -62,9 +67,8 @@ class CandumpWriter:
         if name is None:
             name = self._names[can_id] = _format_id(can_id) + "#"
         lines = self._lines
-        lines.append(
-            f"{self._prefix}{name}{_format_payload(can_id, data) if can_id & RTR_FLAG else data.hex().upper()}\n"
-        )
+        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
+        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
         if len(lines) >= _LINES:
             self.flush()
 
@@ -108,6 +112,8 @@ def _format_prefix(channel: str, t_ns: int) -> str:
 
 
 def _format_payload(can_id: int, data: bytes) -> str:
+    if len(data) > CLASSIC_BYTES:
+        return f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
     return "R" if can_id & RTR_FLAG else data.hex().upper()
 
 
@@ -118,8 +124,12 @@ def _format_id(can_id: int) -> str:
     return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
 
 
-def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
+
+    Args:
+        path: the log.
+        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -130,26 +140,37 @@ def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
     try:
         with Path(path).open(encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
+                if only is not None and _id_of(line) not in only:
+                    continue
                 if text := line.rstrip("\r\n"):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
 
 
+def _id_of(line: str) -> int:
+    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
+    name = line.partition("#")[0].rpartition(" ")[2]
+    try:
+        return int(name, 16) if len(name) == 3 else -1
+    except ValueError:
+        return -1
+
+
 def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
     match = _LINE.fullmatch(text)
     if match is None:
-        what = "a CAN FD frame; only classic CAN is read" if "##" in text else "no candump line"
-        raise UsageError(f"{path}:{number}: {what}: {text[:60]!r}; expected '(seconds.microseconds) channel ID#DATA'")
+        form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
+        raise UsageError(f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'")
     t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
-    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["data"] or "")
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or match["data"] or "")
 
 
 def _parse_id(match: re.Match[str]) -> int:
     can_id = int(match["id"], 16)
     if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
         can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
-    return can_id | RTR_FLAG if match["data"] is None else can_id
+    return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 
 class FrameWriter(Protocol):

@@ -14,6 +14,7 @@ from typing import Any
 import can
 
 from canprobe.bus.clock import Clock
+from canprobe.bus.echoes import Echoes
 from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
 
@@ -24,6 +25,8 @@ _STATES = {
     can.BusState.PASSIVE: ControllerState.PASSIVE,
     can.BusState.ERROR: ControllerState.BUS_OFF,
 }
+_HEARS_ITSELF = ("udp_multicast",)
+"""Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
 
 
 class PythonCanPort:
@@ -52,6 +55,7 @@ class PythonCanPort:
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
+        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters)
 
     stamps_arrival = False
@@ -67,6 +71,8 @@ class PythonCanPort:
                 self.counters.transmit_full += 1
                 raise InterfaceError(f"{self.channel}: sending {can_id:03X} failed: {error}") from error
             self.counters.sent += 1
+            if self._echoes is not None:
+                self._echoes.sent((can_id, data), self.clock.now_ns())
 
     def drain(self) -> list[TimedFrame]:
         """Return everything that has arrived, stamped now."""
@@ -77,6 +83,8 @@ class PythonCanPort:
         t_ns = self.clock.now_ns()
         frames = [frame for message in arrived if (frame := self._frame(message, t_ns)) is not None]
         arrived.clear()
+        if self._echoes is not None:
+            frames = [frame for frame in frames if not self._echoes.is_one(frame[:2], t_ns)]
         self.counters.received += len(frames)
         return frames
 

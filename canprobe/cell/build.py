@@ -14,6 +14,7 @@ from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Controller, TactileSample
+from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.planning.model import (
     HEARTBEAT_PRODUCED_MS,
@@ -31,9 +32,11 @@ COMMAND_REPEAT_NS = 100_000_000
 def make_cell(
     plan: Plan,
     port: Port,
+    *,
     say: Callable[[str], None] = lambda _: None,
     times: BringUpTimes | None = None,
     log_failure: Callable[[], str | None] = lambda: None,
+    observers: Observers | None = None,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered.
 
@@ -43,12 +46,14 @@ def make_cell(
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
     """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
         sync_overflow=plan.sync.overflow,
         heartbeat_ns=HEARTBEAT_PRODUCED_MS * 1_000_000,
         master_id=MASTER_NODE_ID,
+        looks_ns=plan.traffic.budget.looks_ns,
     )
     return Cell(
         port,
@@ -61,6 +66,7 @@ def make_cell(
         say=say,
         times=times,
         log_failure=log_failure,
+        observers=observers,
     )
 
 
@@ -94,9 +100,10 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
     sensor = plan.scene.sensor
     if sensor is None:
         return None
-    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(sensor.node_id, "tpdo")]
+    pdos = plan.pdos_of(sensor.node_id, "tpdo")
+    cob_ids = [pdo.cob_id for pdo in pdos]
     deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
-    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline)
+    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline, [pdo.layout.length for pdo in pdos])
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
 
 

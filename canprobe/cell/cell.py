@@ -12,6 +12,7 @@ from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
+from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
@@ -42,6 +43,7 @@ class Cell:
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
 
     Attributes:
         log: one row a cycle.
@@ -62,6 +64,7 @@ class Cell:
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
+        observers: Observers | None = None,
     ) -> None:
         self.log = RunLog()
         self.drives = drives
@@ -74,6 +77,7 @@ class Cell:
         self._say = say
         self._log_failure = log_failure
         self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), force_of)
+        self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
@@ -257,6 +261,8 @@ class Cell:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
         self.log.add(row)
+        if self._observers is not None and self.cycle is not None:
+            self._observers.cycle(self.cycle.t_first_ns, measurement, command)
 
     # the way out
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,9 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
 from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
 from canprobe.touch.strategy import PathFollower, Strategy
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
 LONGEST_STEP = 4
@@ -125,6 +129,7 @@ class TouchTask:
         self._pole0: Vector = np.zeros(3)
         self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
+        self._estimate: SurfaceEstimate | None = None
 
     @property
     def scan_cycles(self) -> tuple[int, int] | None:
@@ -150,6 +155,7 @@ class TouchTask:
             self._motion = self._motion_from(measurement.q)
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
+        self._estimate = None
         self._pass_time(measurement.t_ns)
         self._sense(measurement)
         self._watch(measurement)
@@ -164,6 +170,7 @@ class TouchTask:
             done=self.phase is Phase.DONE and self.reason is None,
             stop_reason=self.reason if self.phase is Phase.DONE else None,
             columns=self._columns,
+            estimate=self._estimate,
         )
 
     # sensing and supervision
@@ -193,7 +200,7 @@ class TouchTask:
 
     def _take_shape(self, contact: ContactSample) -> None:
         assert self.shape is not None and self._servo is not None
-        estimate = self.shape.add(contact)
+        estimate = self._estimate = self.shape.add(contact)
         if estimate is None:
             return
         self._shape_columns = {
