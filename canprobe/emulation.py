@@ -53,12 +53,12 @@ def emulate(
     plan = make_plan(resolved)
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or name others with --nodes") as port:
         rehearse(resolved)
-        world = make_world(plan, node_ids)
+        world = make_world(plan, node_ids, truth=truth_path is not None)
         _keep(world.nodes, store_folder)
         try:
             _serve(world.participants, node_ids, port, say=say, in_realtime=resolved.cycle.realtime)
         finally:
-            if truth_path is not None:
+            if truth_path is not None and world.recorder is not None:
                 world.recorder.save(truth_path)
 
 
