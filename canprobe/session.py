@@ -194,7 +194,7 @@ class Session:
                 observers=self.observers,
                 rows_kept=self._rows_kept,
             )
-            self._stack.enter_context(garbage_collection_paused())
+            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
             self._observe_frames(port)
