@@ -20,6 +20,7 @@ ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
+TransmitQueue = Literal["priority", "fifo"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -51,6 +52,9 @@ class BusSettings:
     fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
     data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
     cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
+    timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
+    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
 
 
 @dataclass(frozen=True, slots=True)

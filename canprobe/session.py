@@ -6,9 +6,11 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -18,6 +20,7 @@ from numpy.typing import NDArray
 
 from canprobe.bus.candump import CandumpWriter, RecordingPort
 from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
+from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
@@ -26,7 +29,9 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.planning.wire_bits import CLASSIC_BYTES
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits, exact_fd_bits
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene import Scene
 
 if TYPE_CHECKING:
@@ -121,9 +126,10 @@ class Session:
         self.wall_ns = 0
         self._bus_start_ns = 0
         self._bus_time_ns = 0
-        self.traffic: TrafficCounter | None = None
+        self.traffic: dict[str, TrafficCounter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
+        self._candump: CandumpWriter | None = None
         self.world: World | None = None
         self._say = say
         self._stack = ExitStack()
@@ -141,12 +147,11 @@ class Session:
         """The nodes were brought up; there is something to report."""
         return self._cell is not None and self._cell.cycle is not None
 
-    @property
-    def bus_load(self) -> float | None:
-        """Measured share of the bit rate, from the first frame to the last."""
-        if self.traffic is None or self._bus_time_ns <= 0:
+    def bus_load(self, channel: str) -> float | None:
+        """Measured share of a bus's bit rate, from the first frame to the last."""
+        if channel not in self.traffic or self._bus_time_ns <= 0:
             return None
-        return self.traffic.bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
+        return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
@@ -190,14 +195,20 @@ class Session:
     def _open(self) -> Port:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _writer(self, t0_ns: int) -> Callable[[int, bytes, int], None]:
+    def _writer(self, channel: str, t0_ns: int) -> Callable[[int, bytes, int], None]:
         write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
-            writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
-            write = writer.write
-        self.traffic = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        return self.traffic.write
+            if self._candump is None:
+                self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
+            write = self._candump.on(channel)
+        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        self.traffic[channel] = counter
+        return counter.write
+
+    def _join(self, ports: dict[str, Port]) -> Port:
+        """One port for the cell, whatever the number of buses."""
+        return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world
@@ -205,13 +216,18 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel, fd=self.scene.bus.fd is True)
-        bus.recorder = self._writer(0)
+        clock = VirtualClock()
+        buses = {bus.channel: _lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
+        for channel, bus in buses.items():
+            bus.recorder = self._writer(channel, 0)
+        self.lockstep = buses[self.plan.buses[0].channel]
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
-        for participant in self.world.participants:
-            bus.attach(participant)
-        return bus.port()
+        channel_of = {node.node_id: node.channel for node in self.plan.nodes}
+        for node in self.world.nodes:
+            buses[channel_of[node.node_id]].attach(node)
+        self.lockstep.attach(self.world.recorder)
+        return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
         assert self.world is not None
@@ -231,10 +247,16 @@ class Session:
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
             )
+        if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
+            raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         clock = MonotonicClock()
-        real = open_port(bus.interface, bus.channel, bus.bitrate, clock)
-        self._stack.callback(real.close)
-        port = RecordingPort(real, _Sink(self._writer(clock.now_ns())))
+        t0_ns = clock.now_ns()
+        ports: dict[str, Port] = {}
+        for planned in self.plan.buses:
+            real = open_port(bus.interface, planned.channel, bus.bitrate, clock)
+            self._stack.callback(real.close)
+            ports[planned.channel] = RecordingPort(real, _Sink(self._writer(planned.channel, t0_ns)))
+        port = self._join(ports)
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
@@ -250,6 +272,39 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def channel_routes(plan: Plan) -> dict[int, str]:
+    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    for node in plan.nodes:
+        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+            routes[base + node.node_id] = node.channel
+    return routes
+
+
+def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    length = partial(frame_bits_exact, speed_up=bus.data_bitrate / bus.bitrate) if bus.fd else exact_bits
+    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
+    timed.fd = bus.fd is True
+    return timed
+
+
+def frame_bits_exact(can_id: int, data: bytes, *, speed_up: float) -> int:
+    """Bits of this very frame in bit times of the nominal rate; above 8 bytes it is one of CAN FD, rounded up."""
+    if len(data) <= CLASSIC_BYTES:
+        return exact_bits(can_id, data)
+    length = exact_fd_bits(can_id, data)
+    return length.nominal + math.ceil(length.data / speed_up)
 
 
 class _Sink:
