@@ -31,6 +31,7 @@ def run(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -44,6 +45,7 @@ def run(
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, bitrate: in the place of the scene's bus.
+        sensor_channel: the sensor's bus, where it is another one.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
@@ -56,7 +58,13 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
     """
     resolved = resolve_scene(
-        scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        duration_s=duration_s,
     )
     folder = results_folder(resolved, out) if files else None
     session = Session(resolved, folder, say)
@@ -150,6 +158,7 @@ def open_cell(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -164,7 +173,7 @@ def open_cell(
 
     Args:
         scene: from :func:`canprobe.load_scene`.
-        interface, channel, bitrate, seed: in the place of the scene's.
+        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
 
@@ -172,7 +181,9 @@ def open_cell(
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed.
     """
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, seed=seed
+    )
     with Session(resolved, Path(out) if out is not None else None, say) as session:
         yield session
 
@@ -182,6 +193,7 @@ def up(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     say: Say = quiet,
 ) -> None:
@@ -192,7 +204,9 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say) as session:
+    with open_cell(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, say=say
+    ) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())
 

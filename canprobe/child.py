@@ -49,10 +49,12 @@ class EmulatorChild:
     Args:
         scene: the resolved scene.
         out: folder for ``truth.npz``; None uses a temporary one.
+        channel: the bus of its nodes.
     """
 
-    def __init__(self, scene: Scene, out: Path | None) -> None:
+    def __init__(self, scene: Scene, out: Path | None, channel: str) -> None:
         self._scene = scene
+        self._channel = channel
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._truth = (out or self._folder) / "truth.npz"
         self._errors: IO[bytes] | None = None
@@ -68,7 +70,7 @@ class EmulatorChild:
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
-            *("--bus", bus.interface, "--channel", bus.channel, "--bitrate", str(bus.bitrate)),
+            *("--bus", bus.interface, "--channel", self._channel, "--bitrate", str(bus.bitrate)),
             *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth), "--parent", str(os.getpid())),
         ]
         self._errors = (self._folder / "stderr").open("w+b")

@@ -32,7 +32,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.planning.wire_bits import CLASSIC_BYTES
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits, exact_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene import Scene
+from canprobe.scene import BusSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -55,6 +55,7 @@ def resolve_scene(
     bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    sensor_channel: str | None = None,
 ) -> Scene:
     """The scene with what the caller put in the place of its own values; None keeps them."""
     bus = replace(
@@ -65,7 +66,10 @@ def resolve_scene(
     )
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    return replace(scene, bus=bus, scene=info, task=task)
+    sensor = scene.sensor
+    if sensor is not None and sensor_channel is not None:
+        sensor = replace(sensor, channel=sensor_channel)
+    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor)
 
 
 def hush_canopen() -> None:
@@ -253,14 +257,15 @@ class Session:
         t0_ns = clock.now_ns()
         ports: dict[str, Port] = {}
         for planned in self.plan.buses:
-            real = open_port(bus.interface, planned.channel, bus.bitrate, clock)
+            real = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
             self._stack.callback(real.close)
             ports[planned.channel] = RecordingPort(real, _Sink(self._writer(planned.channel, t0_ns)))
         port = self._join(ports)
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
-            child = EmulatorChild(self.scene, self.out)
+            emulated = next(node.channel for node in self.plan.nodes if node.emulated)
+            child = EmulatorChild(self.scene, self.out, emulated)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
@@ -272,6 +277,11 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Of CAN FD frames, None where the scene has none."""
+    return bus.data_bitrate if bus.fd is True else None
 
 
 def channel_routes(plan: Plan) -> dict[int, str]:

@@ -34,5 +34,12 @@ def run(args: argparse.Namespace) -> int:
     from canprobe import api
 
     with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
-        api.up(scene, interface=target.interface, channel=target.channel, bitrate=target.bitrate, say=say)
+        api.up(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            sensor_channel=target.sensor_channel,
+            bitrate=target.bitrate,
+            say=say,
+        )
     return 0
