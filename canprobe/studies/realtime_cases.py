@@ -95,7 +95,7 @@ class Hold:
 def served(channel: str, child: EmulatorChild | None = None) -> Iterator[None]:
     """The nodes of `cylinder` in their process; they take rates and mappings from the master, not from their scene."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel)
-    child = child or EmulatorChild(scene, None)
+    child = child or EmulatorChild(scene, None, channel)
     port = open_port("socketcan", channel, scene.bus.bitrate, MonotonicClock())
     try:
         child.start()

@@ -132,7 +132,7 @@ def soak(seconds: float) -> list[Sample]:
         arm=replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS),
         sensor=replace(scene.sensor, emulated=False),
     )
-    child = EmulatorChild(scene, None, truth=False)
+    child = EmulatorChild(scene, None, CHANNEL, truth=False)
     with served(CHANNEL, child):
         session = Session(real, rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)
