@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from canprobe.cell.cell import Cell
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
@@ -21,6 +22,7 @@ from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
+from canprobe.traffic_log import LOG, measure_traffic
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -91,11 +93,23 @@ def summarise(
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
             for bus in session.plan.buses
         },
-        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
+        "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+
+
+def _traffic(session: Session) -> dict[str, Any] | None:
+    """What was on the bus beside the plan; on a real bus counted afterwards, from the log."""
+    if session.meter is not None:
+        return session.meter.report().as_dict()
+    if session.out is None or len(session.plan.buses) > 1:
+        return None
+    try:
+        return measure_traffic(session.out / LOG, session.plan, exact=False).as_dict()
+    except UsageError:  # it ended before the first SYNC
+        return None
 
 
 def _scan(controller: object) -> tuple[int, int] | None:

@@ -253,7 +253,7 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        if len(self.plan.buses) == 1:
+        if len(self.plan.buses) == 1 and self.scene.bus.interface == LOCKSTEP:
             write = self._metered(write)
         counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         self.traffic[channel] = counter

@@ -13,11 +13,19 @@ from typing import Any, Literal
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan
 from canprobe.planning.pdos import TACTILE_TPDO1
 from canprobe.planning.traffic import on_the_wire
-from canprobe.protocol.frame_bits import best_case_bits, exact_bits, worst_case_bits
+from canprobe.protocol.frame_bits import (
+    FD_LENGTHS,
+    FrameLength,
+    best_case_bits,
+    best_case_fd_bits,
+    exact_bits,
+    exact_fd_bits,
+    worst_case_bits,
+)
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
 Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "heartbeat", "NMT", "EMCY", "SDO"]
-_UNSTUFFED = [best_case_bits(n) for n in range(9)]
+_CLASSIC_BYTES = 8
 TOLERANCE = 0.02
 """Share by which a count may differ from the plan; a frame of each message may always be missing at the edges."""
 
@@ -219,8 +227,11 @@ class TrafficMeter:
     _by_counter: dict[int, int] = field(init=False, default_factory=dict)
     _header_id: int | None = field(init=False, default=None)
     _tactile_ns: int | None = field(init=False, default=None)
+    _unstuffed: dict[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
+        self._unstuffed = {n: best_case_bits(n) for n in range(_CLASSIC_BYTES + 1)}
+        self._unstuffed |= {n: self._nominal(best_case_fd_bits(n)) for n in FD_LENGTHS if n > _CLASSIC_BYTES}
         self._expected = expected_messages(self.plan)
         self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
 
@@ -265,7 +276,7 @@ class TrafficMeter:
             if count is None:
                 count = counts[can_id] = _Count()
             count.frames += 1
-            count.bits += exact_bits(can_id, data) if self.exact else _UNSTUFFED[len(data)]
+            count.bits += self._exact_bits(can_id, data) if self.exact else self._unstuffed[len(data)]
             expected = self._expected.get(can_id)
             if expected is None or expected.latest_ns is None:
                 continue
@@ -275,6 +286,16 @@ class TrafficMeter:
                 count.slowest_ns = max(count.slowest_ns, took)
                 count.late += took > expected.latest_ns
         self._cycle.clear()
+
+    def _exact_bits(self, can_id: int, data: bytes) -> int:
+        if len(data) <= _CLASSIC_BYTES:
+            return exact_bits(can_id, data)
+        return self._nominal(exact_fd_bits(can_id, data))
+
+    def _nominal(self, length: FrameLength) -> int:
+        """Bits of a CAN FD frame in bit times of the nominal rate."""
+        bus = self.plan.scene.bus
+        return length.nominal + round(length.data * bus.bitrate / bus.data_bitrate)
 
     def _trigger(self, expected: Expected, data: bytes) -> int | None:
         """When the SYNC behind a frame was through: the last one, or the one that a tactile header names."""
