@@ -88,7 +88,7 @@ def summarise(
         ),
         "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
         "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
-        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
+        "traffic": {channel: meter.report().as_dict() for channel, meter in session.meters.items()},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],

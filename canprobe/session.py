@@ -149,7 +149,7 @@ class Session:
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: TrafficCounter | None = None
-        self.meter: TrafficMeter | None = None
+        self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
@@ -245,7 +245,7 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        self.meter = meter = TrafficMeter(self.plan, exact=False)
+        meter = self.meters[self.scene.bus.channel] = TrafficMeter(self.plan, self.scene.bus.channel, exact=False)
 
         def measured(can_id: int, data: bytes, t_ns: int) -> None:
             meter.write(can_id, data, t_ns)
