@@ -50,6 +50,7 @@ def run(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -65,6 +66,7 @@ def run(
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, bitrate: in the place of the scene's bus.
+        sensor_channel: the sensor's bus, where it is another one.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
@@ -79,7 +81,14 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
     """
     resolved = resolve_scene(
-        scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s, bridge=bridge
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        duration_s=duration_s,
+        bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
     plan = make_plan(resolved)
@@ -180,6 +189,7 @@ def open_cell(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -197,7 +207,7 @@ def open_cell(
 
     Args:
         scene: from :func:`canprobe.load_scene`.
-        interface, channel, bitrate, seed: in the place of the scene's.
+        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
         observers, bridge: as for :func:`run`.
@@ -207,7 +217,15 @@ def open_cell(
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed.
     """
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, bridge=bridge)
+    resolved = resolve_scene(
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        bridge=bridge,
+    )
     folder = Path(out) if out is not None else None
     with (
         Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
@@ -221,6 +239,7 @@ def up(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     say: Say = quiet,
     bridge: Sequence[str] = (),
@@ -232,8 +251,8 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    session_of = partial(open_cell, interface=interface, channel=channel, bitrate=bitrate, say=say, bridge=bridge)
-    with session_of(scene, rows_kept=ROWS_OF_UP) as session:
+    session_of = partial(open_cell, interface=interface, channel=channel, sensor_channel=sensor_channel)
+    with session_of(scene, bitrate=bitrate, say=say, bridge=bridge, rows_kept=ROWS_OF_UP) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())
 

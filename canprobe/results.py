@@ -87,7 +87,10 @@ def summarise(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
         "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
-        "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
+        "bus_load": {
+            bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+            for bus in session.plan.buses
+        },
         "traffic": {channel: meter.report().as_dict() for channel, meter in session.meters.items()},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "bridges": bridges,
