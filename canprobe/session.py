@@ -31,7 +31,7 @@ from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
-from canprobe.planning.measured import TrafficMeter
+from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.planning.wire_bits import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE

@@ -9,7 +9,8 @@ from canprobe.bus.candump import read_candump
 from canprobe.bus.port import ERR_FLAG
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
+from canprobe.planning.measured import MeasuredTraffic
+from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import Scene
 
 LOG = "bus.log"
