@@ -100,16 +100,15 @@ def summarise(
     }
 
 
-def _traffic(session: Session) -> dict[str, Any] | None:
-    """What was on the bus beside the plan; on a real bus counted afterwards, from the log."""
-    if session.meter is not None:
-        return session.meter.report().as_dict()
-    if session.out is None or len(session.plan.buses) > 1:
-        return None
+def _traffic(session: Session) -> dict[str, Any]:
+    """What was on each bus beside the plan; on a real one counted afterwards, from the log."""
+    if session.out is None or session.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    log, plan = session.out / LOG, session.plan
     try:
-        return measure_traffic(session.out / LOG, session.plan, exact=False).as_dict()
+        return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
     except UsageError:  # it ended before the first SYNC
-        return None
+        return {}
 
 
 def _scan(controller: object) -> tuple[int, int] | None:

@@ -49,6 +49,7 @@ COMPOSITION = {
     "recorded_bridges",
     "recorded_summary",
     "surface_file",
+    "traffic_log",
     "emulation",
 }
 

@@ -70,12 +70,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
-    """Print what was measured; 3 where it is not what was planned."""
+    """Print what was measured on each bus; 3 where it is not what was planned."""
     from canprobe.traffic_log import measure_traffic
 
-    measured = measure_traffic(log, plan)
+    several = len(plan.buses) > 1
+    measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
     if as_json:
-        print_json(measured.as_dict())
+        print_json({channel: one.as_dict() for channel, one in measured.items()})
     else:
-        print(measured.text(), end="")
-    return 0 if measured.as_planned else 3
+        print("\n".join(one.text() for one in measured.values()), end="")
+    return 0 if all(one.as_planned for one in measured.values()) else 3
