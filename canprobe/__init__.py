@@ -19,12 +19,14 @@ if TYPE_CHECKING:
     from canprobe.touch.fit import fit_surface
     from canprobe.touch.surface import SurfaceMatrix
     from canprobe.touch.surface_map import SurfaceMap
+    from canprobe.traffic_log import measure_traffic
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "load_scene": ("canprobe.scene_loader", "load_scene"),
     "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
+    "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
     "open_cell": ("canprobe.api", "open_cell"),
@@ -49,6 +51,7 @@ __all__ = [
     "fit_surface",
     "load_scene",
     "load_surface_map",
+    "measure_traffic",
     "open_cell",
     "plan",
     "replay",

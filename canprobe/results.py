@@ -89,6 +89,7 @@ def summarise(
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
             for bus in session.plan.buses
         },
+        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "faults": list(cell.faults),
     }

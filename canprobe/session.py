@@ -6,7 +6,6 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -29,8 +28,9 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.planning.wire_bits import CLASSIC_BYTES
-from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits, exact_fd_bits
+from canprobe.planning.measured import TrafficMeter
+from canprobe.planning.wire_bits import exact_frame_bits, shortest_bits
+from canprobe.protocol.frame_bits import exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene import BusSettings, Scene
 
@@ -87,13 +87,13 @@ class TrafficCounter:
 
     Args:
         write: of the log.
-        speed_up: data bit rate of CAN FD over the nominal one.
+        bus: its bit rates.
     """
 
-    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
+    def __init__(self, write: Callable[[int, bytes, int], None], bus: BusSettings) -> None:
         self._write = write
         self._by_length = [0] * 65
-        self._speed_up = speed_up
+        self._bus = bus
 
     @property
     def frames(self) -> int:
@@ -102,10 +102,8 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far, those of a data phase as bits of the nominal rate."""
-        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
-        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
-        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+        """Bits so far, in bit times of the nominal rate."""
+        return sum(count * shortest_bits(n, self._bus) for n, count in enumerate(self._by_length) if count)
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -131,6 +129,7 @@ class Session:
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: dict[str, TrafficCounter] = {}
+        self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self._candump: CandumpWriter | None = None
@@ -206,9 +205,19 @@ class Session:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
             write = self._candump.on(channel)
-        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        self.traffic[channel] = counter
+        meter = self.meters[channel] = TrafficMeter(self.plan, exact=False, channel=channel)
+
+        def measured(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.write(can_id, data, t_ns)
+            write(can_id, data, t_ns)
+
+        counter = self.traffic[channel] = TrafficCounter(measured, self.scene.bus)
         return counter.write
+
+    @property
+    def meter(self) -> TrafficMeter | None:
+        """What was counted on the bus that sets the pace."""
+        return self.meters.get(self.plan.buses[0].channel)
 
     def _join(self, ports: dict[str, Port]) -> Port:
         """One port for the cell, whatever the number of buses."""
@@ -303,18 +312,10 @@ def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBu
     rate = scene.bus.bit_error_rate
     errors = BitErrors(rate, scene.seed) if rate > 0 else None
     bus = scene.bus
-    length = partial(frame_bits_exact, speed_up=bus.data_bitrate / bus.bitrate) if bus.fd else exact_bits
+    length = partial(exact_frame_bits, bus=bus) if bus.fd else exact_bits
     timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
     timed.fd = bus.fd is True
     return timed
-
-
-def frame_bits_exact(can_id: int, data: bytes, *, speed_up: float) -> int:
-    """Bits of this very frame in bit times of the nominal rate; above 8 bytes it is one of CAN FD, rounded up."""
-    if len(data) <= CLASSIC_BYTES:
-        return exact_bits(can_id, data)
-    length = exact_fd_bits(can_id, data)
-    return length.nominal + math.ceil(length.data / speed_up)
 
 
 class _Sink:

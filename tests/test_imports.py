@@ -48,6 +48,7 @@ COMPOSITION = {
     "recorded_summary",
     "surface_file",
     "emulation",
+    "traffic_log",
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}

@@ -28,7 +28,7 @@ class CycleSettings:
         sync_overflow: of the SYNC counter (1019h).
         heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
-        looks_ns: times after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
+        looks_ns: times after SYNC went out at which TPDOs are looked for, until all are in; then they are late.
             Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender,
             so that many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway.
     """
@@ -114,7 +114,7 @@ class Cycle:
     def _collect(self) -> None:
         port, clock, intake = self._port, self._port.clock, self._intake
         for look_ns in self._s.looks_ns:
-            clock.sleep_until_ns(self._deadline + look_ns)
+            clock.sleep_until_ns(self.sync_ns + look_ns)
             self._route(port.drain())
             if intake.complete:
                 break
