@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import importlib
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from canprobe.bridging import Bridges
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
+from canprobe.planning import make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
@@ -21,9 +26,23 @@ if TYPE_CHECKING:
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
-__all__ = ["Command", "Measurement", "RunResult", "emulate", "emulate_eds", "open_cell", "run", "scan", "up"]
+__all__ = [
+    "Command",
+    "Measurement",
+    "Observation",
+    "RunResult",
+    "emulate",
+    "emulate_eds",
+    "open_cell",
+    "run",
+    "scan",
+    "up",
+]
 
+ROWS_OF_UP = 4000
+"""Cycles that :func:`up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
+AnyObserver = Observer | Callable[[Observation], None]
 
 
 def run(
@@ -39,6 +58,8 @@ def run(
     progress: Progress | None = None,
     say: Say = quiet,
     files: bool = True,
+    observers: Sequence[AnyObserver] = (),
+    bridge: Sequence[str] = (),
 ) -> RunResult:
     """Carry out a scene's task and write what was measured.
 
@@ -51,6 +72,8 @@ def run(
         progress: called with (seconds done, seconds in all).
         say: called with each step of bring-up and stop.
         files: False writes nothing.
+        observers: called after each cycle with what it saw, said and had on the bus (`Observation`).
+        bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
@@ -65,19 +88,22 @@ def run(
         bitrate=bitrate,
         seed=seed,
         duration_s=duration_s,
+        bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
-    session = Session(resolved, folder, say)
-    controller = make_task(session.plan)
+    plan = make_plan(resolved)
+    controller = make_task(plan)
     failure: BaseException | None = None
-    try:
-        with session:
-            session.run(controller, _report(progress, resolved.task.duration_s))
-    except (CanprobeError, KeyboardInterrupt) as error:
-        failure = error
-        if not session.opened:
-            raise
-    result = _finish(session, controller, failure)
+    with Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges:
+        session = Session(resolved, folder, say, (*observers, *bridges.observers))
+        try:
+            with session:
+                session.run(controller, _report(progress, resolved.task.duration_s))
+        except (CanprobeError, KeyboardInterrupt) as error:
+            failure = error
+            if not session.opened:
+                raise
+        result = _finish(session, controller, failure, bridges)
     if failure is not None:
         if isinstance(failure, CanprobeError):
             failure.summary = result.summary
@@ -96,11 +122,12 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
     return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
 
 
-def _finish(session: Session, controller: object, failure: BaseException | None) -> RunResult:
+def _finish(session: Session, controller: object, failure: BaseException | None, bridges: Bridges) -> RunResult:
     estimates = _estimates(session.scene, controller)
     reason = None if failure is None else (str(failure) or "interrupted")
     surface_map, consistency, map_summary = _mapped(session.scene, controller)
-    summary = summarise(session, controller, estimates, reason, map_summary)
+    summary = summarise(session, controller, estimates, reason, map_summary=map_summary, bridges=bridges.status())
+    summary["bridges"] = bridges.end(summary)
     result = RunResult(
         session.plan,
         summary,
@@ -142,6 +169,10 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
 
 
 def _draw(result: RunResult, out: Path) -> None:
+    (out / "report.html").unlink(missing_ok=True)  # of an earlier run
+    if "report.html" in result.plan.outputs:
+        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
+        page.write_page(recorded.read_run(out), out / "report.html")
     try:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface
@@ -163,6 +194,9 @@ def open_cell(
     out: Path | str | None = None,
     seed: int | None = None,
     say: Say = quiet,
+    observers: Sequence[AnyObserver] = (),
+    bridge: Sequence[str] = (),
+    rows_kept: int | None = None,
 ) -> Iterator[Session]:
     """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
 
@@ -176,15 +210,27 @@ def open_cell(
         interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
+        observers, bridge: as for :func:`run`.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by 3 KiB a cycle.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed.
     """
     resolved = resolve_scene(
-        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, seed=seed
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        bridge=bridge,
     )
-    with Session(resolved, Path(out) if out is not None else None, say) as session:
+    folder = Path(out) if out is not None else None
+    with (
+        Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
+        Session(resolved, folder, say, (*observers, *bridges.observers), rows_kept) as session,
+    ):
         yield session
 
 
@@ -196,6 +242,7 @@ def up(
     sensor_channel: str | None = None,
     bitrate: int | None = None,
     say: Say = quiet,
+    bridge: Sequence[str] = (),
 ) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 
@@ -204,9 +251,8 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(
-        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, say=say
-    ) as session:
+    session_of = partial(open_cell, interface=interface, channel=channel, sensor_channel=sensor_channel)
+    with session_of(scene, bitrate=bitrate, say=say, bridge=bridge, rows_kept=ROWS_OF_UP) as session:
         say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
         session.run(lambda _: Command())
 

@@ -57,12 +57,12 @@ def emulate(
     way_out = "end that node, or name others with --nodes"
     with _free_port(interface, channel, bitrate, node_ids, way_out, data_bitrate=fast) as port:
         rehearse(resolved)
-        world = make_world(plan, node_ids)
+        world = make_world(plan, node_ids, truth=truth_path is not None)
         _keep(world.nodes, store_folder)
         try:
-            _serve(world.participants, node_ids, port, channel, say)
+            _serve(world.participants, node_ids, port, say=say, in_realtime=resolved.cycle.realtime)
         finally:
-            if truth_path is not None:
+            if truth_path is not None and world.recorder is not None:
                 world.recorder.save(truth_path)
 
 
@@ -73,6 +73,7 @@ def emulate_eds(
     channel: str,
     bitrate: int,
     store_folder: Path | None = None,
+    in_realtime: bool = False,
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
@@ -81,6 +82,7 @@ def emulate_eds(
         files: (name or path of an EDS or DCF file, node id) of each node.
         interface, channel, bitrate: of the bus.
         store_folder: as for :func:`emulate`.
+        in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
         say: called with what is odd about the files, and when the nodes are there.
 
     Raises:
@@ -103,7 +105,7 @@ def emulate_eds(
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
         _keep(nodes, store_folder)
-        _serve(nodes, node_ids, port, channel, say)
+        _serve(nodes, node_ids, port, say=say, in_realtime=in_realtime)
 
 
 @contextlib.contextmanager
@@ -130,16 +132,18 @@ def _free_port(
         port.close()
 
 
-def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, channel: str, say: Say) -> None:
+def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, *, say: Say, in_realtime: bool) -> None:
     from canprobe.bus.memory import reserve_memory
-    from canprobe.bus.priority import ask_for_processor
+    from canprobe.bus.priority import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.emulator.serve import serve
 
     reserve_memory()
     port.drain()  # what passed meanwhile
     ask_for_processor()
-    say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
-    serve(nodes, port, lambda: False)
+    favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
+    say(f"serving nodes {', '.join(map(str, node_ids))} on {port.channel}; Ctrl-C stops them")
+    with favour:
+        serve(nodes, port, lambda: False)
 
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:

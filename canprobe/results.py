@@ -62,7 +62,9 @@ def summarise(
     controller: object,
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
+    *,
     map_summary: dict[str, Any] | None = None,
+    bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
@@ -84,14 +86,15 @@ def summarise(
         "shape": summarise_shape(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
-        "cycle": _cycle(cell, controller),
+        "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
         "bus_load": {
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
             for bus in session.plan.buses
         },
-        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
+        "traffic": {channel: meter.report().as_dict() for channel, meter in session.meters.items()},
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
-        "faults": list(cell.faults),
+        "bridges": bridges,
+        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
 
 
@@ -229,6 +232,11 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
     }
 
 
+def _observed(session: Session) -> dict[str, float | None] | None:
+    """What observers and bridges added to a cycle, after its work; None without any."""
+    return _percentiles(session.observers.cost_ns) if session.observers is not None else None
+
+
 def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     if not values_ns:
         return dict.fromkeys(("p50", "p99", "p999", "max"))
@@ -278,9 +286,19 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         )
     if shape["method"] is not None:
         lines += shape_lines(shape)
+    lines += bridge_lines(summary.get("bridges") or {})
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
+
+
+def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What each bridge was given and lost, as lines for people."""
+    return [
+        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
+        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
+        for name, status in bridges.items()
+    ]
 
 
 def curvature_text(values: Sequence[float | None] | None) -> str:

@@ -21,6 +21,7 @@ ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
 TransmitQueue = Literal["priority", "fifo"]
+BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -49,12 +50,12 @@ class BusSettings:
     interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
-    fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
-    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
-    cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
     timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
     transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
     bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
+    fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
+    cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +63,7 @@ class CycleSettings:
     """`[cycle]`: the rate of SYNC and servo."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
     compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
 
 
@@ -169,6 +171,9 @@ class LimitSettings:
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
     joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
+    workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
+    workspace_max_mm: Vec3 | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,6 +201,20 @@ class PlantSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class BridgeSettings:
+    """`[bridge]`: the other tools that see this cell, each in a process of its own; `canprobe.planning.bridges`."""
+
+    use: Annotated[tuple[BridgeName, ...], Distinct()] = ()
+    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765  # 0 lets the system choose
+    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_domain: Annotated[int, Range(0, 232)] = 0
+    ros2_loopback: bool = True  # false lets other machines see the topics, and command the cell where that is allowed
+    view_port: Annotated[int, Range(0, 65_535)] = 8080  # 0 lets the system choose; where it is taken, the next free one
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_commands: bool = False  # start, stop, target force and speed are taken from topics, within the scene's limits
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """One experiment. Sections that are None are absent."""
 
@@ -211,6 +230,7 @@ class Scene:
     shape: ShapeSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
+    bridge: BridgeSettings | None = None
 
     @property
     def name(self) -> str:

@@ -6,7 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -23,16 +23,19 @@ from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
+from canprobe.planning.bridges import check_bridges
 from canprobe.planning.measured import TrafficMeter
-from canprobe.planning.wire_bits import exact_frame_bits, shortest_bits
-from canprobe.protocol.frame_bits import exact_bits
+from canprobe.planning.wire_bits import exact_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene import BusSettings, Scene
+from canprobe.scene import BridgeSettings, BusSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -56,8 +59,9 @@ def resolve_scene(
     seed: int | None = None,
     duration_s: float | None = None,
     sensor_channel: str | None = None,
+    bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them."""
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
     bus = replace(
         scene.bus,
         interface=scene.bus.interface if interface is None else interface,
@@ -69,7 +73,16 @@ def resolve_scene(
     sensor = scene.sensor
     if sensor is not None and sensor_channel is not None:
         sensor = replace(sensor, channel=sensor_channel)
-    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor)
+    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
 def hush_canopen() -> None:
@@ -87,13 +100,13 @@ class TrafficCounter:
 
     Args:
         write: of the log.
-        bus: its bit rates.
+        speed_up: data bit rate of CAN FD over the nominal one.
     """
 
-    def __init__(self, write: Callable[[int, bytes, int], None], bus: BusSettings) -> None:
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
         self._by_length = [0] * 65
-        self._bus = bus
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -102,8 +115,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far, in bit times of the nominal rate."""
-        return sum(count * shortest_bits(n, self._bus) for n, count in enumerate(self._by_length) if count)
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -118,9 +133,22 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+
+    Attributes:
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Say = quiet) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
+    ) -> None:
+        self._rows_kept = rows_kept
         self.plan: Plan = make_plan(scene)
         self.scene = self.plan.scene
         self.out = out
@@ -134,6 +162,8 @@ class Session:
         self.lockstep: LockstepBus | None = None
         self._candump: CandumpWriter | None = None
         self.world: World | None = None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -163,9 +193,18 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say)
-            self._stack.enter_context(garbage_collection_paused())
+            self._cell = make_cell(
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
+            )
+            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
+            self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
+            self._observe_frames(port)
         except BaseException:
             self._close()
             raise
@@ -189,6 +228,11 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
+            if self._cell is not None and (failure := self._log_failure()) is not None:
+                self._cell.faults.append(f"the log is not whole: {failure}")
+
+    def _log_failure(self) -> str | None:
+        return self._candump.failure if self._candump is not None else None
 
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
@@ -205,23 +249,31 @@ class Session:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
             write = self._candump.on(channel)
-        meter = self.meters[channel] = TrafficMeter(self.plan, exact=False, channel=channel)
+        if self.observers is not None:
+            self.observers.origin_ns = t0_ns
+            write = self.observers.tap(write)
+        write = self._metered(channel, write)
+        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        self.traffic[channel] = counter
+        return counter.write
 
-        def measured(can_id: int, data: bytes, t_ns: int) -> None:
+    def _metered(self, channel: str, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
+        meter = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+
+        def both(can_id: int, data: bytes, t_ns: int) -> None:
             meter.write(can_id, data, t_ns)
             write(can_id, data, t_ns)
 
-        counter = self.traffic[channel] = TrafficCounter(measured, self.scene.bus)
-        return counter.write
-
-    @property
-    def meter(self) -> TrafficMeter | None:
-        """What was counted on the bus that sets the pace."""
-        return self.meters.get(self.plan.buses[0].channel)
+        return both
 
     def _join(self, ports: dict[str, Port]) -> Port:
         """One port for the cell, whatever the number of buses."""
         return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world
@@ -238,8 +290,9 @@ class Session:
         self._stack.callback(self._keep_truth)
         channel_of = {node.node_id: node.channel for node in self.plan.nodes}
         for node in self.world.nodes:
-            buses[channel_of[node.node_id]].attach(node)
-        self.lockstep.attach(self.world.recorder)
+            buses[channel_of[node.node_id]].attach(self.joins(node))
+        if self.world.recorder is not None:
+            self.lockstep.attach(self.joins(self.world.recorder))
         return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
@@ -274,7 +327,7 @@ class Session:
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
             emulated = next(node.channel for node in self.plan.nodes if node.emulated)
-            child = EmulatorChild(self.scene, self.out, emulated)
+            child = EmulatorChild(self.scene, self.out, emulated, truth=self._rows_kept is None)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
@@ -282,6 +335,8 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
@@ -312,7 +367,7 @@ def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBu
     rate = scene.bus.bit_error_rate
     errors = BitErrors(rate, scene.seed) if rate > 0 else None
     bus = scene.bus
-    length = partial(exact_frame_bits, bus=bus) if bus.fd else exact_bits
+    length = partial(exact_frame_bits, bus=bus)
     timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
     timed.fd = bus.fd is True
     return timed

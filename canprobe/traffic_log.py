@@ -21,7 +21,7 @@ def measure_traffic(log: Path | str, scene: Scene | Plan, *, channel: str | None
     Args:
         log: a candump log, or the folder of a run.
         scene: the scene that ran, or its plan.
-        channel: of the log; by default the scene's, or the only one in the log.
+        channel: of the log; by default that of the scene's first bus, or the only one in the log.
 
     Returns:
         Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
@@ -36,11 +36,9 @@ def measure_traffic(log: Path | str, scene: Scene | Plan, *, channel: str | None
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
     for t_ns, name, can_id, data in read_candump(path):
-        if channel is not None and name != channel:
-            continue
         meter = meters.get(name)
         if meter is None:
-            meter = meters[name] = TrafficMeter(plan, channel=name)
+            meter = meters[name] = TrafficMeter(plan, name)
         if can_id & ERR_FLAG and can_id <= 0x3FFFFFFF:
             meter.error_frames += 1
         else:
@@ -53,10 +51,13 @@ def _chosen(
     path: Path, meters: dict[str, TrafficMeter], syncs: Counter[str], plan: Plan, channel: str | None
 ) -> TrafficMeter:
     with_sync = [name for name in meters if syncs[name]]
-    preferred = channel or plan.scene.bus.channel
-    name = preferred if preferred in with_sync else with_sync[0] if len(with_sync) == 1 else None
-    if name is None:
-        found = ", ".join(sorted(with_sync)) or "none"
-        what = f"channel {channel}" if channel else "any channel" if not with_sync else f"channel {preferred}"
-        raise UsageError(f"{path}: no SYNC (080h) on {what}; channels with SYNC: {found}; name one of them")
-    return meters[name]
+    wanted = plan.buses[0].channel if channel is None else channel
+    if wanted in with_sync:
+        return meters[wanted]
+    if channel is None and len(with_sync) == 1:
+        return meters[with_sync[0]]
+    if not with_sync:
+        raise UsageError(f"{path}: no SYNC (080h) on any channel; expected the log of a cell that ran")
+    raise UsageError(
+        f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
+    )

@@ -7,14 +7,15 @@ Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 
 from __future__ import annotations
 
+import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, Port, PortCounters, TimedFrame
 from canprobe.errors import UsageError
 
 _LINE = re.compile(
@@ -33,15 +34,24 @@ _LINES = 256
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
+    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
+    looks at `failure`.
+
     Args:
         path: the file to write; an existing one is replaced.
         channel: the name in each line.
         t0_ns: the time on the frames' clock that is written as 0.
+
+    Attributes:
+        failure: why nothing is written any more; None while all is well.
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
         self._t0_ns = t0_ns
-        self._file = open(path, "w", encoding="ascii", newline="\n", buffering=1 << 16)  # noqa: SIM115 - closed by close
+        self.failure: str | None = None
+        self._path = path
+        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
+        self._size = 0
         self._lines: list[str] = []
         self.write = self.on(channel)
 
@@ -51,8 +61,19 @@ class CandumpWriter:
 
     def flush(self) -> None:
         """Hand what was written to the file."""
-        self._file.write("".join(self._lines))
+        data = "".join(self._lines).encode("ascii")
         self._lines.clear()
+        if self.failure is not None:
+            return
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.failure = f"{self._path}: {error.strerror}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
+        self._size += written
 
     def close(self) -> None:
         """Flush and close the file; twice is allowed."""
@@ -116,8 +137,12 @@ def _format_id(can_id: int) -> str:
     return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
 
 
-def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
+
+    Args:
+        path: the log.
+        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -128,10 +153,21 @@ def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
     try:
         with Path(path).open(encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
+                if only is not None and _id_of(line) not in only:
+                    continue
                 if text := line.rstrip("\r\n"):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def _id_of(line: str) -> int:
+    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
+    name = line.partition("#")[0].rpartition(" ")[2]
+    try:
+        return int(name, 16) if len(name) == 3 else -1
+    except ValueError:
+        return -1
 
 
 def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
@@ -188,6 +224,11 @@ class RecordingPort:
     def counters(self) -> PortCounters:
         """The port's counters."""
         return self._port.counters
+
+    @property
+    def state(self) -> ControllerState:
+        """As the port tells it."""
+        return self._port.state
 
     @property
     def stamps_arrival(self) -> bool:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import Frame, Port, PortCounters, TimedFrame
+from canprobe.bus.port import ControllerState, Frame, Port, PortCounters, TimedFrame
 
 _SLICE_NS = 200_000
 """How long one bus is waited for before the others are looked at again."""
@@ -43,6 +43,11 @@ class JoinedPort:
         """What has passed through all of them."""
         every = [port.counters for port in self._ports.values()]
         return PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+
+    @property
+    def state(self) -> ControllerState:
+        """The worst of their controllers' states."""
+        return max(port.state for port in self._ports.values())
 
     @property
     def stamps_arrival(self) -> bool:

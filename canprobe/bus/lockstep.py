@@ -16,7 +16,7 @@ from heapq import heapify, heappop, heappush
 from typing import Protocol
 
 from canprobe.bus.clock import VirtualClock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import BusError, InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
@@ -258,9 +258,13 @@ class LockstepBus:
 
 
 class LockstepPort:
-    """A master's `Port` on a `LockstepBus`; see there for the order of frames."""
+    """A master's `Port` on a `LockstepBus`; see there for the order of frames.
 
-    __slots__ = ("_bus", "_open", "counters", "inbox", "node")
+    Attributes:
+        state: of a controller that this bus does not have: as it was set, to see what a cell does about it.
+    """
+
+    __slots__ = ("_bus", "_open", "counters", "inbox", "node", "state")
 
     node: BusNode
 
@@ -269,6 +273,7 @@ class LockstepPort:
         self._open = True
         self.inbox: list[TimedFrame] = []
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
 
     @property
     def clock(self) -> VirtualClock:

@@ -85,6 +85,11 @@ class Port(Protocol):
         ...
 
     @property
+    def state(self) -> ControllerState:
+        """The CAN controller's error state, as far as the port can tell."""
+        ...
+
+    @property
     def stamps_arrival(self) -> bool:
         """Whether a received frame carries the time of its arrival; if not, that of the `drain` that returned it."""
         ...

@@ -15,13 +15,18 @@ import can
 
 from canprobe.bus.clock import Clock
 from canprobe.bus.echoes import Echoes
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
 CLASSIC_BYTES = 8
+_STATES = {
+    can.BusState.ACTIVE: ControllerState.ACTIVE,
+    can.BusState.PASSIVE: ControllerState.PASSIVE,
+    can.BusState.ERROR: ControllerState.BUS_OFF,
+}
 _HEARS_ITSELF = ("udp_multicast",)
 """Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
 
@@ -39,6 +44,7 @@ class PythonCanPort:
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
+        state: the controller's state as python-can told it at the last error frame.
 
     Raises:
         InterfaceError: python-can cannot open it, with its reason.
@@ -58,6 +64,7 @@ class PythonCanPort:
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
         self._echoes = Echoes() if interface in _HEARS_ITSELF else None
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters, data_bitrate)
@@ -120,6 +127,7 @@ class PythonCanPort:
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
             self.counters.error_frames += 1
+            self.state = _STATES.get(self._open_bus().state, self.state)
             return None
         if message.is_fd and not self._fd:
             self.counters.ignored += 1

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass, field
 
 from canprobe.bus.clock import elapsed_ns
@@ -45,8 +46,15 @@ class CycleStatistics:
     """What the cycle counted and timed: an entry a cycle, and a computing time every ``TIMED_CYCLES``."""
 
     overruns: int = 0
-    period_error_ns: list[int] = field(default_factory=list)
-    compute_ns: list[int] = field(default_factory=list)
+    period_error_ns: MutableSequence[int] = field(default_factory=list)
+    compute_ns: MutableSequence[int] = field(default_factory=list)
+
+    @classmethod
+    def of_last(cls, cycles: int | None) -> CycleStatistics:
+        """With the times of the last cycles only; None for all."""
+        if cycles is None:
+            return cls()
+        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles))
 
 
 class Cycle:
@@ -59,6 +67,7 @@ class Cycle:
         tactile: the sensor's receiver; None in a scene without a sensor.
         watch: sees heartbeats and EMCYs.
         other: takes what nobody here expects (SDO answers).
+        kept: cycles whose times are kept; None for all.
     """
 
     def __init__(
@@ -70,9 +79,10 @@ class Cycle:
         tactile: TactileReceiver | None,
         watch: NodeWatch,
         other: Callable[[list[TimedFrame]], None],
+        kept: int | None = None,
     ) -> None:
         self.number = -1
-        self.statistics = CycleStatistics()
+        self.statistics = CycleStatistics.of_last(kept)
         self.t_first_ns = port.clock.now_ns() + settings.period_ns
         self.t_ns = 0
         self.sync_ns = 0
@@ -125,6 +135,11 @@ class Cycle:
         rest = [frame for frame in self._intake.route(frames) if not watch.push(*frame)]
         if rest:
             self._other(rest)
+
+    def skip(self) -> None:
+        """Let this cycle be: wait for the end of its period."""
+        self._deadline += self._s.period_ns
+        self._port.clock.sleep_until_ns(self._deadline)
 
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_ids, whole
-from canprobe.cli.target import real_target, target_of
+from canprobe.cli.target import add_realtime, real_target, target_of, with_realtime
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("emulate", help="serve emulated nodes on a bus", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser, optional=True)
     add_bus(parser)
+    add_realtime(parser)
     parser.add_argument(
         "--eds", metavar="FILE", action="append", default=[], help="an EDS or DCF file to serve; may be repeated"
     )
@@ -83,7 +84,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
 
     if args.node_id:
         raise UsageError("emulate: --node-id belongs to --eds; of a scene's nodes, choose with --nodes")
-    scene = load_scene(args.scene)
+    scene = with_realtime(load_scene(args.scene), args.realtime)
     _name_bus(args, scene.bus.channel)
     target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
@@ -124,6 +125,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         channel=channel,
         bitrate=bitrate or _BITRATE,
         store_folder=args.store,
+        in_realtime=args.realtime,
         say=say,
     )
 

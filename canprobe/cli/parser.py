@@ -58,6 +58,16 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate of the bus")
 
 
+def add_bridge(parser: argparse.ArgumentParser) -> None:
+    """Other tools to feed, besides those of the scene."""
+    parser.add_argument(
+        "--bridge",
+        metavar="NAME",
+        action="append",
+        help="feed a tool: mcap, foxglove, ros2, view; may be repeated",
+    )
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """--json: one document on stdout."""
     parser.add_argument("--json", action="store_true", help="print one JSON document")

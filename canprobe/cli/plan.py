@@ -20,9 +20,9 @@ for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
 examples:
   canprobe plan cylinder
   canprobe plan mine.toml --auto
+  canprobe plan cylinder --measured runs/cylinder-20260101-120000
   canprobe plan cylinder --export dbc --export dcf --out config/
   canprobe plan cylinder --figure plan.png
-  canprobe plan cylinder --measured runs/cylinder-20260101-120000
 """
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
@@ -34,6 +34,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     add_scene(parser)
     parser.add_argument(
+        "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
+    )
+    parser.add_argument(
         "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
     )
     parser.add_argument(
@@ -43,9 +46,6 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--figure", metavar="FILE.png", type=Path, help="draw cycles and response times (extra `study`)"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
-    parser.add_argument(
-        "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
-    )
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -87,12 +87,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
-    """Print what was measured; 3 where it is not what was planned."""
+    """Print what was measured on each bus; 3 where it is not what was planned."""
     from canprobe.traffic_log import measure_traffic
 
-    measured = measure_traffic(log, plan)
+    several = len(plan.buses) > 1
+    measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
     if as_json:
-        print_json(measured.as_dict())
+        print_json({channel: one.as_dict() for channel, one in measured.items()})
     else:
-        print(measured.text(), end="")
-    return 0 if measured.as_planned else 3
+        print("\n".join(one.text() for one in measured.values()), end="")
+    return 0 if all(one.as_planned for one in measured.values()) else 3

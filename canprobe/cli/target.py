@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from canprobe.cli.parser import did_you_mean
@@ -46,6 +46,20 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
         return Target(args.bus or scene.bus.interface, channel, args.bitrate or scene.bus.bitrate, sensor_channel)
     channel = channels.get(scene.bus.channel) or found.channel or scene.bus.channel
     return Target(found.interface, channel, args.bitrate or found.bitrate or scene.bus.bitrate, sensor_channel)
+
+
+def add_realtime(parser: argparse.ArgumentParser) -> None:
+    """The option of commands that keep time on a real interface."""
+    parser.add_argument(
+        "--realtime",
+        action="store_true",
+        help="SCHED_FIFO, a processor of its own and locked memory, as far as permitted [the scene's cycle.realtime]",
+    )
+
+
+def with_realtime(scene: Scene, wanted: bool) -> Scene:
+    """The scene, in real time where the command line wants it."""
+    return replace(scene, cycle=replace(scene.cycle, realtime=True)) if wanted else scene
 
 
 def real_target(bus: str | None, channel: str | None, bitrate: int | None) -> tuple[str, str | None, int | None]:

@@ -51,6 +51,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "offline_estimators": list(plan.offline_estimators),
         "strategy": plan.strategy,
         "fidelity": plan.fidelity,
+        "bridges": list(plan.scene.bridge.use) if plan.scene.bridge is not None else [],
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],

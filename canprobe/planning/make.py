@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from canprobe.errors import EdsError, PlanError
 from canprobe.planning.abilities import Abilities
+from canprobe.planning.bridges import unavailable_bridges
 from canprobe.planning.cycle import plan_ratio, plan_sync
 from canprobe.planning.identifiers import identifier_problems, order_by_deadline
 from canprobe.planning.left_out import left_out, outputs
@@ -66,7 +67,7 @@ def make_plan(scene: Scene) -> Plan:
         fidelity=scene.plant.fidelity if scene.plant is not None and scene.emulated_node_ids else None,
         outputs=outputs(scene),
         left_out=left_out(scene),
-        not_available=bus.not_available,
+        not_available=(*bus.not_available, *unavailable_bridges(scene)),
     )
 
 

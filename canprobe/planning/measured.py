@@ -12,12 +12,11 @@ from typing import Any, Literal
 
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus
 from canprobe.planning.traffic import on_the_wire
-from canprobe.planning.wire_bits import CLASSIC_BYTES, exact_frame_bits, shortest_bits
-from canprobe.protocol.frame_bits import best_case_bits, exact_bits, worst_case_bits
+from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
 Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "heartbeat", "NMT", "EMCY", "SDO"]
-_UNSTUFFED = [best_case_bits(n) for n in range(9)]
 TOLERANCE = 0.02
 """Share by which a count may differ from the plan; a frame of each message may always be missing at the edges."""
 
@@ -41,13 +40,12 @@ class Expected:
     latest_ns: int | None = None
 
 
-def expected_messages(plan: Plan, channel: str | None = None) -> dict[int, Expected]:
-    """Every message that the plan lists on a bus, by identifier; by default the bus that sets the pace."""
-    bus = _bus(plan, channel)
+def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
+    """Every message that the plan lists for one of its buses, by identifier."""
     sync_bytes = 1 if SYNC_OVERFLOW else 0
     shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.scene.bus.bitrate
     found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, worst_case_bits(sync_bytes)), Expected(NMT_ID, "NMT")]
-    for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.channel == bus.channel]):
+    for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
         kind: Kind = "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
         triggered = pdo.response_ns is not None and pdo.transmission_type <= 240
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
@@ -60,10 +58,6 @@ def expected_messages(plan: Plan, channel: str | None = None) -> dict[int, Expec
         found += [Expected(EMCY_BASE + node, "EMCY"), Expected(SDO_TX_BASE + node, "SDO")]
         found.append(Expected(SDO_RX_BASE + node, "SDO"))
     return {message.cob_id: message for message in found}
-
-
-def _bus(plan: Plan, channel: str | None) -> PlannedBus:
-    return next((bus for bus in plan.buses if bus.channel == channel), plan.buses[0])
 
 
 @dataclass(slots=True)
@@ -208,15 +202,16 @@ class TrafficMeter:
 
     Attributes:
         plan: what to expect.
+        channel: of the bus, as the plan names it; None: its first one.
         exact: count stuff bits too, which costs a few µs a frame.
         error_frames: to be counted by the reader.
-        channel: which of the plan's buses; by default the one that sets the pace.
     """
 
     plan: Plan
+    channel: str | None = None
     exact: bool = True
     error_frames: int = 0
-    channel: str | None = None
+    _bus: PlannedBus = field(init=False)
     _expected: dict[int, Expected] = field(init=False)
     _counts: dict[int, _Count] = field(init=False, default_factory=dict)
     _before: dict[int, _Count] = field(init=False, default_factory=dict)
@@ -228,7 +223,9 @@ class TrafficMeter:
     _tactile_ns: int | None = field(init=False, default=None)
 
     def __post_init__(self) -> None:
-        self._expected = expected_messages(self.plan, self.channel)
+        buses = self.plan.buses
+        self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
+        self._expected = expected_messages(self.plan, self._bus)
         self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
@@ -261,22 +258,18 @@ class TrafficMeter:
                 if one.kind in ("drive TPDO", "drive RPDO", "tactile PDO") and one.cob_id not in seen
             ),
             error_frames=self.error_frames,
-            planned_worst=_bus(self.plan, self.channel).traffic.load,
+            planned_worst=self._bus.traffic.load,
         )
 
     def _count(self) -> None:
         """Count the frames since the last SYNC."""
-        counts = self._counts
+        counts, bus, exact = self._counts, self.plan.scene.bus, self.exact
         for can_id, data, t_ns in self._cycle:
             count = counts.get(can_id)
             if count is None:
                 count = counts[can_id] = _Count()
             count.frames += 1
-            if len(data) > CLASSIC_BYTES:
-                bus = self.plan.scene.bus
-                count.bits += exact_frame_bits(can_id, data, bus) if self.exact else shortest_bits(len(data), bus)
-            else:
-                count.bits += exact_bits(can_id, data) if self.exact else _UNSTUFFED[len(data)]
+            count.bits += exact_frame_bits(can_id, data, bus) if exact else unstuffed_frame_bits(len(data), bus)
             expected = self._expected.get(can_id)
             if expected is None or expected.latest_ns is None:
                 continue

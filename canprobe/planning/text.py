@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -152,6 +153,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     if plan.fidelity is not None:
         emulated = ", ".join(map(str, plan.scene.emulated_node_ids))
         yield ["emulator", f"nodes {emulated}; arm {plan.fidelity}" if plan.scene.arm else f"nodes {emulated}"]
+    for name in plan.scene.bridge.use if plan.scene.bridge is not None else ():
+        yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
 
 

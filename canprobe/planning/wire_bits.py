@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from canprobe.protocol.frame_bits import (
-    FrameLength,
     best_case_bits,
     best_case_fd_bits,
     exact_bits,
@@ -25,18 +24,21 @@ def frame_bits(n_data: int, bus: BusSettings) -> int:
     """
     if n_data <= CLASSIC_BYTES:
         return worst_case_bits(n_data)
-    return _nominal(worst_case_fd_bits(n_data), bus)
-
-
-def shortest_bits(n_data: int, bus: BusSettings) -> int:
-    """The same without one stuff bit that depends on the data."""
-    return best_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(best_case_fd_bits(n_data), bus)
+    worst = worst_case_fd_bits(n_data)
+    return worst.nominal - (-worst.data * bus.bitrate // bus.data_bitrate)
 
 
 def exact_frame_bits(can_id: int, data: bytes, bus: BusSettings) -> int:
-    """The same of this very frame."""
-    return exact_bits(can_id, data) if len(data) <= CLASSIC_BYTES else _nominal(exact_fd_bits(can_id, data), bus)
+    """Bits of this very frame, in the same bit times."""
+    if len(data) <= CLASSIC_BYTES:
+        return exact_bits(can_id, data)
+    exact = exact_fd_bits(can_id, data)
+    return exact.nominal - (-exact.data * bus.bitrate // bus.data_bitrate)
 
 
-def _nominal(length: FrameLength, bus: BusSettings) -> int:
-    return length.nominal - (-length.data * bus.bitrate // bus.data_bitrate)
+def unstuffed_frame_bits(n_data: int, bus: BusSettings) -> int:
+    """Bits of a frame without stuff bits, as `canbusload -i` counts, in the same bit times."""
+    if n_data <= CLASSIC_BYTES:
+        return best_case_bits(n_data)
+    best = best_case_fd_bits(n_data)
+    return best.nominal - (-best.data * bus.bitrate // bus.data_bitrate)
