@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 
 from canprobe.planning.measured import ClassTraffic, Kind, MeasuredTraffic
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus
-from canprobe.planning.pdos import TACTILE_TPDO1
 from canprobe.planning.traffic import on_the_wire
 from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
@@ -43,8 +42,8 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
         kind: Kind = "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
         triggered = pdo.response_ns is not None and pdo.transmission_type <= 240
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
-        tactile = pdo.direction == "tpdo" and pdo.cob_id >= TACTILE_TPDO1
-        found.append(Expected(pdo.cob_id, "tactile PDO" if tactile else kind, pdo.rate_hz, pdo.bits_worst, latest))
+        kind = "tactile PDO" if pdo.kind == "tactile" else kind
+        found.append(Expected(pdo.cob_id, kind, pdo.rate_hz, pdo.bits_worst, latest))
     beat = 1000 / HEARTBEAT_PRODUCED_MS
     for node in (*bus.node_ids, MASTER_NODE_ID):
         found.append(Expected(HEARTBEAT_BASE + node, "heartbeat", beat, worst_case_bits(1)))
