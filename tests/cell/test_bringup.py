@@ -156,9 +156,6 @@ def other_make(tmp_path):
     sections = re.split(r"(?m)^(?=\[)", text)
     optional = "1015|1019|1016|6007|605A|6065|6066|607D|1020|1010|1011|100A|(14|16|18|1A)0[123]|2[0-9A-F]{3}"
     gone = re.compile(rf"\[({optional})(sub\w+)?\]", re.IGNORECASE)
-        r"\[(1020|1010|1011|100A|1015|(14|16|18|1A)0[123]|1019|6007|605A|6065|6066|607D|1016|2[0-9A-F]{3})(sub\w+)?\]",
-        re.IGNORECASE,
-    )
     kept = [section for section in sections if not gone.match(section)]
     objects = {m[1].upper() for s in sections if (m := re.match(r"\[([0-9A-F]{4})\]", s)) and gone.match(s)}
     lists = "".join(kept)
