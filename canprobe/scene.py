@@ -234,6 +234,8 @@ class PlantSettings:
     hysteresis: bool = True
     creep: bool = True
     crosstalk: bool = True
+    saturation: bool = True
+    threshold: bool = True  # of the array itself, before the node's own
 
 
 @dataclass(frozen=True, slots=True)
