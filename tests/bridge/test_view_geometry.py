@@ -47,7 +47,9 @@ def test_volumes_are_those_of_the_solids():
     stadium = math.pi * 0.02**2 + 0.04 * 0.1
     link = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03))
     assert link.volume == pytest.approx(0.03 * stadium, rel=2e-3)
-    assert meshes.dome(0.04, math.pi, rings=200, sectors=200).volume == pytest.approx(4 / 3 * math.pi * 0.04**3, rel=1e-3)
+    assert meshes.dome(0.04, math.pi, rings=200, sectors=200).volume == pytest.approx(
+        4 / 3 * math.pi * 0.04**3, rel=1e-3
+    )
     rounded = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03), 4e-3)
     assert 0.9 * link.volume < rounded.volume < link.volume
 
@@ -57,7 +59,9 @@ def test_a_link_between_unequal_circles_has_their_tangents():
     apart = np.minimum(np.hypot(*outline.T) - 0.03, np.hypot(outline[:, 0] - 0.1, outline[:, 1]) - 0.01)
     assert np.abs(apart).max() < 1e-12
     edges = np.roll(outline, -1, axis=0) - outline
-    assert (edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0] > -1e-15).all()
+    assert (
+        edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0] > -1e-15
+    ).all()
 
 
 def test_a_circle_inside_the_other_leaves_the_larger():
@@ -81,8 +85,12 @@ def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
     frames = arm.link_frames(model, q)
     assert frames[6] == pytest.approx(forward(model, q), abs=1e-14)
     c = chain(model, q)
-    assert frames[4][:3, 3] == pytest.approx(c.wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(c.wrist, abs=1e-14)
-    assert frames[1][:3, 2] == pytest.approx(c.axis2, abs=1e-14) and frames[3][:3, 2] == pytest.approx(c.axis4, abs=1e-14)
+    assert frames[4][:3, 3] == pytest.approx(c.wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(
+        c.wrist, abs=1e-14
+    )
+    assert frames[1][:3, 2] == pytest.approx(c.axis2, abs=1e-14) and frames[3][:3, 2] == pytest.approx(
+        c.axis4, abs=1e-14
+    )
 
 
 @MODEL
