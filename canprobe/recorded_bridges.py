@@ -98,8 +98,8 @@ class _Observations:
         self._plan = plan
         self._path = path
         self._as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
-        self._ours = (
-            (result is None and folder is not None) or (result is not None and result.summary["driven_by"] == "task")
+        self._ours = (result is None and folder is not None) or (
+            result is not None and result.summary["driven_by"] == "task"
         )
         self._recording = read_recording(path, plan, as_taken=self._as_taken)
         self._drifts = folder is None
