@@ -46,7 +46,7 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     assert np.abs(np.diff(target)).max() == pytest.approx(FORCE_RATE * 2.5e-3)  # no step
     first, last = task.scan_cycles
     assert last - first == pytest.approx(480, abs=2)
-    assert press.truth["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.15)
+    assert press.truth["force"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.15)
     assert task.reason is None and press.cell.faults == []
 
 
