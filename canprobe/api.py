@@ -18,7 +18,7 @@ from canprobe.errors import CanprobeError, UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
+from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.touch.consistency import Consistency
@@ -37,13 +37,8 @@ __all__ = [
     "up",
 ]
 
-Say = Callable[[str], None]
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
-
-
-def _quiet(_: str) -> None:
-    return
 
 
 def run(
@@ -56,7 +51,7 @@ def run(
     seed: int | None = None,
     duration_s: float | None = None,
     progress: Progress | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     files: bool = True,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
@@ -199,7 +194,7 @@ def open_cell(
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
 ) -> Iterator[Session]:
@@ -236,7 +231,7 @@ def up(
     interface: str | None = None,
     channel: str | None = None,
     bitrate: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     bridge: Sequence[str] = (),
 ) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
