@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.bridging import Bridges
 from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.planning import make_plan
+from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
+from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.touch.consistency import Consistency
@@ -38,13 +38,8 @@ __all__ = [
     "up",
 ]
 
-Say = Callable[[str], None]
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
-
-
-def _quiet(_: str) -> None:
-    return
 
 
 def run(
@@ -57,7 +52,7 @@ def run(
     seed: int | None = None,
     duration_s: float | None = None,
     progress: Progress | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     files: bool = True,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
@@ -91,7 +86,7 @@ def run(
         session = Session(resolved, folder, say, (*observers, *bridges.observers))
         try:
             with session:
-                session.run(controller, _report(progress, resolved.task.duration_s))
+                session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
         except (CanprobeError, KeyboardInterrupt) as error:
             failure = error
             if not session.opened:
@@ -102,6 +97,25 @@ def run(
             failure.summary = result.summary
         raise failure
     return result
+
+
+def _requested(
+    plan: Plan, task: Controller | None, make: Callable[[], Controller] | None, bridges: Bridges
+) -> Controller:
+    """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
+    if not bridges.requests:
+        return task if task is not None else _Hold()
+    from canprobe.cell.tasks.requested import RequestedTask
+
+    return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
+
+
+class _Hold:
+    """Stay where the drives are."""
+
+    def step(self, _: Measurement) -> Command:
+        """Nothing to do."""
+        return Command()
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -185,7 +199,7 @@ def open_cell(
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
 ) -> Iterator[Session]:
@@ -222,7 +236,7 @@ def up(
     interface: str | None = None,
     channel: str | None = None,
     bitrate: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     bridge: Sequence[str] = (),
 ) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
@@ -232,9 +246,14 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say, bridge=bridge) as session:
-        say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
-        session.run(lambda _: Command())
+    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, bridge=bridge)
+    plan = make_plan(resolved)
+    with (
+        Bridges(plan, None, virtual=False, say=say) as bridges,
+        Session(resolved, None, say, bridges.observers) as session,
+    ):
+        say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ CanprobeError
 ├── BusError             3  interface missing or lost, node missing, node refused
 │   ├── InterfaceError   3  the CAN interface itself
 │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
+├── StudyError           3  a study's worker, cell or files failed
 ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
 └── ProtocolError        3  bytes on the bus that mean nothing where they stand
 """
@@ -81,6 +82,10 @@ class NodeError(BusError):
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
         super().__init__(f"node {node_id}: {message}")
+
+
+class StudyError(CanprobeError):
+    """A cell of a study, a worker, or the files that it keeps failed."""
 
 
 class ProtocolError(BusError):

@@ -13,12 +13,15 @@ from canprobe.scene_checks import Direction, Distinct, Only, Pattern, Range, Sce
 
 TaskKind = Literal["scan", "press", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-TactileModeName = Literal["window", "image", "features"]
+Auto = Literal["auto"]  # the plan chooses
+TactileModeName = Literal["window", "image", "features", "auto"]
+CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
+TransmitQueue = Literal["priority", "fifo"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -47,6 +50,12 @@ class BusSettings:
     interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
+    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
+    fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
+    cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +63,8 @@ class CycleSettings:
     """`[cycle]`: the rate of SYNC and servo."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +78,7 @@ class ArmSettings:
     # selects the branch of the inverse kinematics; an emulated arm stands here in `free`, above the start in others
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
-    grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
+    grouped_rpdo: bool | Auto = False  # two targets in one RPDO through dummy mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +88,7 @@ class SensorSettings:
     node_id: NodeId = 16
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
     emulated: bool = True
+    channel: Annotated[str | None, Pattern(r"\S+", "without spaces")] = None  # a bus of its own; "auto" as it fits
     mode: TactileModeName = "window"
     rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
@@ -159,6 +171,9 @@ class LimitSettings:
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
     joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
+    workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
+    workspace_max_mm: Vec3 | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
@@ -28,15 +29,20 @@ from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
-from canprobe.protocol.timing import best_case_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.scene import BridgeSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
 
 Array = NDArray[np.float64]
-Say = Callable[[str], None]
 LOCKSTEP = "lockstep"
+Say = Callable[[str], None]
+"""Is told each step, in words."""
+
+
+def quiet(_: str) -> None:
+    """Tell nobody."""
 
 
 def resolve_scene(
@@ -81,11 +87,17 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
 
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
-        self._by_length = [0] * 9
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -94,8 +106,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far."""
-        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -111,17 +125,20 @@ class Session:
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
         observers: called after each cycle with what it saw, said and had on the bus.
+
+    Attributes:
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
     def __init__(
         self,
         scene: Scene,
         out: Path | None = None,
-        say: Callable[[str], None] = lambda _: None,
+        say: Say = quiet,
         observers: Sequence[Observer | Callable[[Observation], None]] = (),
     ) -> None:
-        self.scene = scene
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
@@ -132,6 +149,8 @@ class Session:
         self.lockstep: LockstepBus | None = None
         self.world: World | None = None
         self.observers = Observers(observers) if observers else None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self._log: CandumpWriter | None = None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -162,7 +181,7 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say, observers=self.observers)
+            self._cell = make_cell(self.plan, port, self._say, log_failure=self._log_failure, observers=self.observers)
             self._stack.enter_context(garbage_collection_paused())
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
@@ -190,6 +209,11 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
+            if self._cell is not None and (failure := self._log_failure()) is not None:
+                self._cell.faults.append(f"the log is not whole: {failure}")
+
+    def _log_failure(self) -> str | None:
+        return self._log.failure if self._log is not None else None
 
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
@@ -204,11 +228,12 @@ class Session:
         if self.out is not None:
             self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
             writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
+            self._log = writer
             write = writer.write
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        self.traffic = TrafficCounter(write)
+        self.traffic = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         return self.traffic.write
 
     def _observe_frames(self, port: Port) -> None:
@@ -222,12 +247,12 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
+        bus = self.lockstep = _lockstep_bus(self.scene)
         bus.recorder = self._writer(0)
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
         for participant in self.world.participants:
-            bus.attach(participant)
+            bus.attach(self.joins(participant))
         return bus.port()
 
     def _keep_truth(self) -> None:
@@ -263,10 +288,25 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def _lockstep_bus(scene: Scene) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed or scene.bus.fd is True:
+        return LockstepBus(VirtualClock(), scene.bus.channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    return TimedBus(VirtualClock(), bus.channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors)
 
 
 class _Sink:

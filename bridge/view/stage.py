@@ -92,7 +92,8 @@ class Stage:
             vertices, faces = tile()
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=taxel_colours(np.zeros(256, np.uint8)), batched_opacities=_opacities(np.zeros(256, np.uint8)), side="double", cast_shadow=False, lod="off",
+                batched_colors=taxel_colours(np.zeros(256, np.uint8)), batched_opacities=_opacities(np.zeros(256, np.uint8)), side="double", lod="off",
+                cast_shadow=False,
             )  # fmt: skip
         else:
             self._taxels = None

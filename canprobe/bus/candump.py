@@ -1,10 +1,13 @@
 """candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
 
+CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
+
 Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
@@ -12,15 +15,18 @@ from types import TracebackType
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, Port, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, Port, PortCounters, TimedFrame
 from canprobe.errors import UsageError
 
 _LINE = re.compile(
     r"\((?P<s>\d+)\.(?P<us>\d{6})\) (?P<channel>\S+) (?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
-    r"(?:R(?P<length>[0-8]?)|(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
+    r"(?:R(?P<length>[0-8]?)|#(?P<flags>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
 )
 
 
+CLASSIC_BYTES = 8
+_BIT_RATE_SWITCH = 1
 _LINES = 256
 """Lines that are joined before they go to the file."""
 
@@ -28,16 +34,25 @@ _LINES = 256
 class CandumpWriter:
     """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
 
+    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
+    looks at `failure`.
+
     Args:
         path: the file to write; an existing one is replaced.
         channel: the name in each line.
         t0_ns: the time on the frames' clock that is written as 0.
+
+    Attributes:
+        failure: why nothing is written any more; None while all is well.
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
         self._channel = channel
         self._t0_ns = t0_ns
-        self._file = open(path, "w", encoding="ascii", newline="\n", buffering=1 << 16)  # noqa: SIM115 - closed by close
+        self.failure: str | None = None
+        self._path = path
+        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
+        self._size = 0
         self._lines: list[str] = []
         self._t_ns: int | None = None
         self._prefix = ""
@@ -52,16 +67,26 @@ class CandumpWriter:
         if name is None:
             name = self._names[can_id] = _format_id(can_id) + "#"
         lines = self._lines
-        lines.append(
-            f"{self._prefix}{name}{_format_payload(can_id, data) if can_id & RTR_FLAG else data.hex().upper()}\n"
-        )
+        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
+        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
         if len(lines) >= _LINES:
             self.flush()
 
     def flush(self) -> None:
         """Hand what was written to the file."""
-        self._file.write("".join(self._lines))
+        data = "".join(self._lines).encode("ascii")
         self._lines.clear()
+        if self.failure is not None:
+            return
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.failure = f"{self._path}: {error.strerror}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
+        self._size += written
 
     def close(self) -> None:
         """Flush and close the file; twice is allowed."""
@@ -87,6 +112,8 @@ def _format_prefix(channel: str, t_ns: int) -> str:
 
 
 def _format_payload(can_id: int, data: bytes) -> str:
+    if len(data) > CLASSIC_BYTES:
+        return f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
     return "R" if can_id & RTR_FLAG else data.hex().upper()
 
 
@@ -133,17 +160,17 @@ def _id_of(line: str) -> int:
 def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
     match = _LINE.fullmatch(text)
     if match is None:
-        what = "a CAN FD frame; only classic CAN is read" if "##" in text else "no candump line"
-        raise UsageError(f"{path}:{number}: {what}: {text[:60]!r}; expected '(seconds.microseconds) channel ID#DATA'")
+        form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
+        raise UsageError(f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'")
     t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
-    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["data"] or "")
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or match["data"] or "")
 
 
 def _parse_id(match: re.Match[str]) -> int:
     can_id = int(match["id"], 16)
     if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
         can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
-    return can_id | RTR_FLAG if match["data"] is None else can_id
+    return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 
 class FrameWriter(Protocol):
@@ -184,6 +211,11 @@ class RecordingPort:
     def counters(self) -> PortCounters:
         """The port's counters."""
         return self._port.counters
+
+    @property
+    def state(self) -> ControllerState:
+        """As the port tells it."""
+        return self._port.state
 
     @property
     def stamps_arrival(self) -> bool:

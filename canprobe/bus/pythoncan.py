@@ -14,11 +14,19 @@ from typing import Any
 import can
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, Frame, PortCounters, TimedFrame
+from canprobe.bus.echoes import Echoes
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
 
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
+_STATES = {
+    can.BusState.ACTIVE: ControllerState.ACTIVE,
+    can.BusState.PASSIVE: ControllerState.PASSIVE,
+    can.BusState.ERROR: ControllerState.BUS_OFF,
+}
+_HEARS_ITSELF = ("udp_multicast",)
+"""Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
 
 
 class PythonCanPort:
@@ -33,6 +41,7 @@ class PythonCanPort:
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames.
+        state: the controller's state as python-can told it at the last error frame.
 
     Raises:
         InterfaceError: python-can cannot open it, with its reason.
@@ -44,7 +53,9 @@ class PythonCanPort:
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
+        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
         self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters)
 
     stamps_arrival = False
@@ -60,6 +71,8 @@ class PythonCanPort:
                 self.counters.transmit_full += 1
                 raise InterfaceError(f"{self.channel}: sending {can_id:03X} failed: {error}") from error
             self.counters.sent += 1
+            if self._echoes is not None:
+                self._echoes.sent((can_id, data), self.clock.now_ns())
 
     def drain(self) -> list[TimedFrame]:
         """Return everything that has arrived, stamped now."""
@@ -70,6 +83,8 @@ class PythonCanPort:
         t_ns = self.clock.now_ns()
         frames = [frame for message in arrived if (frame := self._frame(message, t_ns)) is not None]
         arrived.clear()
+        if self._echoes is not None:
+            frames = [frame for frame in frames if not self._echoes.is_one(frame[:2], t_ns)]
         self.counters.received += len(frames)
         return frames
 
@@ -101,6 +116,7 @@ class PythonCanPort:
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
             self.counters.error_frames += 1
+            self.state = _STATES.get(self._open_bus().state, self.state)
             return None
         if message.is_fd:
             self.counters.ignored += 1

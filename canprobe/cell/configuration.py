@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.eds import MISSED_SYNCS, has_missed_syncs, load_eds
+from canprobe.eds import LONG_PDOS, MISSED_SYNCS, has_long_pdos, has_missed_syncs, load_eds
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -17,6 +17,7 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.planning.wire_bits import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.puma260 import MODELS, Array, PumaModel
@@ -66,6 +67,10 @@ def _common_writes(plan: Plan) -> list[Write]:
 
 def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: Any) -> list[Write]:
     writes = []
+    if any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo")):
+        writes.append(Write(LONG_PDOS, 0, 1))
+    elif has_long_pdos(dictionary):
+        writes.append(Write(LONG_PDOS, 0, 0))
     for direction, number in node.switched_off:
         index = COMMUNICATION[direction] + number - 1
         writes.append(Write(index, 1, (dictionary[index][1].default or 0) | INVALID))

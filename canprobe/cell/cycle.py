@@ -15,11 +15,6 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.frames import NmtState, pack_heartbeat
 from canprobe.protocol.sync import SyncCounter, pack_sync
 
-LOOKS = (0.25, 0.35, 0.6)
-"""Shares of the period after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
-
-Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender, so that
-many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway."""
 TIMED_CYCLES = 4
 """The computing time of every fourth cycle is taken: in a virtual machine reading a clock costs as much as sending."""
 
@@ -33,12 +28,16 @@ class CycleSettings:
         sync_overflow: of the SYNC counter (1019h).
         heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
+        looks_ns: times after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
+            Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender,
+            so that many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway.
     """
 
     period_ns: int
     sync_overflow: int
     heartbeat_ns: int
     master_id: int
+    looks_ns: tuple[int, ...]
 
 
 @dataclass(slots=True)
@@ -86,7 +85,6 @@ class Cycle:
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)
         self._deadline = self.t_first_ns
-        self._looks = tuple(int(settings.period_ns * share) for share in LOOKS)
         self._started_ns = 0
 
     def begin(self) -> Measurement:
@@ -115,7 +113,7 @@ class Cycle:
 
     def _collect(self) -> None:
         port, clock, intake = self._port, self._port.clock, self._intake
-        for look_ns in self._looks:
+        for look_ns in self._s.looks_ns:
             clock.sleep_until_ns(self._deadline + look_ns)
             self._route(port.drain())
             if intake.complete:
@@ -127,6 +125,11 @@ class Cycle:
         rest = [frame for frame in self._intake.route(frames) if not watch.push(*frame)]
         if rest:
             self._other(rest)
+
+    def skip(self) -> None:
+        """Let this cycle be: wait for the end of its period."""
+        self._deadline += self._s.period_ns
+        self._port.clock.sleep_until_ns(self._deadline)
 
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
 from canprobe.cell.build import make_drives, make_tactile
-from canprobe.cell.cycle import LOOKS
 from canprobe.cell.deadlines import find_deadlines
 from canprobe.cell.drives import CommandFrame, command_frames
 from canprobe.cell.intake import Intake
@@ -76,8 +75,8 @@ class LogCycles:
         stamps = recording.sync_stamps
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
-        looks = LOOKS if on_deadlines else (math.inf,)
-        self._looks = _looks(recording, deadlines, [share * plan.sync.period_ns for share in looks])
+        looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
+        self._looks = _looks(recording, deadlines, looks)
         axes = self.drives.axes if self.drives is not None else ()
         self._commands = {frame.cob_id: frame for frame in command_frames(axes)}
         self._targets: list[int | None] = [None] * len(axes)
@@ -152,7 +151,7 @@ class LogCycles:
         return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
 
 
-def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: list[float]) -> list[list[int]]:
+def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:
     """Where each look of each cycle ends among the frames; a late SYNC's looks come at once."""
     stamps, syncs = recording.sync_stamps, recording.syncs
     following = np.append(syncs[1:], len(recording.frames))

@@ -7,6 +7,11 @@ from collections.abc import Sequence
 from canprobe.cell.measurement import TactileSample
 from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 
+JITTER_NS = 300_000
+"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
+LATEST_CYCLES = 4
+"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
+
 
 class TactileReceiver:
     """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
@@ -15,6 +20,10 @@ class TactileReceiver:
         assembler: puts the frames together.
         cob_ids: of its PDOs.
         sync_overflow: at which the SYNC counter starts again.
+
+    Attributes:
+        newest_cycle: trigger of the newest sample.
+        stale: frames dropped because they name no SYNC that they can have followed.
     """
 
     def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
@@ -51,12 +60,21 @@ class TactileReceiver:
             self._complete = frame
             return None
         trigger = cycle - cycles_ago
-        if cycles_ago >= len(sync_times):
+        if cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
             self.stale += 1
             return None
         self.newest_cycle = trigger
         t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
         return TactileSample(frame, t_sample, trigger)
+
+    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
+        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
+        if not sync_stamps:
+            return False
+        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
+            return True
+        later = cycles_ago - LATEST_CYCLES
+        return later > 0 and sync_stamps[-later] <= frame.t_ns
 
     def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
         if sync_counter and frame.header.sync_counter:

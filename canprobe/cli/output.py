@@ -35,12 +35,13 @@ def say_on_terminal(line: str) -> None:
         say(line)
 
 
-def progress_bar(stream: TextIO | None = None, width: int = 40) -> Progress | None:
+def progress_bar(stream: TextIO | None = None, width: int = 40, unit: str = ".1f s") -> Progress | None:
     """A progress bar on a terminal, None elsewhere.
 
     Args:
         stream: stderr by default.
         width: of the bar, in characters.
+        unit: form of a number, and the unit's name.
 
     Returns:
         A function of (done, total), both in the same unit, that redraws only when the picture changes.
@@ -48,6 +49,7 @@ def progress_bar(stream: TextIO | None = None, width: int = 40) -> Progress | No
     out = sys.stderr if stream is None else stream
     if not out.isatty():
         return None
+    form, name = unit.split()
     shown = -1
 
     def show(done: float, total: float) -> None:
@@ -57,7 +59,7 @@ def progress_bar(stream: TextIO | None = None, width: int = 40) -> Progress | No
             return
         shown = percent
         bar = "█" * round(width * share)
-        out.write(f"\r{bar.ljust(width, '░')} {percent:3d} %  {done:6.1f} of {total:.1f} s")
+        out.write(f"\r{bar.ljust(width, '░')} {percent:3d} %  {done:{form}} of {total:{form}} {name}")
         out.write("\n" if percent == 100 else "")
         out.flush()
 

@@ -43,7 +43,11 @@ def add_scene(parser: argparse.ArgumentParser, optional: bool = False) -> None:
 
 def add_bus(parser: argparse.ArgumentParser) -> None:
     """Where the nodes are, in place of what the scene says."""
-    parser.add_argument("--bus", metavar="B", help="lockstep, socketcan, or any python-can interface")
+    parser.add_argument(
+        "--bus",
+        metavar="B",
+        help="lockstep, socketcan, any python-can interface, or config: what CAN_INTERFACE or python-can's files name",
+    )
     parser.add_argument(
         "--channel",
         metavar="[NAME=]CH",

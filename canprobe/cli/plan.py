@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
 
 _EXAMPLE = """\
-example:
+The files: dcf, one device configuration file a node; dbc and kcd, every frame with its signals (extra `can`); bus.yml,
+for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
+
+examples:
   canprobe plan cylinder
+  canprobe plan mine.toml --auto
+  canprobe plan cylinder --export dbc --export dcf --out config/
 """
+EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
 def add_parser(commands: Commands[Parser]) -> None:
@@ -19,18 +26,34 @@ def add_parser(commands: Commands[Parser]) -> None:
         "plan", help="show what a scene needs and leaves out", description=__doc__, epilog=_EXAMPLE
     )
     add_scene(parser)
+    parser.add_argument(
+        "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
+    )
+    parser.add_argument(
+        "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
     add_json(parser)
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the plan; a scene that does not fit raises PlanError with every reason."""
+    """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.planning import make_plan, plan_text
+    from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
-    plan = make_plan(load_scene(args.scene))
+    scene = load_scene(args.scene)
+    plan = make_plan(opened(scene) if args.auto else scene)
+    files: list[Path] = []
+    if args.export:
+        from canprobe.bridge.export import export_plan
+
+        files = export_plan(plan, args.out, args.export)
     if args.json:
-        print_json(plan.as_dict())
+        print_json(plan.as_dict() | ({"files": [str(file) for file in files]} if files else {}))
+    elif files:
+        print("\n".join(str(file) for file in files))
     else:
         print(plan_text(plan), end="")
     return 0

@@ -5,13 +5,18 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.output import print_json, print_table, say
-from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import print_json, print_table, progress_bar, say
+from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
 
 _EXAMPLE = """\
-example:
+Cells that are finished are kept in DIR/cells.jsonl: the same command again, after Ctrl-C or anything worse, computes
+what is left. Code that has changed since is noticed, and its cells are computed again.
+
+examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
+  canprobe study bound --dask tcp://10.0.0.1:8786
 """
 
 
@@ -24,6 +29,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--list", action="store_true", help="list the studies and leave")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the files; runs/study-NAME by default")
     parser.add_argument("--quick", action="store_true", help="fewer repeats: a first look")
+    parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="processes [one for each core]")
+    parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler instead")
+    parser.add_argument("--fresh", action="store_true", help="compute everything, whatever is kept in DIR")
     add_json(parser)
     parser.set_defaults(run=run, complain=parser.error)
 
@@ -43,9 +51,20 @@ def run(args: argparse.Namespace) -> int:
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
     from canprobe.studies.study_files import as_document, text_of, write_study
+    from canprobe.studies.sweep import open_sweep
 
-    result = run_study(args.name, quick=args.quick, say=say)
-    paths = write_study(result, args.out or Path("runs") / f"study-{args.name}")
+    out = args.out or Path("runs") / f"study-{args.name}"
+    options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
+    try:
+        with (
+            termination_interrupts(),
+            open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep,
+        ):
+            result = run_study(args.name, quick=args.quick, sweep=sweep)
+    except KeyboardInterrupt:
+        say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
+        raise
+    paths = write_study(result, out)
     if args.json:
         print_json(as_document(result))
     else:

@@ -8,7 +8,7 @@ import contextlib
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
-from canprobe.cli.target import target_of
+from canprobe.cli.target import add_realtime, target_of, with_realtime
 
 _EXAMPLE = """\
 example:
@@ -22,6 +22,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser)
     add_bus(parser)
     add_bridge(parser)
+    add_realtime(parser)
     parser.set_defaults(run=run)
 
 
@@ -29,7 +30,7 @@ def run(args: argparse.Namespace) -> int:
     """Hold the cell until an interrupt, which is the normal way to leave."""
     from canprobe.scene_loader import load_scene
 
-    scene = load_scene(args.scene)
+    scene = with_realtime(load_scene(args.scene), args.realtime)
     target = target_of(args, scene)
 
     from canprobe import api

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.eds import has_missed_syncs
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.drive_faults import DriveFaults
@@ -38,15 +37,13 @@ _ENABLED = DriveState.OPERATION_ENABLED
 class DriveApplication(Application):
     """The drive function of one node."""
 
-    def __init__(self, axis: int, plant: AxisPlant, has_misses: bool = False) -> None:
+    def __init__(self, axis: int, plant: AxisPlant) -> None:
         """Make the drive of one axis.
 
         Args:
             axis: of the plant, 0-based.
             plant: shared with the other nodes.
-            has_misses: see `DriveParameters`.
         """
-        self._has_misses = has_misses
         self._axis, self._plant = axis, plant
         self._standstill = False
 
@@ -54,7 +51,7 @@ class DriveApplication(Application):
         """Hang the drive's objects on the node."""
         self._node, self._core = node, node.core
         self._values, dictionary, timers = node.dictionary.values, node.dictionary, node.core.timers
-        self._parameters = DriveParameters(dictionary, self._has_misses)
+        self._parameters = DriveParameters(dictionary)
         self._motion = Motion(self._axis, self._plant, timers)
         self._feedback = DriveFeedback(node, self._axis, self._plant, self._motion, self._parameters.units)
         self._faults = DriveFaults(node, lambda t_ns: self._states.event(Event.FAULT_DETECTED, t_ns))
@@ -226,4 +223,4 @@ def make_drive_node(od: ObjectDictionary, node_id: int, axis: int, plant: AxisPl
         axis: of the plant, 0-based.
         plant: shared by all nodes.
     """
-    return SlaveNode(od, node_id, DriveApplication(axis, plant, has_missed_syncs(od)))
+    return SlaveNode(od, node_id, DriveApplication(axis, plant))

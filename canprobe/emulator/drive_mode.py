@@ -117,6 +117,12 @@ class DriveMode:
         limit = self._parameters.max_torque
         return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) > limit
 
+    def _look(self) -> tuple[int, float] | None:
+        """For a mode's timer: now, and where the motor is; None when the following error has become a fault."""
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        return None if self._lags(t_ns, counts) else (t_ns, counts)
+
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""
         if not self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):

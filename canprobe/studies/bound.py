@@ -11,24 +11,30 @@ them for (planes, large radii) an estimate with that prior is better than it, an
 from __future__ import annotations
 
 import math
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from itertools import product
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from canprobe.studies.ground import PATHS, SURFACES, Array, Ground, make_ground
-from canprobe.studies.study import Column, Say, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.studies.ground import FROBENIUS, PATHS, SURFACES, Array, Ground, make_ground
+from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.study_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.studies.sweep import Sweep
+from canprobe.studies.sweep_store import as_json
 from canprobe.touch.bound import cramer_rao
 from canprobe.touch.fit import fit_surface
 from canprobe.touch.prior import Prior
 
+SEEDS = 200
 SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
 METHODS = ("ml", "recursive")
-WEIGHT = np.array([1.0, 2.0, 1.0])
+MODEL = ("touch", "studies/bound.py", "studies/ground.py")
 CHI2_95_OF_3 = 7.815
 # the region in which a local quadratic bound means something
 LARGEST_BOUND, LEAST_SIZE, LARGEST_TILT, LARGEST_BIAS = 0.2, 50.0, 5e-3, 1.0 / 3.0
@@ -38,8 +44,7 @@ COLUMNS = (
     Column("path", "path"),
     Column("size_mm", "size mm", ".0f"),
     Column("length_mm", "path mm", ".1f"),
-    Column("sigma_point_um", "σp µm", ".0f"),
-    Column("sigma_normal_mrad", "σn mrad", ".1f"),
+    *SIGMA_COLUMNS,
     Column("method", "method"),
     Column("bound_per_m", "bound 1/m", ".3g"),
     Column("ratio", "error/bound", ".2f"),
@@ -71,42 +76,41 @@ class Case:
 
 
 def all_cases() -> Iterator[Case]:
-    """Weaves over every surface and size with every noise, circles with the middle one, and paths of 1.5 radii."""
+    """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
     for surface in SURFACES:
         for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
-            for path, noises in zip(PATHS, (NOISES, NOISES[1:2]), strict=True):
-                for noise in noises:
-                    yield Case(surface, path, size, min(size, LONGEST_M), *noise)
+            for path, noise in product(PATHS, NOISES):
+                yield Case(surface, path, size, min(size, LONGEST_M), *noise)
         if surface != "plane":
             for noise in NOISES[1:]:
                 yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
 
 
-def run(*, quick: bool, say: Say) -> StudyResult:
+def quick_cases() -> Iterator[Case]:
+    """Every surface once, and sizes, paths and noises in turn."""
+    for i, surface in enumerate(SURFACES):
+        size = SIZES_M[i % 2]
+        yield Case(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Measure all cases."""
-    return measure_all(20 if quick else 200, quick, say)
+    seeds = 10 if quick else SEEDS
+    cases = list(quick_cases() if quick else all_cases())
+    sweep.say(f"{len(cases)} cases, {seeds} seeds each")
+    rows = [row for rows in sweep.map(measure, [(case, seeds) for case in cases], model=MODEL) for row in rows]
 
-
-def measure_all(seeds: int, quick: bool, say: Say) -> StudyResult:
-    """The study with so many seeds a case."""
-    rows: list[dict[str, Any]] = []
-    last = ""
-    for i, case in enumerate(all_cases()):
-        if case.surface != last:
-            last = case.surface
-            say(f"{last}: {seeds} seeds a case")
-        rows += measure(case, range(1000 * i, 1000 * i + seeds))
-
-    def draw(path: Any) -> None:
+    def draw(path: Path) -> None:
         from canprobe.studies.bound_figure import draw_bound
 
         draw_bound(rows, path)
 
-    return StudyResult("bound", COLUMNS, rows, findings(rows), measuring_facts(quick, seeds), draw)
+    return StudyResult("bound", COLUMNS, rows, findings(rows), measuring_facts(quick, seeds, MODEL), draw)
 
 
-def measure(case: Case, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """One row for each method."""
+def measure(cell: tuple[Case, int]) -> list[dict[str, Any]]:
+    """One row for each method, of a case with so many seeds."""
+    case, seeds = cell
     ground = case.ground
     prior = Prior.weak(float(np.linalg.norm(ground.points - ground.points[-1], axis=1).max()))
     C = cramer_rao(
@@ -114,20 +118,22 @@ def measure(case: Case, seeds: Sequence[int]) -> list[dict[str, Any]]:
         sigma_point=case.sigma_point, sigma_normal=case.sigma_normal, prior=prior,
     )  # fmt: skip
     fit = partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
-    bound = math.sqrt(float(WEIGHT @ np.diag(C)))
+    bound = math.sqrt(float(FROBENIUS @ np.diag(C)))
     exact = fit(ground.points, ground.normals)
     model_bias = _length(ground.error(exact.T_frame_contact, exact.K)) / bound
     why = reasons_outside(case, ground, C, model_bias)
     shared = {
         "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
-        "sigma_point_um": case.sigma_point * 1e6, "sigma_normal_mrad": case.sigma_normal * 1e3,
+        **sigma_values(case.sigma_point, case.sigma_normal),
         "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)), "model_bias": model_bias,
         "inside": not why, "outside_for": ", ".join(why) or "–",
     }  # fmt: skip
-    felt = [ground.felt(case.sigma_point, case.sigma_normal, np.random.default_rng(seed)) for seed in seeds]
+    own = zlib.crc32(as_json(case).encode())
+    generators = [np.random.default_rng([own, seed]) for seed in range(seeds)]
+    felt = [ground.felt(case.sigma_point, case.sigma_normal, rng) for rng in generators]
     rows = [shared | {"method": m} | _score(ground, [fit(p, n, method=m) for p, n in felt], bound) for m in METHODS]
     for row in rows:
-        row["verdict"] = verdict(row, len(seeds))
+        row["verdict"] = verdict(row, seeds)
     return rows
 
 
@@ -151,10 +157,10 @@ def _score(ground: Ground, answers: Sequence[Any], bound: float) -> dict[str, An
         return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
     errors = np.array([ground.error(a.T_frame_contact, a.K) for a in seen])
     squares = [float(e @ np.linalg.solve(a.covariance, e)) for e, a in zip(errors, seen, strict=True)]
-    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ WEIGHT) / len(errors)  # the mean's own scatter
-    claimed = float(np.median([WEIGHT @ np.diag(a.covariance) for a in seen]))
+    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ FROBENIUS) / len(errors)  # the mean's own scatter
+    claimed = float(np.median([FROBENIUS @ np.diag(a.covariance) for a in seen]))
     return {
-        "ratio": math.sqrt(float(np.mean(errors**2 @ WEIGHT))) / bound,
+        "ratio": math.sqrt(float(np.mean(errors**2 @ FROBENIUS))) / bound,
         "claimed": math.sqrt(claimed) / bound,
         "bias": math.sqrt(max(_length(mean) ** 2 - scatter, 0.0)) / bound,
         "coverage": float(np.mean(np.array(squares) < CHI2_95_OF_3)),
@@ -163,7 +169,7 @@ def _score(ground: Ground, answers: Sequence[Any], bound: float) -> dict[str, An
 
 
 def _length(error: Array) -> float:
-    return math.sqrt(float(WEIGHT @ error**2))
+    return math.sqrt(float(FROBENIUS @ error**2))
 
 
 def verdict(row: dict[str, Any], seeds: int) -> str:

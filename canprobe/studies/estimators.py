@@ -11,15 +11,17 @@ import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from canprobe.studies.ground import Array, Ground, make_ground
-from canprobe.studies.study import Column, Say, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.studies.ground import FROBENIUS, Array, Ground, make_ground
+from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.study_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.studies.sweep import Sweep
 from canprobe.touch.bound import cramer_rao
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimators import Estimator, make_estimator
@@ -33,15 +35,16 @@ NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (50e-6, 3e-3))
 GROUNDS = (("ellipsoid", 0.05), ("cylinder", 0.036))
 WAVES = 5
 """Waves of the weave on the whole path: one on 12 mm of it."""
+Noise = tuple[float, float]
+Place = tuple[str, float]
 REFERENCE = ("chen1996", 160, 10)
-WEIGHT = np.array([1.0, 2.0, 1.0])
+MODEL = ("touch", "studies/estimators.py", "studies/ground.py")
 COLUMNS = (
     Column("surface", "surface"),
     Column("method", "method"),
     Column("window_samples", "window"),
     Column("lag_samples", "lag"),
-    Column("sigma_point_um", "σp µm", ".0f"),
-    Column("sigma_normal_mrad", "σn mrad", ".1f"),
+    *SIGMA_COLUMNS,
     Column("error_percent", "error %", ".2f"),
     Column("bound_percent", "bound %", ".2f"),
     Column("observed", "observed", ".2f"),
@@ -74,26 +77,31 @@ class Setting:
         )
 
 
-def settings() -> list[Setting]:
+def settings(quick: bool = False) -> list[Setting]:
     """Every method and window; the lags below half a window."""
-    found = [Setting(m, w) for m in ("chord", "ml", "recursive") for w in WINDOWS]
-    return [Setting("chen1996", w, lag) for w in WINDOWS for lag in LAGS if 2 * lag < w] + found
+    windows, lags = ((40, 160), (10,)) if quick else (WINDOWS, LAGS)
+    found = [Setting(m, w) for m in ("chord", "ml", "recursive") for w in windows]
+    return [Setting("chen1996", w, lag) for w in windows for lag in lags if 2 * lag < w] + found
 
 
-def run(*, quick: bool, say: Say) -> StudyResult:
-    """Measure errors and costs."""
-    seeds, turns = (6, 6) if quick else (24, 20)
-    grounds = {name: on_the_move(name, size) for name, size in GROUNDS}
-    rows: list[dict[str, Any]] = []
-    for noise in NOISES:
-        say(f"costs and errors at {noise[0] * 1e6:.0f} µm and {noise[1] * 1e3:.1f} mrad")
-        costs = measure_costs(grounds[GROUNDS[0][0]], noise, turns)
-        for name, ground in grounds.items():
-            errors = measure_errors(ground, noise, seeds)
-            rows += [_row(name, ground, s, noise, errors[s], costs[s]) for s in settings()]
-    facts = measuring_facts(quick, seeds) | {"turns": turns}
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Measure costs, then errors."""
+    seeds, turns = (3, 4) if quick else (24, 20)
+    grounds = GROUNDS[:1] if quick else GROUNDS
+    sweep.say(f"costs of {len(settings(quick))} settings at {len(NOISES)} noises, one after another")
+    costs = sweep.time(measure_costs, [(noise, quick, turns) for noise in NOISES], model=MODEL)
+    sweep.say(f"errors on {len(grounds)} surfaces, {seeds} seeds each")
+    cells = [(place, noise, quick, seed) for noise in NOISES for place in grounds for seed in range(seeds)]
+    errors = iter(sweep.map(measure_errors, cells, model=MODEL))
+    rows = []
+    for noise, times in zip(NOISES, costs, strict=True):
+        for name, size in grounds:
+            ground, by_seed = on_the_move(name, size), [next(errors) for _ in range(seeds)]
+            found = zip(settings(quick), times, zip(*by_seed, strict=True), strict=True)
+            rows += [_row(name, ground, noise, *one) for one in found]
+    facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
 
-    def draw(path: Any) -> None:
+    def draw(path: Path) -> None:
         from canprobe.studies.estimators_figure import draw_estimators
 
         draw_estimators(rows, path)
@@ -115,40 +123,43 @@ def contacts(points: Array, normals: Array, first: int = 0) -> list[ContactSampl
     ]
 
 
-def measure_errors(ground: Ground, noise: tuple[float, float], seeds: int) -> dict[Setting, list[Array | None]]:
-    """Errors (3,) of K by setting and seed; None where not all of K was observed."""
-    found: dict[Setting, list[Array | None]] = {s: [] for s in settings()}
-    for seed in range(seeds):
-        samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
-        for setting, errors in found.items():
-            estimator = setting.make(*noise)
-            for sample in samples if setting.method == "recursive" else samples[-setting.window :]:
-                estimator.add(sample)
-            answer = estimator.estimate()
-            seen = answer is not None and answer.rank == 3
-            errors.append(ground.error(answer.T_frame_contact, answer.K) if answer is not None and seen else None)
-    return found
+def measure_errors(cell: tuple[Place, Noise, bool, int]) -> list[Array | None]:
+    """Error (3,) of K of each setting, of one seed; None where not all of K was observed."""
+    (name, size), noise, quick, seed = cell
+    ground = on_the_move(name, size)
+    samples = contacts(*ground.felt(*noise, np.random.default_rng([seed, round(noise[0] * 1e9)])))
+    errors: list[Array | None] = []
+    for setting in settings(quick):
+        estimator = setting.make(*noise)
+        for sample in samples if setting.method == "recursive" else samples[-setting.window :]:
+            estimator.add(sample)
+        answer = estimator.estimate()
+        seen = answer is not None and answer.rank == 3
+        errors.append(ground.error(answer.T_frame_contact, answer.K) if answer is not None and seen else None)
+    return errors
 
 
-def measure_costs(ground: Ground, noise: tuple[float, float], turns: int) -> dict[Setting, tuple[Array, Array]]:
-    """Times (turns,) of one `add` and of one answer by setting, µs; the settings take turns."""
-    estimators = {s: s.make(*noise) for s in settings()}
+def measure_costs(cell: tuple[Noise, bool, int]) -> list[list[tuple[float, float]]]:
+    """Times of one `add` and of one answer by setting and turn, µs; the settings take turns."""
+    noise, quick, turns = cell
+    ground = on_the_move(*GROUNDS[0])
+    estimators = [s.make(*noise) for s in settings(quick)]
     samples = contacts(*ground.felt(*noise, np.random.default_rng(99)))
-    for estimator in estimators.values():
+    for estimator in estimators:
         for sample in samples:
             estimator.add(sample)
-    times: dict[Setting, list[tuple[float, float]]] = {s: [] for s in estimators}
+    times: list[list[tuple[float, float]]] = [[] for _ in estimators]
     more = contacts(*_back_and_forth(ground, noise, SHARE * (turns + 1)), first=SAMPLES)
     gc.collect()
     gc.disable()
     try:
         for turn in range(turns + 1):
             block = more[SHARE * turn : SHARE * (turn + 1)]
-            for setting, estimator in estimators.items():
-                times[setting].append(_timed(estimator, block))
+            for mine, estimator in zip(times, estimators, strict=True):
+                mine.append(_timed(estimator, block))
     finally:
         gc.enable()
-    return {s: (np.array(t)[1:, 0], np.array(t)[1:, 1]) for s, t in times.items()}
+    return [mine[1:] for mine in times]
 
 
 def _timed(estimator: Estimator, block: Sequence[ContactSample]) -> tuple[float, float]:
@@ -160,7 +171,7 @@ def _timed(estimator: Estimator, block: Sequence[ContactSample]) -> tuple[float,
     return (added - start) / len(block) * 1e6, (perf_counter() - added) * 1e6
 
 
-def _back_and_forth(ground: Ground, noise: tuple[float, float], n: int) -> tuple[Array, Array]:
+def _back_and_forth(ground: Ground, noise: Noise, n: int) -> tuple[Array, Array]:
     """The path back from its end, felt anew."""
     points, normals = ground.felt(*noise, np.random.default_rng(100))
     index = -2 - np.arange(n) % (SAMPLES - 2)
@@ -170,10 +181,10 @@ def _back_and_forth(ground: Ground, noise: tuple[float, float], n: int) -> tuple
 def _row(  # noqa: PLR0917 - one row of a table
     surface: str,
     ground: Ground,
+    noise: Noise,
     setting: Setting,
-    noise: tuple[float, float],
+    times: Sequence[tuple[float, float]],
     errors: Sequence[Array | None],
-    costs: tuple[Array, Array],
 ) -> dict[str, Any]:
     size = float(np.linalg.norm(ground.K))
     # the filter's memory fades, it has no window: it is held against all that it was given
@@ -182,22 +193,22 @@ def _row(  # noqa: PLR0917 - one row of a table
         ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
     )
     seen = [e for e in errors if e is not None]
-    rms = math.sqrt(float(np.mean(np.square(seen) @ WEIGHT))) if seen else math.nan
-    add, answer = median(costs[0].tolist()), median(costs[1].tolist())
+    rms = math.sqrt(float(np.mean(np.square(seen) @ FROBENIUS))) if seen else math.nan
+    add, answer = (median(column) for column in zip(*times, strict=True))
+    per_sample = [t[0] + t[1] / SHARE for t in times]
     return {
         "surface": surface,
         "method": setting.method,
         "window_samples": setting.window,
         "lag_samples": setting.lag,
-        "sigma_point_um": noise[0] * 1e6,
-        "sigma_normal_mrad": noise[1] * 1e3,
+        **sigma_values(*noise),
         "error_percent": 100.0 * rms / size,
-        "bound_percent": 100.0 * math.sqrt(float(WEIGHT @ np.diag(C))) / size,
+        "bound_percent": 100.0 * math.sqrt(float(FROBENIUS @ np.diag(C))) / size,
         "observed": len(seen) / len(errors),
         "add_us": add,
         "answer_us": answer,
-        "sample_us": median((costs[0] + costs[1] / SHARE).tolist()),
-        "spread_us": float(np.subtract(*np.percentile(costs[0] + costs[1] / SHARE, [75, 25]))),
+        "sample_us": median(per_sample),
+        "spread_us": float(np.subtract(*np.percentile(per_sample, [75, 25]))),
         "in_budget": add + answer <= FRAME_US,
     }
 

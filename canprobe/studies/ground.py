@@ -29,6 +29,10 @@ _OFF_AXIS = 0.4
 """Turn of the principal directions against the path, rad, so that no entry of K is special."""
 
 
+FROBENIUS = np.array([1.0, 2.0, 1.0])
+"""Weights of (K11², K12², K22²) in ‖K‖²."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Ground:
     """A path over an exact surface.

@@ -7,9 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.studies.sweep import Sweep
 
 Say = Callable[[str], None]
 Row = Mapping[str, Any]
@@ -18,9 +21,11 @@ STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "faults": "what the cell does about thousands of random faults of its nodes and their links",
     }
 )
-"""Name → what it shows. The module of that name in this package has `run(quick, say) -> StudyResult`."""
+"""Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,18 +64,18 @@ class StudyResult:
     draw: Callable[[Path], None]
 
 
-def run_study(name: str, *, quick: bool, say: Say) -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep) -> StudyResult:
     """Run a study.
 
     Args:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
-        say: called with each step.
+        sweep: computes its cells.
 
     Raises:
         UsageError: for an unknown name.
     """
     if name not in STUDIES:
         raise UsageError(f"study: expected one of {', '.join(STUDIES)}, got {name!r}")
-    result: StudyResult = importlib.import_module(f"canprobe.studies.{name}").run(quick=quick, say=say)
+    result: StudyResult = importlib.import_module(f"canprobe.studies.{name}").run(quick=quick, sweep=sweep)
     return result

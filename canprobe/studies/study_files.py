@@ -15,20 +15,33 @@ from typing import Any
 import numpy as np
 
 import canprobe
-from canprobe.studies.study import StudyResult
+from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.sweep_store import model_digest
+
+SIGMA_COLUMNS = (
+    Column("sigma_point_um", "σp µm", ".0f"),
+    Column("sigma_normal_mrad", "σn mrad", ".1f"),
+)
+"""Noise of a row, filled by `sigma_values`."""
 
 
-def measuring_facts(quick: bool, seeds: int) -> dict[str, Any]:
-    """Machine, versions and settings of a study."""
+def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
+    """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
     return {
         "canprobe": canprobe.__version__,
         "commit": _commit(),
+        "model": model_digest(tuple(model)),
         "python": platform.python_version(),
         "numpy": np.__version__,
         "machine": _processor(),
         "quick": quick,
         "seeds": seeds,
     }
+
+
+def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
+    """The values of `SIGMA_COLUMNS`, from m and rad."""
+    return {"sigma_point_um": sigma_point * 1e6, "sigma_normal_mrad": sigma_normal * 1e3}
 
 
 def table_lines(result: StudyResult) -> list[str]:

@@ -10,6 +10,7 @@ import pytest
 
 import canprobe
 from canprobe.api import Observation
+from canprobe.planning import make_plan
 from canprobe.results import RunResult
 from canprobe.scene_loader import parse_scene
 from canprobe.scene_writer import dump_scene
@@ -41,3 +42,25 @@ def recorded(tmp_path_factory) -> Recorded:
         parse_scene(text), out=folder, duration_s=0.6, seed=5, bridge=("mcap",), observers=(seen.append,)
     )
     return Recorded(folder, result, seen)
+
+
+@pytest.fixture(scope="session")
+def press_plan():
+    return make_plan(canprobe.load_scene("press"))
+
+
+@pytest.fixture(scope="session")
+def free_run(tmp_path_factory):
+    """Folder of 0.3 s of `free` on the lockstep bus, and its result."""
+    return _run("free", tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def listen_run(tmp_path_factory):
+    """Folder of 0.3 s of `listen` on the lockstep bus, and its result."""
+    return _run("listen", tmp_path_factory)
+
+
+def _run(scene, tmp_path_factory):
+    folder = tmp_path_factory.mktemp(scene)
+    return folder, canprobe.run(canprobe.load_scene(scene), out=folder, duration_s=0.3)

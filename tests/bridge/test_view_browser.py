@@ -151,7 +151,8 @@ def chromium(tmp_path):
         [
             CHROMIUM, "--headless=new", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader",
             "--enable-unsafe-swiftshader", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1",
-            "--window-size=640,300", "--remote-debugging-port=0", f"--user-data-dir={tmp_path / 'profile'}", "about:blank",
+            "--window-size=640,300", "--remote-debugging-port=0", f"--user-data-dir={tmp_path / 'profile'}",
+            "about:blank",
         ],
         stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
     )  # fmt: skip

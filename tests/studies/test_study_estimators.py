@@ -9,28 +9,48 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.studies import estimators
-from canprobe.studies.estimators import GROUNDS, NOISES, Setting, findings, measure_costs, measure_errors, on_the_move
+from canprobe.studies.estimators import (
+    GROUNDS,
+    NOISES,
+    Setting,
+    findings,
+    measure_costs,
+    measure_errors,
+    on_the_move,
+    settings,
+)
 from canprobe.studies.study import STUDIES, Column, StudyResult
 from canprobe.studies.study_files import as_document, table_lines, write_study
+from canprobe.touch.estimators import METHODS
 
 FEW = [Setting("chen1996", 160, 10), Setting("ml", 160), Setting("recursive", 160)]
 
 
 @pytest.fixture
 def few(monkeypatch):
-    monkeypatch.setattr(estimators, "settings", lambda: list(FEW))
+    monkeypatch.setattr(estimators, "settings", lambda quick=False: list(FEW))
 
 
 def test_errors_and_costs_of_every_setting(few):
     ground = on_the_move(*GROUNDS[0])
-    errors = measure_errors(ground, NOISES[1], 3)
-    assert set(errors) == set(FEW)
+    errors = [measure_errors((GROUNDS[0], NOISES[1], False, seed)) for seed in range(3)]
     size = np.linalg.norm(ground.K)
-    worst = {s.method: max(np.linalg.norm(e) for e in found) / size for s, found in errors.items()}
+    worst = {s.method: np.linalg.norm(found, axis=1).max() / size for s, *found in zip(FEW, *errors, strict=True)}
     assert worst["recursive"] < 0.03
     assert worst["ml"] < 0.05
-    costs = measure_costs(ground, NOISES[1], 2)
-    assert all(add.shape == answer.shape == (2,) and (answer > 0).all() for add, answer in costs.values())
+    costs = np.array(measure_costs((NOISES[1], False, 2)))
+    assert costs.shape == (len(FEW), 2, 2)
+    assert (costs > 0).all()
+
+
+def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
+    assert main(["study", "estimators", "--quick", "--out", str(tmp_path), "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert len(document["rows"]) == len(NOISES) * len(settings(quick=True))
+    assert {r["method"] for r in document["rows"]} == set(METHODS)
+    assert all(r["bound_percent"] > 0 and r["sample_us"] > 0 for r in document["rows"])
+    assert {"commit", "machine", "model", "seeds"} <= set(document["facts"])
+    assert (tmp_path / "estimators.png").stat().st_size > 10_000
 
 
 def test_ratios_are_to_the_paper_in_the_same_run():
@@ -78,7 +98,7 @@ def test_a_wrong_name_is_told(argv, said, capsys):
 
 
 def test_run_prints_the_table_and_writes_files(monkeypatch, tmp_path, capsys):
-    def run(*, quick, say):
+    def run(*, quick, sweep):
         return result()
 
     monkeypatch.setattr(estimators, "run", run)

@@ -1,0 +1,342 @@
+"""A lockstep bus with a bit rate: one frame at a time, each as long as its bits, the lowest identifier first.
+
+A frame that was queued while another is on the wire waits for its end; whoever has the lowest identifier when the bus
+is free again sends, to the end. Receivers get a frame with the last bit of its end-of-frame field; the next may follow
+after three bits of intermission. A frame that the wire corrupts ends in an error frame and is sent again; every
+controller counts errors as ISO 11898-1 has it, waits as an error-passive transmitter, and is cut off when it is bus off
+until it has heard 128 times eleven recessive bits.
+
+All of it in virtual time and deterministic, like the `LockstepBus`. Which of its frames a node sends first is its
+controller's: with `queue="priority"` the lowest identifier, as from mailboxes; with "fifo" the oldest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Literal
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.fault_confinement import ErrorCounters
+from canprobe.bus.lockstep import BusNode, LockstepBus, LockstepPort, Participant, arbitration_key, name_of
+from canprobe.bus.port import ControllerState, Frame
+from canprobe.bus.wire_errors import WireErrors
+from canprobe.protocol.frame_bits import (
+    ERROR_DELIMITER_BITS,
+    ERROR_FLAG_BITS,
+    INTERMISSION_BITS,
+    SUSPEND_BITS,
+    exact_bits,
+)
+
+Queue = Literal["priority", "fifo"]
+_NS = 1_000_000_000
+_RECESSIVE_BITS = 11
+_AFTER_ACK_BITS = (
+    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
+)
+_ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
+
+_Entry = tuple[int, int, BusNode, Frame]
+"""A frame that takes part in the arbitration: what the wire compares, order of queueing, sender, frame."""
+
+
+class TimedBus(LockstepBus):
+    """The bus itself; attach participants and take ports as of a `LockstepBus`.
+
+    Args:
+        clock: virtual time, possibly shared with other buses.
+        channel: the bus's name in messages and logs.
+        bitrate: bit/s.
+        queue: what a node with several frames sends first.
+        errors: where the wire fails; None: nowhere.
+        length: bits of a frame with its intermission, exact by default.
+        max_frames: frames that may wait at once before somebody is taken to send for ever.
+    """
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        channel: str = "can0",
+        *,
+        bitrate: int = 1_000_000,
+        queue: Queue = "priority",
+        errors: WireErrors | None = None,
+        length: Callable[[int, bytes], int] = exact_bits,
+        max_frames: int = 20_000,
+    ) -> None:
+        super().__init__(clock, channel, max_frames=max_frames)
+        self.bitrate = bitrate
+        self.frames = self.error_frames = self.busy_ns = 0
+        self._fifo = queue == "fifo"
+        self._errors = errors
+        self._length = length
+        self._ready: list[_Entry] = []  # a heap
+        self._order = 0
+        self._flying: _Entry | None = None
+        self._hit = False
+        self._end_ns = self._free_ns = 0
+        self._quiet_ns = 0  # since when the wire has been recessive
+        self._suspended: dict[BusNode, int] = {}
+        self._counters: dict[BusNode, ErrorCounters] = {}
+        self._troubled = False  # somebody's counters are not 0
+        self._stale = True  # the participants' deadlines have to be read again
+        self._first_due: int | None = None
+
+    # what is to be seen
+
+    def counters(self, owner: Participant | LockstepPort) -> ErrorCounters:
+        """Error counters of a participant or a port.
+
+        Raises:
+            KeyError: it is not on the bus.
+        """
+        if self._troubled and self._flying is None:
+            self._listen_quiet(self.clock.now_ns())
+        for node, counters in self._counters.items():
+            if node.owner is owner:
+                return counters
+        raise KeyError(owner)
+
+    # time
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the wire or a participant next has something to do."""
+        if self._stale or self._flying is None:
+            self._first_due = super().next_deadline_ns()
+            self._stale = False
+        first = self._first_due
+        wire = self._end_ns if self._flying is not None else self._next_start() if self._ready else None
+        if wire is not None and (first is None or wire < first):
+            first = wire
+        if self._troubled and self._flying is None:
+            back = self._next_recovery()
+            if back is not None and (first is None or back < first):
+                first = back
+        return first
+
+    def settle(self) -> None:
+        """Do what is due at the present instant: end of a frame, deadlines of participants, start of the next frame."""
+        if self._settling:
+            return
+        self._settling = True
+        t_ns = self.clock.now_ns()
+        if self._stale:
+            self.next_deadline_ns()
+        rounds_left = self._max_frames
+        try:
+            while True:
+                if self._flying is not None and self._end_ns <= t_ns:
+                    self._finish()
+                elif self._first_due is not None and self._first_due <= t_ns and self._advance_due(t_ns):
+                    self._first_due = self._earliest()
+                    rounds_left -= 1
+                    if rounds_left < 0:
+                        raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
+                elif not (self._flying is None and self._ready and self._free_ns <= t_ns and self._start(t_ns)):
+                    break
+            if self._troubled and self._flying is None:
+                self._listen_quiet(t_ns)
+        finally:
+            self._settling = False
+
+    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
+        self._stale = True
+        self._queue(node, frames)
+        self.settle()
+
+    def _earliest(self) -> int | None:
+        dues = [node.due for node, _ in self._participants if node.due is not None]
+        return min(dues) if dues else None
+
+    def _bits_ns(self, bits: int) -> int:
+        return -(-bits * _NS // self.bitrate)
+
+    # queues and arbitration
+
+    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        if not frames or (self._troubled and self._counters[node].outstanding):
+            return  # a controller that is bus off takes no part
+        for frame in frames:
+            self._check(node, frame)
+            if self._fifo and (node.outbox or self._is_ready(node)):
+                node.outbox.append(frame)
+            else:
+                self._compete(node, frame)
+        if len(self._ready) + len(node.outbox) > self._max_frames:
+            self._ready.clear()
+            raise self._endless(
+                self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {name_of(node.owner)}"
+            )
+
+    def _is_ready(self, node: BusNode) -> bool:
+        flying = self._flying
+        return (flying is not None and flying[2] is node) or any(entry[2] is node for entry in self._ready)
+
+    def _compete(self, node: BusNode, frame: Frame) -> None:
+        can_id = frame[0]
+        self._order += 1
+        heappush(self._ready, (can_id << 21 if can_id <= 0x7FF else arbitration_key(can_id), self._order, node, frame))
+
+    def _start(self, t_ns: int) -> bool:
+        """Let the winner of the arbitration send; False where all who want to have to wait."""
+        entry = self._winner(t_ns) if self._suspended else heappop(self._ready)
+        if entry is None:
+            return False
+        can_id, data = entry[3]
+        bits = self._length(can_id, data)
+        if self._troubled:
+            self._listen_quiet(t_ns)
+        hit = None if self._errors is None else self._errors(can_id, data, bits - INTERMISSION_BITS)
+        if len(self._nodes) < 2:
+            hit = bits - INTERMISSION_BITS - 9  # nobody there to acknowledge it
+        self._flying, self._hit = entry, hit is not None
+        if hit is not None:
+            bits = hit + 1 + _ERROR_BITS + INTERMISSION_BITS
+        self._end_ns = t_ns + self._bits_ns(bits - INTERMISSION_BITS)
+        self._free_ns = t_ns + self._bits_ns(bits)
+        self.busy_ns += self._free_ns - t_ns
+        return True
+
+    def _winner(self, t_ns: int) -> _Entry | None:
+        """The winner among those who do not have to wait after a frame of their own."""
+        waiting = []
+        found = None
+        while self._ready and found is None:
+            entry = heappop(self._ready)
+            if self._suspended.get(entry[2], 0) > t_ns:
+                waiting.append(entry)
+            else:
+                found = entry
+        for entry in waiting:
+            heappush(self._ready, entry)
+        return found
+
+    def _next_start(self) -> int:
+        """When the wire can take the next frame."""
+        if not self._suspended:
+            return max(self._free_ns, self.clock.now_ns())
+        return max(self._free_ns, min(self._suspended.get(entry[2], 0) for entry in self._ready))
+
+    # the end of a frame
+
+    def _finish(self) -> None:
+        """End what is on the wire: deliver it, or count its error and let it compete again."""
+        entry = self._flying
+        assert entry is not None
+        _, _, sender, frame = entry
+        t_ns, self._flying = self._end_ns, None
+        self._quiet_ns = t_ns - self._bits_ns(_AFTER_ACK_BITS)
+        if self._hit:
+            self._fail(entry, t_ns)
+            return
+        self.frames += 1
+        if self._fifo and sender.outbox:
+            self._compete(sender, sender.outbox.popleft())
+        if self._troubled:
+            self._count_success(sender)
+        self._hand_over(sender, frame, t_ns)
+
+    def _hand_over(self, sender: BusNode, frame: Frame, t_ns: int) -> None:
+        can_id, data = frame
+        if self.recorder is not None:
+            self.recorder(can_id, data, t_ns)
+        off = self._cut_off() if self._troubled else ()
+        changed = False
+        for receive, receiver in self._listeners_of(sender, can_id):
+            if receiver in off:
+                continue
+            answers = receive(can_id, data, t_ns)
+            due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
+            changed = changed or due != receiver.due
+            receiver.due = due
+            if answers:
+                self._queue(receiver, answers)
+        if changed:
+            self._first_due = self._earliest()
+        if off:
+            self._deliver_to_ports(sender, (can_id, data, t_ns), off)
+            return
+        stamped = (can_id, data, t_ns)
+        for put in sender.inboxes:
+            put(stamped)
+
+    def _deliver_to_ports(self, sender: BusNode, stamped: tuple[int, bytes, int], off: Sequence[BusNode]) -> None:
+        for node in self._nodes:
+            if node is not sender and node not in off and isinstance(node.owner, LockstepPort):
+                node.owner.inbox.append(stamped)
+
+    # errors
+
+    def _fail(self, entry: _Entry, t_ns: int) -> None:
+        self.error_frames += 1
+        sender = entry[2]
+        self._troubled = True
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmit_error(acknowledge=len(self._nodes) < 2)
+            else:
+                counters.receive_error()
+            if isinstance(node.owner, LockstepPort):
+                node.owner.counters.error_frames += 1
+        if self._counters[sender].outstanding:
+            self._silence(sender)
+            return
+        heappush(self._ready, entry)
+        self._suspend(sender, t_ns)
+
+    def _count_success(self, sender: BusNode) -> None:
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmitted()
+            elif not counters.outstanding:
+                counters.received()
+        self._troubled = any(c.transmit or c.receive or c.outstanding for c in self._counters.values())
+        self._suspend(sender, self._end_ns)
+
+    def _suspend(self, sender: BusNode, t_ns: int) -> None:
+        """After its own frame an error-passive node waits for eight bits more."""
+        if self._counters[sender].state is ControllerState.PASSIVE:
+            self._suspended[sender] = t_ns + self._bits_ns(INTERMISSION_BITS + SUSPEND_BITS)
+        else:
+            self._suspended.pop(sender, None)
+
+    def _cut_off(self) -> list[BusNode]:
+        return [node for node, counters in self._counters.items() if counters.outstanding]
+
+    def _silence(self, node: BusNode) -> None:
+        """A node that is bus off loses what it wanted to say."""
+        node.outbox.clear()
+        self._suspended.pop(node, None)
+        self._ready = [entry for entry in self._ready if entry[2] is not node]
+        heapify(self._ready)
+
+    def _listen_quiet(self, t_ns: int) -> None:
+        """Count what nodes that are bus off have heard since the wire fell silent."""
+        sequences = (t_ns - self._quiet_ns) // self._bits_ns(_RECESSIVE_BITS)
+        for counters in self._counters.values():
+            counters.heard_recessive(sequences)
+        self._quiet_ns += sequences * self._bits_ns(_RECESSIVE_BITS)
+
+    def _next_recovery(self) -> int | None:
+        """When the next node that is bus off comes back, if the wire stays silent."""
+        least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
+        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
+
+    # who is there
+
+    def _add(self, owner: Participant | LockstepPort) -> BusNode:
+        node = super()._add(owner)
+        self._counters[node] = ErrorCounters()
+        self._stale = True
+        return node
+
+    def _remove(self, owner: Participant | LockstepPort) -> None:
+        for node in [node for node in self._counters if node.owner is owner]:
+            self._silence(node)
+            del self._counters[node]
+            if self._flying is not None and self._flying[2] is node:
+                self._flying = None  # it falls silent in the middle of a frame
+        super()._remove(owner)
+        self._stale = True

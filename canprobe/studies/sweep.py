@@ -1,0 +1,192 @@
+"""Sweeps: many independent cells on all cores or on a cluster, what is finished kept, the rest taken up again.
+
+A study is a module with `run(*, quick, sweep) -> StudyResult`. It names a function of the module that measures one cell
+and the cells; the sweep does the rest:
+
+    @dataclass(frozen=True, slots=True)
+    class Case:
+        stiffness: float
+        rate_hz: int
+        seeds: int
+
+    def measure(case: Case) -> dict[str, Any]:
+        return {"error": ...}                                  # plain numbers, text, lists, mappings, arrays
+
+    def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+        cases = [Case(k, 400, 4 if quick else 40) for k in STIFFNESSES]
+        answers = sweep.map(measure, cases, model=("touch", "emulator", "studies/my_study.py"))
+        costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
+        ...
+        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), draw)
+
+Answers come back in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
+and arrays are lists, keys of mappings are text. What decides an answer (parameters, seeds) belongs into the cell, and
+`model` names the files and folders of the package that it rests on (all of it by default): when one of them changes,
+its cells are computed again.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from canprobe.errors import StudyError
+from canprobe.studies.executors import dask_executor, process_pool
+from canprobe.studies.study import Say
+from canprobe.studies.sweep_store import CellStore, as_json, cell_key, model_digest
+
+Opener = Callable[[], AbstractContextManager[Executor]]
+Progress = Callable[[float, float], None]
+"""Called with the cells done and all cells."""
+
+
+class Sweep:
+    """How a study's cells are computed, and where they are kept.
+
+    Args:
+        executor: opens any `concurrent.futures` executor; called when there is something to compute.
+        store: finished cells.
+        say: called with each step.
+        progress: called after each cell.
+
+    Attributes:
+        computed: cells computed so far.
+        kept: cells found in the store so far.
+    """
+
+    def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
+        self.say = say
+        self.computed = self.kept = 0
+        self._executor = executor
+        self._store = store
+        self._progress = progress or _no_progress
+        if store.damaged:
+            say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
+
+    def map(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """Answers of `measure` to cells, in their order.
+
+        Args:
+            measure: a function of a module, of one cell; its answer has a JSON form.
+            cells: dataclasses or whatever else has a JSON form.
+            model: files and folders of the package that the answers rest on; all by default.
+
+        Raises:
+            StudyError: a cell failed, or a worker; the cells finished until then are kept.
+        """
+        return self._all(measure, cells, tuple(model), None)
+
+    def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
+        """The same for cells that measure run time: one after another in one process of this machine, nothing beside.
+
+        What was kept counts on the machine that it was measured on only.
+        """
+        return self._all(measure, cells, tuple(model), f"{platform.node()} {platform.processor()}")
+
+    def _all(
+        self, measure: Callable[[Any], object], cells: Sequence[Any], parts: tuple[str, ...], machine: str | None
+    ) -> list[Any]:
+        name, model = f"{measure.__module__}:{measure.__qualname__}", model_digest(parts)
+        keys = [cell_key(name, [cell, machine] if machine else cell, model) for cell in cells]
+        todo = {key: cell for key, cell in zip(keys, cells, strict=True) if self._store.get(key) is None}
+        total = len(set(keys))
+        done = total - len(todo)
+        self.kept += done
+        if done:
+            self.say(f"{done} of {total} cells are kept in {self._store.path}")
+
+        def keep(key: str, answer: str) -> None:
+            self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
+            self.computed += 1
+            self._progress(total - len(todo.keys() - self._store.keys()), total)
+
+        if todo:
+            with self._executor() if machine is None else process_pool(1) as executor:
+                for batch in [todo] if machine is None else [{key: cell} for key, cell in todo.items()]:
+                    _collect(executor, partial(_compute, measure, parts, model), batch, keep)
+        return [json.loads(self._store.get(key) or "null") for key in keys]
+
+
+@contextmanager
+def open_sweep(
+    folder: Path,
+    *,
+    say: Say,
+    progress: Progress | None = None,
+    workers: int | None = None,
+    dask: str | None = None,
+    fresh: bool = False,
+) -> Iterator[Sweep]:
+    """A sweep over the processes of this machine, or a Dask cluster, that keeps its cells in a folder.
+
+    Args:
+        folder: for `cells.jsonl`; what it holds is not computed again.
+        say: called with each step.
+        progress: called after each cell.
+        workers: processes, one for each core by default.
+        dask: address of a Dask scheduler to use instead.
+        fresh: forget what the folder holds.
+
+    Raises:
+        StudyError: another process uses the folder.
+    """
+    store = CellStore(folder, fresh=fresh)
+    try:
+        yield Sweep(
+            partial(dask_executor, dask) if dask else partial(process_pool, workers), store, say=say, progress=progress
+        )
+    finally:
+        store.close()
+
+
+def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
+    """In the worker: whether it went well, and the answer or what went wrong. Not every exception can be pickled."""
+    try:
+        if (here := model_digest(parts)) != model:
+            return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
+        return True, as_json(measure(cell))
+    except Exception as error:  # said again in the main process
+        frame = traceback.extract_tb(error.__traceback__)[-1]
+        return False, f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
+
+
+def _collect(
+    executor: Executor,
+    task: Callable[[Any], tuple[bool, str]],
+    cells: Mapping[str, Any],
+    keep: Callable[[str, str], None],
+) -> None:
+    """Compute cells and keep the answers as they come, those too that are ready when something goes wrong."""
+    futures = {executor.submit(task, cell): key for key, cell in cells.items()}
+    left = set(futures)
+    try:
+        for future in as_completed(futures):
+            keep(futures[future], _answer(future, cells[futures[future]]))
+            left.discard(future)
+    except BaseException:
+        for future in left:
+            if future.done() and not future.cancelled() and future.exception() is None and future.result()[0]:
+                keep(futures[future], future.result()[1])
+        raise
+
+
+def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
+    try:
+        well, text = future.result()
+    except BrokenProcessPool as error:
+        raise StudyError("a worker was killed; start the study again to compute what is left") from error
+    if not well:
+        raise StudyError(f"cell {as_json(cell)}: {text}")
+    return text
+
+
+def _no_progress(_done: float, _total: float) -> None:
+    """Nobody watches."""

@@ -1,0 +1,137 @@
+"""Finished cells of a sweep on disk: one line each, checked when read, found again by what made them.
+
+A line of `cells.jsonl` is the SHA-256 of its document, a space, and the document: the cell's key, what it was measured
+by and at, and the answer. Lines are added whole and at once; one that was cut short or changed is left out and counted.
+The key is a digest of the measuring function, the cell and the model (`model_digest`), so that an answer of other code
+is never taken for one of this code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import fcntl
+import functools
+import hashlib
+import json
+import platform
+from collections.abc import Set
+from importlib.metadata import version
+from pathlib import Path
+from typing import IO, Any
+
+import canprobe
+from canprobe.errors import StudyError
+
+PACKAGE = Path(canprobe.__file__).parent
+_SOURCES = (".py", ".toml", ".eds")
+
+
+def as_json(value: object) -> str:
+    """Canonical JSON: dataclasses are objects, arrays and tuples lists, keys sorted; NaN and infinity are kept."""
+    return json.dumps(value, sort_keys=True, default=_plain, ensure_ascii=False)
+
+
+def _plain(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if hasattr(value, "tolist"):  # numpy's scalars and arrays
+        return value.tolist()
+    raise TypeError(f"expected numbers, text, lists, mappings, arrays or dataclasses of them, got {type(value)}")
+
+
+@functools.cache
+def model_digest(parts: tuple[str, ...] = ()) -> str:
+    """Digest of the code that answers rest on, of Python and of numpy.
+
+    Args:
+        parts: files and folders of the package, such as "touch" or "studies/ground.py"; the whole package by default.
+
+    Raises:
+        StudyError: a part is not there.
+    """
+    found: set[Path] = set()
+    for part in parts or (".",):
+        where = PACKAGE / part
+        inside = [where] if where.is_file() else [p for p in where.rglob("*") if p.suffix in _SOURCES]
+        if not inside:
+            raise StudyError(f"model: expected a file or folder of the package, got {part!r}")
+        found.update(inside)
+    digest = hashlib.sha256(f"{platform.python_version()} {version('numpy')}".encode())
+    for path in sorted(found):
+        digest.update(f"\n{path.relative_to(PACKAGE)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cell_key(measure: str, cell: object, model: str) -> str:
+    """What an answer is found by."""
+    return hashlib.sha256(as_json([measure, cell, model]).encode()).hexdigest()[:32]
+
+
+class CellStore:
+    """The finished cells in a folder; open in one process at a time.
+
+    Args:
+        folder: made if it is not there.
+        fresh: forget what is kept.
+
+    Attributes:
+        path: of the file.
+        damaged: lines that were left out because they were cut short or changed.
+
+    Raises:
+        StudyError: another process has it open.
+    """
+
+    def __init__(self, folder: Path, *, fresh: bool = False) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path = folder / "cells.jsonl"
+        self.damaged = 0
+        self._answers: dict[str, str] = {}
+        self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._file.close()
+            raise StudyError(
+                f"{self.path}: another study is writing here; wait for it, or give another --out"
+            ) from error
+        self._file.seek(0)
+        if fresh:
+            self._file.truncate()
+        self._read()
+
+    def close(self) -> None:
+        """Let others open it."""
+        self._file.close()
+
+    def keys(self) -> Set[str]:
+        """Of all answers."""
+        return self._answers.keys()
+
+    def get(self, key: str) -> str | None:
+        """The answer as JSON text, None where there is none."""
+        return self._answers.get(key)
+
+    def put(self, key: str, what: object, answer: str) -> None:
+        """Keep an answer (JSON text) together with what it is an answer to."""
+        document = as_json({"key": key, "what": what, "answer": json.loads(answer)})
+        self._file.write(f"{_checksum(document)} {document}\n")
+        self._file.flush()
+        self._answers[key] = answer
+
+    def _read(self) -> None:
+        last = "\n"
+        for last in self._file:
+            checksum, _, document = last.rstrip("\n").partition(" ")
+            if checksum != _checksum(document):
+                self.damaged += 1
+                continue
+            found = json.loads(document)
+            self._answers[found["key"]] = as_json(found["answer"])
+        if not last.endswith("\n"):  # the next answer must not be written on to what was cut short
+            self._file.write("\n")
+            self._file.flush()
+
+
+def _checksum(document: str) -> str:
+    return hashlib.sha256(document.encode()).hexdigest()[:16]
