@@ -90,10 +90,11 @@ class Stage:
         if taxels:
             places, turns = taxel_poses(radius)
             vertices, faces = tile()
+            blank = np.zeros(len(places), np.uint8)
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=taxel_colours(np.zeros(256, np.uint8)), batched_opacities=_opacities(np.zeros(256, np.uint8)), side="double", lod="off",
-                cast_shadow=False,
+                batched_colors=taxel_colours(blank), batched_opacities=_opacities(blank), side="double",
+                cast_shadow=False, lod="off",
             )  # fmt: skip
         else:
             self._taxels = None
