@@ -150,7 +150,7 @@ class Stage:
     def _move_arm(self, q: Array) -> None:
         assert self._model is not None
         frames = link_frames(self._model, q)
-        for handle, T in zip(self._links, frames, strict=True):
+        for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
             _place(self._probe, frames[6] @ self._tool)

@@ -60,7 +60,7 @@ def test_every_tactile_frame_of_the_bus_is_found_once(run, recorded):
         o.measurement.tactile.t_sample_ns for o in recorded.observations if o.measurement and o.measurement.tactile
     ]
     late = [t - s * 1e-9 for (t, _), s in zip(run.taxels, sampled, strict=False)]
-    assert min(late) > 0.0 and max(late) < 6e-3  # sent at the next trigger, 5 ms later at 200 Hz
+    assert min(late) > 0.0 and max(late) < 7.5e-3  # sent at the next trigger, 5 ms later, within its cycle
 
 
 def test_a_moment_is_the_row_of_the_log(run, recorded):
