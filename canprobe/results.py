@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from canprobe.cell.cell import Cell
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
@@ -21,6 +22,9 @@ from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -55,6 +59,43 @@ class RunResult:
     def text(self) -> str:
         """The summary for people."""
         return summary_text(self.summary, self.out)
+
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (a row a cycle), `truth` (a row a SYNC), or `estimates` (a row an answer of the estimator in
+                the loop; see `estimates` for the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it, `canprobe.tables.parquet_to_npz` turns back.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Array]:
+        if what == "estimates":
+            from canprobe.recorded_summary import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth
 
 
 def summarise(
