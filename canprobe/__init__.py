@@ -20,12 +20,14 @@ if TYPE_CHECKING:
     from canprobe.touch.fit import fit_surface
     from canprobe.touch.surface import SurfaceMatrix
     from canprobe.touch.surface_map import SurfaceMap
+    from canprobe.traffic_log import measure_traffic
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "load_scene": ("canprobe.scene_loader", "load_scene"),
     "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
+    "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
     "load_table": ("canprobe.tables", "load_table"),
@@ -52,6 +54,7 @@ __all__ = [
     "load_scene",
     "load_surface_map",
     "load_table",
+    "measure_traffic",
     "open_cell",
     "plan",
     "replay",

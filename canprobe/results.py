@@ -128,7 +128,11 @@ def summarise(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
         "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
-        "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
+        "bus_load": {
+            bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+            for bus in session.plan.buses
+        },
+        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
@@ -271,7 +275,7 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
 
 def _observed(session: Session) -> dict[str, float | None] | None:
     """What observers and bridges added to a cycle, after its work; None without any."""
-    return _percentiles(session.observers.cost_ns) if session.observers is not None else None
+    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
 
 
 def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:

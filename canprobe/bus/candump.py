@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -47,30 +47,17 @@ class CandumpWriter:
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
-        self._channel = channel
         self._t0_ns = t0_ns
         self.failure: str | None = None
         self._path = path
         self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
         self._size = 0
         self._lines: list[str] = []
-        self._t_ns: int | None = None
-        self._prefix = ""
-        self._names: dict[int, str] = {}
+        self.write = self.on(channel)
 
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Add one frame that was on the bus at `t_ns`; the same line as `format_line`, for a fifth of its time."""
-        if t_ns != self._t_ns:
-            self._t_ns = t_ns
-            self._prefix = _format_prefix(self._channel, t_ns - self._t0_ns)
-        name = self._names.get(can_id)
-        if name is None:
-            name = self._names[can_id] = _format_id(can_id) + "#"
-        lines = self._lines
-        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
-        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
-        if len(lines) >= _LINES:
-            self.flush()
+    def on(self, channel: str) -> Callable[[int, bytes, int], None]:
+        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file."""
+        return _ChannelWriter(self._lines, self.flush, channel, self._t0_ns).write
 
     def flush(self) -> None:
         """Hand what was written to the file."""
@@ -101,6 +88,32 @@ class CandumpWriter:
         self.close()
 
 
+class _ChannelWriter:
+    """Lines of one channel."""
+
+    __slots__ = ("_channel", "_flush", "_lines", "_names", "_prefix", "_t0_ns", "_t_ns")
+
+    def __init__(self, lines: list[str], flush: Callable[[], None], channel: str, t0_ns: int) -> None:
+        self._lines, self._flush, self._channel, self._t0_ns = lines, flush, channel, t0_ns
+        self._t_ns: int | None = None
+        self._prefix = ""
+        self._names: dict[int, str] = {}
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Add one frame that was on the bus at `t_ns`; the same line as `format_line`, for a fifth of its time."""
+        if t_ns != self._t_ns:
+            self._t_ns = t_ns
+            self._prefix = _format_prefix(self._channel, t_ns - self._t0_ns)
+        name = self._names.get(can_id)
+        if name is None:
+            name = self._names[can_id] = _format_id(can_id) + "#"
+        lines = self._lines
+        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
+        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
+        if len(lines) >= _LINES:
+            self._flush()
+
+
 def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:
     """Return the line of one frame, newline included; ns below the microsecond are cut off."""
     return f"{_format_prefix(channel, t_ns)}{_format_id(can_id)}#{_format_payload(can_id, data)}\n"
@@ -124,8 +137,12 @@ def _format_id(can_id: int) -> str:
     return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
 
 
-def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
+
+    Args:
+        path: the log.
+        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -136,10 +153,21 @@ def read_candump(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
     try:
         with Path(path).open(encoding="ascii", errors="replace") as file:
             for number, line in enumerate(file, 1):
+                if only is not None and _id_of(line) not in only:
+                    continue
                 if text := line.rstrip("\r\n"):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def _id_of(line: str) -> int:
+    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
+    name = line.partition("#")[0].rpartition(" ")[2]
+    try:
+        return int(name, 16) if len(name) == 3 else -1
+    except ValueError:
+        return -1
 
 
 def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:

@@ -61,7 +61,10 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
 def add_bridge(parser: argparse.ArgumentParser) -> None:
     """Other tools to feed, besides those of the scene."""
     parser.add_argument(
-        "--bridge", metavar="NAME", action="append", help="feed another tool: mcap, foxglove, ros2; may be repeated"
+        "--bridge",
+        metavar="NAME",
+        action="append",
+        help="feed a tool: mcap, foxglove, ros2, view; may be repeated",
     )
 
 

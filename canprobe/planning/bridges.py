@@ -60,6 +60,7 @@ BRIDGES: Mapping[str, BridgeInfo] = {
         ("cyclonedds", "rosbags"),
         live=True,
     ),
+    "view": BridgeInfo("live 3-D view in a browser", "view.live", "view", ("viser",), live=True),
 }
 
 

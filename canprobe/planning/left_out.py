@@ -74,7 +74,8 @@ def _no_truth(scene: Scene) -> str | None:
 
 
 def _no_dynamics(scene: Scene) -> str | None:
-    emulated_arm = scene.arm is not None and scene.arm.emulated
+    ideal = scene.plant is not None and scene.plant.fidelity == "ideal"
+    emulated_arm = scene.arm is not None and scene.arm.emulated and ideal
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 
@@ -82,6 +83,14 @@ def _no_figure(_: Scene) -> str | None:
     if importlib.util.find_spec("matplotlib") is not None:
         return None
     return "the study extra is not installed: pip install 'canprobe[study]'"
+
+
+def _no_page(scene: Scene) -> str | None:
+    if scene.task.kind == "listen":
+        return 'task.kind = "listen": nothing moves'
+    if importlib.util.find_spec("viser") is not None:
+        return None
+    return "the view extra is not installed: pip install 'canprobe[view]'"
 
 
 def _no_bridge(scene: Scene) -> str | None:
@@ -116,6 +125,7 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
     ("taxel creep", _switch("creep")),
     ("taxel crosstalk", _switch("crosstalk")),
     ("figure", _no_figure),
+    ("replay to share (report.html)", _no_page),
     ("bridges to other tools", _no_bridge),
 )
 
@@ -136,4 +146,6 @@ def outputs(scene: Scene) -> tuple[str, ...]:
         files.append("surface.npz")
     if _no_figure(scene) is None:
         files += ["report.png", "surface.png"] if mapped else ["report.png"]
+    if _no_page(scene) is None:
+        files.append("report.html")
     return (*files, *bridge_outputs(scene))
