@@ -56,9 +56,6 @@ COMPOSITION = {
 
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
-    "studies/bridge_viewers.py": {"websockets"},
-    "tables.py": {"pandas", "pyarrow"},
-    "results.py": {"pandas"},
     "bridge/cdr.py": {"rosbags"},
     "bridge/mcap_file.py": {"mcap"},
     "bridge/foxglove_live.py": {"foxglove"},

@@ -14,8 +14,6 @@ from canprobe.cell.measurement import Command, Measurement
 
 MOST_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
-COSTS_KEPT = 200_000
-"""Of a cell that is up for days: the last half hour at 400 Hz."""
 
 
 COSTS_KEPT = 100_000

@@ -78,10 +78,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     rows = [_measure(case, observations) for case in cases]
     findings = [f"{name}: not measured, {pip}" for name, pip in missing.items()]
     worst = max(rows, key=lambda row: row["added_p99_us"])
-    findings.append(
-        f"what bridges add to 99 of 100 cycles of 2500 µs is {worst['added_p99_us']:.0f} µs or less ({worst['bridge']});"
-        f" dropped in all: {sum(row['dropped'] for row in rows)} of {sum(row['samples'] for row in rows)} samples"
-    )
+    dropped, samples = (sum(row[key] for row in rows) for key in ("dropped", "samples"))
+    findings += [
+        f"99 of 100 cycles of 2500 µs take {worst['added_p99_us']:.0f} µs more at most ({worst['bridge']})",
+        f"dropped in all: {dropped} of {samples} samples",
+    ]
     facts = measuring_facts(quick, 1) | {"cycles": len(observations), "processors": os.cpu_count()}
     return StudyResult("bridges", COLUMNS, rows, findings, facts, lambda path: _draw(rows, path))
 
