@@ -51,6 +51,7 @@ COMPOSITION = {
     "recorded_summary",
     "surface_file",
     "tables",
+    "traffic_log",
     "emulation",
 }
 
