@@ -73,12 +73,19 @@ class BridgeProcess:
         os.set_blocking(self._back, False)
         self._feed = Feed(writer, batch=self._batch, lossless=virtual)
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
     def await_ready(self) -> str:
-        """Wait until the bridge says where it is to be found.
+        """Wait until the bridge says where it is to be found; at once where it has.
 
         Raises:
             UsageError: it could not begin; with its own words.
         """
+        if self._where is not None:
+            return self._where
         self._feed.put(marshal.dumps(self._config))
         self._feed.flush(READY_TIMEOUT_S)
         self._feed.taken = 0

@@ -32,11 +32,12 @@ COMMAND_REPEAT_NS = 100_000_000
 def make_cell(
     plan: Plan,
     port: Port,
-    say: Callable[[str], None] = lambda _: None,
     *,
+    say: Callable[[str], None] = lambda _: None,
     times: BringUpTimes | None = None,
     log_failure: Callable[[], str | None] = lambda: None,
     observers: Observers | None = None,
+    rows_kept: int | None = None,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered.
 
@@ -46,6 +47,8 @@ def make_cell(
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
     """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
@@ -66,6 +69,7 @@ def make_cell(
         times=times,
         log_failure=log_failure,
         observers=observers,
+        rows_kept=rows_kept,
     )
 
 

@@ -10,7 +10,7 @@ from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.log import RunLog
+from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
@@ -42,8 +42,9 @@ class Cell:
         force_of: force (N) of a tactile sample; None where nothing can press.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
-        observers: called after each cycle.
         log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
 
     Attributes:
         log: one row a cycle.
@@ -63,10 +64,12 @@ class Cell:
         force_of: Callable[[TactileSample], float] | None = None,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
-        observers: Observers | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
+        observers: Observers | None = None,
+        rows_kept: int | None = None,
     ) -> None:
-        self.log = RunLog()
+        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
         self.faults: list[str] = []
@@ -75,9 +78,9 @@ class Cell:
         self._port = port
         self._settings = settings
         self._say = say
-        self._observers = observers
         self._log_failure = log_failure
         self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), force_of)
+        self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
@@ -112,6 +115,7 @@ class Cell:
                 tactile=self.tactile,
                 watch=self.watch,
                 other=self._network.feed,
+                kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
             self.supervisor.seen.first_alarm = len(self.watch.alarms)

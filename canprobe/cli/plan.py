@@ -4,9 +4,13 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
+
+if TYPE_CHECKING:
+    from canprobe.planning import Plan
 
 _EXAMPLE = """\
 The files: dcf, one device configuration file a node; dbc and kcd, every frame with its signals (extra `can`); bus.yml,
@@ -15,6 +19,7 @@ for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
 examples:
   canprobe plan cylinder
   canprobe plan mine.toml --auto
+  canprobe plan cylinder --measured runs/cylinder-20260101-120000
   canprobe plan cylinder --export dbc --export dcf --out config/
 """
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
@@ -26,6 +31,9 @@ def add_parser(commands: Commands[Parser]) -> None:
         "plan", help="show what a scene needs and leaves out", description=__doc__, epilog=_EXAMPLE
     )
     add_scene(parser)
+    parser.add_argument(
+        "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
+    )
     parser.add_argument(
         "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
     )
@@ -45,6 +53,8 @@ def run(args: argparse.Namespace) -> int:
 
     scene = load_scene(args.scene)
     plan = make_plan(opened(scene) if args.auto else scene)
+    if args.measured is not None:
+        return _compare(plan, args.measured, args.json)
     files: list[Path] = []
     if args.export:
         from canprobe.bridge.export import export_plan
@@ -57,3 +67,15 @@ def run(args: argparse.Namespace) -> int:
     else:
         print(plan_text(plan), end="")
     return 0
+
+
+def _compare(plan: Plan, log: Path, as_json: bool) -> int:
+    """Print what was measured; 3 where it is not what was planned."""
+    from canprobe.traffic_log import measure_traffic
+
+    measured = measure_traffic(log, plan)
+    if as_json:
+        print_json(measured.as_dict())
+    else:
+        print(measured.text(), end="")
+    return 0 if measured.as_planned else 3

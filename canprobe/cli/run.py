@@ -26,8 +26,8 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("run", help="carry out a scene", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
     add_bus(parser)
-    add_bridge(parser)
     add_realtime(parser)
+    add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the results [runs/<scene>-<time>]")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
                 scene,
                 interface=target.interface,
                 channel=target.channel,
+                sensor_channel=target.sensor_channel,
                 bitrate=target.bitrate,
                 out=folder,
                 seed=args.seed,

@@ -21,8 +21,8 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("up", help="bring the cell up and hold it", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
     add_bus(parser)
-    add_bridge(parser)
     add_realtime(parser)
+    add_bridge(parser)
     parser.set_defaults(run=run)
 
 
@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
             scene,
             interface=target.interface,
             channel=target.channel,
+            sensor_channel=target.sensor_channel,
             bitrate=target.bitrate,
             say=say,
             bridge=args.bridge or (),

@@ -74,7 +74,8 @@ def _no_truth(scene: Scene) -> str | None:
 
 
 def _no_dynamics(scene: Scene) -> str | None:
-    emulated_arm = scene.arm is not None and scene.arm.emulated
+    ideal = scene.plant is not None and scene.plant.fidelity == "ideal"
+    emulated_arm = scene.arm is not None and scene.arm.emulated and ideal
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 

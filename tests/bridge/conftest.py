@@ -1,4 +1,4 @@
-"""One short run, recorded live, that the tests of the bridges share."""
+"""Plans whose frames the bridges describe, and short recorded runs that their tests share."""
 
 from __future__ import annotations
 

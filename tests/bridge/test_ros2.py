@@ -63,7 +63,7 @@ def test_cyclone_itself_makes_the_same_bytes(messages, encoder):
             message = types.of(topic.type_name).deserialize(data)
             assert bytes(message.serialize(use_version_2=False)).rstrip(b"\0") == data.rstrip(b"\0"), topic.name
             assert types.carry(topic.type_name, data).serialize(use_version_2=False) == data
-    assert seen.keys() == {topic.name for topic in TOPICS}
+    assert seen.keys() == {topic.name for topic in TOPICS} - {"/can_fd_frames"}
 
 
 @pytest.mark.parametrize(
