@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,9 @@ from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
 from canprobe.traffic_log import LOG, measure_traffic
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -57,6 +60,43 @@ class RunResult:
     def text(self) -> str:
         """The summary for people."""
         return summary_text(self.summary, self.out)
+
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (a row a cycle), `truth` (a row a SYNC), or `estimates` (a row an answer of the estimator in
+                the loop; see `estimates` for the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it, `canprobe.tables.parquet_to_npz` turns back.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Array]:
+        if what == "estimates":
+            from canprobe.recorded_summary import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth
 
 
 def summarise(
@@ -247,7 +287,7 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
 
 def _observed(session: Session) -> dict[str, float | None] | None:
     """What observers and bridges added to a cycle, after its work; None without any."""
-    return _percentiles(session.observers.cost_ns) if session.observers is not None else None
+    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
 
 
 def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
