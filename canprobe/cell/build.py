@@ -23,7 +23,7 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene
+from canprobe.scene import BringUpSettings, Scene
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
@@ -37,6 +37,7 @@ def make_cell(
     times: BringUpTimes | None = None,
     log_failure: Callable[[], str | None] = lambda: None,
     observers: Observers | None = None,
+    rows_kept: int | None = None,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered.
 
@@ -47,6 +48,7 @@ def make_cell(
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
     """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
@@ -64,9 +66,21 @@ def make_cell(
         limits=limits_of(plan),
         force_of=_force_of(plan.scene),
         say=say,
-        times=times,
+        times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
         observers=observers,
+        rows_kept=rows_kept,
+    )
+
+
+def _times(settings: BringUpSettings) -> BringUpTimes:
+    return BringUpTimes(
+        listen=settings.listen_s,
+        boot_up=settings.boot_up_s,
+        sdo=settings.sdo_s,
+        start=settings.start_s,
+        retries=settings.retries,
+        store=settings.store,
     )
 
 

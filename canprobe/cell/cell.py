@@ -7,10 +7,10 @@ from types import TracebackType
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
-from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
+from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.log import RunLog
+from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
@@ -44,6 +44,7 @@ class Cell:
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
 
     Attributes:
         log: one row a cycle.
@@ -65,8 +66,10 @@ class Cell:
         times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
+        rows_kept: int | None = None,
     ) -> None:
-        self.log = RunLog()
+        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
         self.faults: list[str] = []
@@ -92,6 +95,11 @@ class Cell:
         """What has passed through the cell's port."""
         return self._port.counters
 
+    @property
+    def bring_up_reports(self) -> tuple[NodeReport, ...]:
+        """How far each node came in bring-up."""
+        return self._bring_up.reports
+
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))
 
@@ -112,6 +120,7 @@ class Cell:
                 tactile=self.tactile,
                 watch=self.watch,
                 other=self._network.feed,
+                kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
             self.supervisor.seen.first_alarm = len(self.watch.alarms)

@@ -32,13 +32,13 @@ class TactileReceiver:
         self.newest_cycle: int | None = None
         self.stale = 0
         self._overflow = sync_overflow
-        self._complete: TactileFrame | None = None
+        self._complete: list[TactileFrame] = []
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Take one tactile PDO."""
         frame = self.assembler.push(can_id, data, t_ns)
         if frame is not None:
-            self._complete = frame
+            self._complete.append(frame)
 
     def take(
         self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
@@ -52,20 +52,21 @@ class TactileReceiver:
             sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
                 SYNC before its header.
         """
-        frame, self._complete = self._complete, None
-        if frame is None:
+        if not self._complete:
             return None
-        cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
-        if cycles_ago == 0:
-            self._complete = frame
-            return None
-        trigger = cycle - cycles_ago
-        if cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
-            self.stale += 1
-            return None
-        self.newest_cycle = trigger
-        t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
-        return TactileSample(frame, t_sample, trigger)
+        sample, early = None, []
+        for frame in self._complete:
+            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
+            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
+                early.append(frame)
+            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
+                self.stale += 1
+            else:
+                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
+                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
+                self.newest_cycle = sample.cycle
+        self._complete = early
+        return sample
 
     def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
         """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""

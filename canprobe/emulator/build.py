@@ -34,25 +34,26 @@ class World:
     Attributes:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
-        recorder: notes the truth at every SYNC.
+        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
     """
 
     nodes: tuple[SlaveNode, ...]
     plant: Plant
-    recorder: TruthRecorder
+    recorder: TruthRecorder | None
 
     @property
     def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
         """Everything that lives on the bus; the recorder listens only."""
-        return (*self.nodes, self.recorder)
+        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
 
 
-def make_world(plan: Plan, node_ids: Collection[int]) -> World:
+def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True) -> World:
     """The emulated nodes of a plan, behind one plant.
 
     Args:
         plan: of the scene.
         node_ids: which of its nodes to emulate.
+        truth: whether what is true is recorded.
     """
     scene = plan.scene
     plant = Plant(_plant_config(scene))
@@ -67,7 +68,7 @@ def make_world(plan: Plan, node_ids: Collection[int]) -> World:
             nodes.append(make_drive_node(dictionary, node.node_id, axis, plant))
         else:
             nodes.append(make_tactile_node(dictionary, node.node_id, plant))
-    return World(tuple(nodes), plant, TruthRecorder(plant))
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
 
 
 def _plant_config(scene: Scene) -> PlantConfig:

@@ -21,7 +21,7 @@ from canprobe.studies.study import Column, Say, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
 
-RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 12, 20
+RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 8, 20
 OUTCOMES = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
 COLUMNS = (
     Column("fault", "fault"),

@@ -23,7 +23,9 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
         "workprec": "error of the dynamic plant against its run time, over integrators, steps and stiffness",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
         "faults": "what the cell does about thousands of random faults of its nodes and their links",
+        "bridges": "what each bridge to another tool adds to a cycle at 400 Hz, what it drops, and its size on disk",
     }
 )
 """Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
