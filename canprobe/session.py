@@ -252,7 +252,8 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        write = self._metered(channel, write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is counted afterwards, from the log
+            write = self._metered(channel, write)
         counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         self.traffic[channel] = counter
         return counter.write
