@@ -205,11 +205,12 @@ def test_another_master():
 def test_missed_pdos_are_lived_with(kind):
     def lose(run):
         if kind is FaultKind.CORRUPT:
-            altered(run.nodes[5], 0x185, lambda data: data[:5])
+            twice = iter((5, 5))
+            altered(run.nodes[5], 0x185, lambda data: data[: next(twice, 8)])
             return
         run.fault(kind, 5, duration_ns=8_000_000, amount_ns=2_000_000)
 
-    run = Injected("free", FREE_CYCLE, lose, until=2 if kind is FaultKind.CORRUPT else 20)
+    run = Injected("free", FREE_CYCLE, lose, until=20)
     run.assert_counted("pdo_missed")
     if kind is FaultKind.CORRUPT:
         assert run.session.cell.drives.malformed > 0
@@ -619,7 +620,7 @@ def test_every_row_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
     special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
     special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
-    special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk"}
+    special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk", "drive_late": 'BY_KEY["drive_late"]'}
     for condition in CONDITIONS:
         assert special.get(condition.key, f'("{condition.key}")') in source, condition.key
     assert {c.reaction for c in CONDITIONS} == set(Reaction)
