@@ -221,7 +221,7 @@ class PlantSettings:
     fidelity: Fidelity = "ideal"
     arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
-    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 1250.0  # of the integrator
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0  # of the integrator
     friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
     integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
     velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
