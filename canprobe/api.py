@@ -188,7 +188,7 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
 
 def _draw(result: RunResult, out: Path) -> None:
     (out / "report.html").unlink(missing_ok=True)  # of an earlier run
-    if "report.html" in result.plan.outputs:
+    if "report.html" in result.plan.outputs and len(result.log["t_s"]):
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
         page.write_page(recorded.read_run(out), out / "report.html")
     try:
