@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from canprobe.recorded import ReplayResult, replay
     from canprobe.scene_loader import load_scene
     from canprobe.surface_file import load_surface_map
+    from canprobe.tables import load_table
     from canprobe.touch.bound import cramer_rao
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.fit import fit_surface
@@ -29,6 +30,7 @@ _EXPORTS = {
     "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
+    "load_table": ("canprobe.tables", "load_table"),
     "open_cell": ("canprobe.api", "open_cell"),
     "replay": ("canprobe.recorded", "replay"),
     "ReplayResult": ("canprobe.recorded", "ReplayResult"),
@@ -51,6 +53,7 @@ __all__ = [
     "fit_surface",
     "load_scene",
     "load_surface_map",
+    "load_table",
     "measure_traffic",
     "open_cell",
     "plan",

@@ -6,18 +6,17 @@ import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from canprobe.bridging import Bridges
 from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.planning import make_plan
+from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
@@ -98,7 +97,7 @@ def run(
         session = Session(resolved, folder, say, (*observers, *bridges.observers))
         try:
             with session:
-                session.run(controller, _report(progress, resolved.task.duration_s))
+                session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
         except (CanprobeError, KeyboardInterrupt) as error:
             failure = error
             if not session.opened:
@@ -109,6 +108,25 @@ def run(
             failure.summary = result.summary
         raise failure
     return result
+
+
+def _requested(
+    plan: Plan, task: Controller | None, make: Callable[[], Controller] | None, bridges: Bridges
+) -> Controller:
+    """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
+    if not bridges.requests:
+        return task if task is not None else _Hold()
+    from canprobe.cell.tasks.requested import RequestedTask
+
+    return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
+
+
+class _Hold:
+    """Stay where the drives are."""
+
+    def step(self, _: Measurement) -> Command:
+        """Nothing to do."""
+        return Command()
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -251,10 +269,16 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    session_of = partial(open_cell, interface=interface, channel=channel, sensor_channel=sensor_channel)
-    with session_of(scene, bitrate=bitrate, say=say, bridge=bridge, rows_kept=ROWS_OF_UP) as session:
-        say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
-        session.run(lambda _: Command())
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
+    )
+    plan = make_plan(resolved)
+    with (
+        Bridges(plan, None, virtual=False, say=say) as bridges,
+        Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
+    ):
+        say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

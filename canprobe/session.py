@@ -31,7 +31,7 @@ from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
-from canprobe.planning.measured import TrafficMeter
+from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.planning.wire_bits import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
@@ -252,7 +252,8 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        write = self._metered(channel, write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is counted afterwards, from the log
+            write = self._metered(channel, write)
         counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         self.traffic[channel] = counter
         return counter.write

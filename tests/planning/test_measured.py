@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from canprobe.planning import make_plan
-from canprobe.planning.measured import TrafficMeter, expected_messages
+from canprobe.planning.traffic_meter import TrafficMeter, expected_messages
 from canprobe.protocol.frame_bits import best_case_bits, exact_bits
 from canprobe.scene_loader import load_scene
 

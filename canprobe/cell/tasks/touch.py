@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -147,6 +147,21 @@ class TouchTask:
     def slowed(self) -> int:
         """Cycles in which a joint could not keep up with the probe's path."""
         return self._motion.slowed if self._motion is not None else 0
+
+    @property
+    def targets(self) -> dict[str, float]:
+        """What the servo aims at: `target_force_n` and `speed_m_s`."""
+        return {"target_force_n": self._s.target_force, "speed_m_s": self._s.speed}
+
+    def set_target(self, kind: str, value: float) -> None:
+        """Change one of `targets`, by a small step: the servo follows at once."""
+        force, speed = (value, self._s.speed) if kind == "target_force_n" else (self._s.target_force, value)
+        self._s = replace(self._s, target_force=force, speed=speed)
+
+    def stop(self) -> None:
+        """Let go and be done, from whatever phase."""
+        if self._motion is not None and self.phase < Phase.RETREAT:
+            self._leave(None)
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
