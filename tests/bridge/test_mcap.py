@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cantools
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -52,6 +53,11 @@ def test_profile_encodings_and_attachments(recorded):
     assert attachments["scene.toml"] == (recorded.folder / "scene.toml").read_bytes()
     for eds in ("puma260_joint.eds", "tactile_array.eds"):
         assert attachments[eds] == eds_path(eds).read_bytes()
+    frames = {
+        message.frame_id
+        for message in cantools.database.load_string(attachments["cylinder.dbc"].decode("cp1252")).messages
+    }
+    assert {pdo.cob_id for pdo in recorded.result.plan.pdos} <= frames
     assert json.loads(attachments["summary.json"]) == json.loads((recorded.folder / "summary.json").read_text())
     assert not (recorded.folder / "run.mcap.part").exists()
 
