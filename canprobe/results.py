@@ -22,6 +22,7 @@ from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
+from canprobe.traffic_log import LOG, measure_traffic
 
 if TYPE_CHECKING:
     import pandas
@@ -132,11 +133,22 @@ def summarise(
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
             for bus in session.plan.buses
         },
-        "traffic": session.meter.report().as_dict() if session.meter is not None else None,
+        "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+
+
+def _traffic(session: Session) -> dict[str, Any]:
+    """What was on each bus beside the plan; on a real one counted afterwards, from the log."""
+    if session.out is None or session.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    log, plan = session.out / LOG, session.plan
+    try:
+        return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
+    except UsageError:  # it ended before the first SYNC
+        return {}
 
 
 def _scan(controller: object) -> tuple[int, int] | None:

@@ -190,6 +190,18 @@ class LimitSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class BringUpSettings:
+    """`[bring_up]`: how long its steps may take, and what is done about those that take longer."""
+
+    listen_s: Annotated[float, Range(0, 60)] = 0.25  # for another master
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0  # from the reset to the boot-up message
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5  # for one answer
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0  # from NMT start to the heartbeat that tells it
+    retries: Annotated[int, Range(0, 100)] = 1  # of a reset and of a request without an answer
+    store: bool = False  # 1010h keeps the configuration in the nodes; 1020h tells the next bring-up to leave it out
+
+
+@dataclass(frozen=True, slots=True)
 class ServoSettings:
     """`[servo]`: the tactile servo's gains."""
 
@@ -222,6 +234,8 @@ class PlantSettings:
     hysteresis: bool = True
     creep: bool = True
     crosstalk: bool = True
+    saturation: bool = True
+    threshold: bool = True  # of the array itself, before the node's own
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +261,7 @@ class Scene:
     bus: BusSettings = BusSettings()
     cycle: CycleSettings = CycleSettings()
     limits: LimitSettings = LimitSettings()
+    bring_up: BringUpSettings = BringUpSettings()
     arm: ArmSettings | None = None
     sensor: SensorSettings | None = None
     probe: ProbeSettings | None = None

@@ -6,7 +6,6 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -32,9 +31,9 @@ from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
-from canprobe.planning.measured import TrafficMeter
-from canprobe.planning.wire_bits import CLASSIC_BYTES
-from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits, exact_fd_bits
+from canprobe.planning.traffic_meter import TrafficMeter
+from canprobe.planning.wire_bits import exact_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene import BridgeSettings, BusSettings, Scene
 
@@ -158,7 +157,7 @@ class Session:
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: dict[str, TrafficCounter] = {}
-        self.meter: TrafficMeter | None = None
+        self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self._candump: CandumpWriter | None = None
@@ -253,14 +252,14 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        if len(self.plan.buses) == 1:
-            write = self._metered(write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is counted afterwards, from the log
+            write = self._metered(channel, write)
         counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         self.traffic[channel] = counter
         return counter.write
 
-    def _metered(self, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
-        self.meter = meter = TrafficMeter(self.plan, exact=False)
+    def _metered(self, channel: str, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
+        meter = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
 
         def both(can_id: int, data: bytes, t_ns: int) -> None:
             meter.write(can_id, data, t_ns)
@@ -361,7 +360,7 @@ def channel_routes(plan: Plan) -> dict[int, str]:
 
 def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
     """A bus in virtual time, with the bit rate of the scene or without one."""
-    if not scene.bus.timed or scene.bus.fd is True:
+    if not scene.bus.timed:
         return LockstepBus(clock, channel, fd=scene.bus.fd is True)
     from canprobe.bus.timed import TimedBus
     from canprobe.bus.wire_errors import BitErrors
@@ -369,18 +368,10 @@ def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBu
     rate = scene.bus.bit_error_rate
     errors = BitErrors(rate, scene.seed) if rate > 0 else None
     bus = scene.bus
-    length = partial(frame_bits_exact, speed_up=bus.data_bitrate / bus.bitrate) if bus.fd else exact_bits
+    length = partial(exact_frame_bits, bus=bus)
     timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
     timed.fd = bus.fd is True
     return timed
-
-
-def frame_bits_exact(can_id: int, data: bytes, *, speed_up: float) -> int:
-    """Bits of this very frame in bit times of the nominal rate; above 8 bytes it is one of CAN FD, rounded up."""
-    if len(data) <= CLASSIC_BYTES:
-        return exact_bits(can_id, data)
-    length = exact_fd_bits(can_id, data)
-    return length.nominal + math.ceil(length.data / speed_up)
 
 
 class _Sink:

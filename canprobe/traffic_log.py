@@ -9,19 +9,23 @@ from canprobe.bus.candump import read_candump
 from canprobe.bus.port import ERR_FLAG
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
+from canprobe.planning.measured import MeasuredTraffic
+from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import Scene
 
 LOG = "bus.log"
 
 
-def measure_traffic(log: Path | str, scene: Scene | Plan, *, channel: str | None = None) -> MeasuredTraffic:
+def measure_traffic(
+    log: Path | str, scene: Scene | Plan, *, channel: str | None = None, exact: bool = True
+) -> MeasuredTraffic:
     """Count what was on a bus and set it beside the plan, message by message.
 
     Args:
         log: a candump log, or the folder of a run.
         scene: the scene that ran, or its plan.
-        channel: of the log; by default the scene's, or the only one in the log.
+        channel: of the log; by default that of the scene's first bus, or the only one in the log.
+        exact: count stuff bits too, which takes a few µs a frame.
 
     Returns:
         Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
@@ -38,7 +42,7 @@ def measure_traffic(log: Path | str, scene: Scene | Plan, *, channel: str | None
     for t_ns, name, can_id, data in read_candump(path):
         meter = meters.get(name)
         if meter is None:
-            meter = meters[name] = TrafficMeter(plan)
+            meter = meters[name] = TrafficMeter(plan, name, exact)
         if can_id & ERR_FLAG and can_id <= 0x3FFFFFFF:
             meter.error_frames += 1
         else:
@@ -51,7 +55,7 @@ def _chosen(
     path: Path, meters: dict[str, TrafficMeter], syncs: Counter[str], plan: Plan, channel: str | None
 ) -> TrafficMeter:
     with_sync = [name for name in meters if syncs[name]]
-    wanted = plan.scene.bus.channel if channel is None else channel
+    wanted = plan.buses[0].channel if channel is None else channel
     if wanted in with_sync:
         return meters[wanted]
     if channel is None and len(with_sync) == 1:

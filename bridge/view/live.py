@@ -37,7 +37,7 @@ class LiveView:
         shape = None if scene.object is None else true_object(scene.object)
         errors = error_scale(shape)
         self._stack = ExitStack()
-        server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
+        server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._address = address(server)
         self._stage = Stage(server, scene)
         self._panel = Panel(server, scene, errors, true_kappa(shape))
@@ -70,14 +70,15 @@ class LiveView:
             self._show(moment, now_ns)
 
     def _show(self, moment: Moment, now_ns: int) -> None:
-        self._stage.show(moment)
-        self._path.refresh()
-        if now_ns - self._plot_ns < PLOT_NS:
-            self._panel.show(moment)
-            return
-        self._plot_ns = now_ns
-        columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
-        self._panel.show(moment, Curves(dict(zip(NAMES, columns, strict=True))))
+        curves = None
+        if now_ns - self._plot_ns >= PLOT_NS:
+            self._plot_ns = now_ns
+            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
+            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.refresh()
+            self._panel.show(moment, curves)
 
     def close(self, summary: str | None) -> None:
         """Take the page away."""

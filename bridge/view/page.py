@@ -55,11 +55,12 @@ def _record(run: RecordedRun, times: Any) -> str:
         path = LoadedPath(server.scene, trail_of(run), error_scale(shape_of(run)))
         recorder = server.get_scene_serializer()
         before = float(times[0])
-        for t in times.tolist():
-            recorder.insert_sleep(t - before)
-            before = t
-            stage.show(run.at(t))
-            path.until(t)
+        with server.atomic():  # nobody listens: nothing is sent
+            for t in times.tolist():
+                recorder.insert_sleep(t - before)
+                before = t
+                stage.show(run.at(t))
+                path.until(t)
         return str(recorder.as_html())
 
 

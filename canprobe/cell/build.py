@@ -23,7 +23,7 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene
+from canprobe.scene import BringUpSettings, Scene
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
@@ -66,10 +66,21 @@ def make_cell(
         limits=limits_of(plan),
         force_of=_force_of(plan.scene),
         say=say,
-        times=times,
+        times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
         observers=observers,
         rows_kept=rows_kept,
+    )
+
+
+def _times(settings: BringUpSettings) -> BringUpTimes:
+    return BringUpTimes(
+        listen=settings.listen_s,
+        boot_up=settings.boot_up_s,
+        sdo=settings.sdo_s,
+        start=settings.start_s,
+        retries=settings.retries,
+        store=settings.store,
     )
 
 

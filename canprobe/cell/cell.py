@@ -7,7 +7,7 @@ from types import TracebackType
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
-from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
+from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.log import CycleLog, LastRows, RunLog
@@ -94,6 +94,11 @@ class Cell:
     def counters(self) -> PortCounters:
         """What has passed through the cell's port."""
         return self._port.counters
+
+    @property
+    def bring_up_reports(self) -> tuple[NodeReport, ...]:
+        """How far each node came in bring-up."""
+        return self._bring_up.reports
 
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))

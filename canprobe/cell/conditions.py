@@ -123,7 +123,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "tactile frame names another SYNC than it followed",
         "its SYNC counter against its arrival",
         Reaction.DEGRADE,
-        _cycles(2),
+        lambda limits: (limits.tactile_cycles + 2) * limits.period_ns,
         BY_ITSELF,
         "the frame is dropped; counted",
         count=checks.misplaced_frames,

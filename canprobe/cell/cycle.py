@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from canprobe.bus.clock import elapsed_ns
 from canprobe.bus.port import Port, TimedFrame
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.intake import Intake
+from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
@@ -90,7 +90,7 @@ class Cycle:
         self._port = port
         self._s = settings
         self._drives = drives
-        self._intake = Intake(drives, tactile, settings.sync_overflow)
+        self._intake = Intake(drives, tactile, settings.sync_overflow or SYNCS_REMEMBERED)
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)

@@ -13,7 +13,7 @@ from canprobe.bus.port import TimedFrame
 from canprobe.cell.build import make_drives, make_tactile
 from canprobe.cell.deadlines import find_deadlines
 from canprobe.cell.drives import CommandFrame, command_frames
-from canprobe.cell.intake import Intake
+from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.recording import Recording
 from canprobe.planning.model import Plan
@@ -62,7 +62,7 @@ class LogCycles:
     def __init__(
         self, plan: Plan, recording: Recording, *, as_taken: bool, on_deadlines: bool = True, drifts: bool = False
     ) -> None:
-        overflow = recording.sync_overflow or plan.sync.overflow
+        overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan, overflow)
         self.sync_times_s: list[float] = []

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
+from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.planning import Plan
@@ -21,6 +22,7 @@ examples:
   canprobe plan mine.toml --auto
   canprobe plan cylinder --measured runs/cylinder-20260101-120000
   canprobe plan cylinder --export dbc --export dcf --out config/
+  canprobe plan cylinder --figure plan.png
 """
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
@@ -40,9 +42,24 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
     )
+    parser.add_argument(
+        "--figure", metavar="FILE.png", type=Path, help="draw cycles and response times (extra `study`)"
+    )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
     add_json(parser)
     parser.set_defaults(run=run)
+
+
+def _draw(plan: Plan, path: Path) -> Path:
+    try:
+        from canprobe.studies.plan_figure import draw_plan
+    except ImportError as error:
+        raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
+    try:
+        draw_plan(plan, path)
+    except ValueError as error:  # matplotlib knows no such form
+        raise UsageError(f"--figure {path}: {error}") from error
+    return path
 
 
 def run(args: argparse.Namespace) -> int:
@@ -55,11 +72,11 @@ def run(args: argparse.Namespace) -> int:
     plan = make_plan(opened(scene) if args.auto else scene)
     if args.measured is not None:
         return _compare(plan, args.measured, args.json)
-    files: list[Path] = []
+    files = [] if args.figure is None else [_draw(plan, args.figure)]
     if args.export:
         from canprobe.bridge.export import export_plan
 
-        files = export_plan(plan, args.out, args.export)
+        files += export_plan(plan, args.out, args.export)
     if args.json:
         print_json(plan.as_dict() | ({"files": [str(file) for file in files]} if files else {}))
     elif files:
@@ -70,12 +87,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
-    """Print what was measured; 3 where it is not what was planned."""
+    """Print what was measured on each bus; 3 where it is not what was planned."""
     from canprobe.traffic_log import measure_traffic
 
-    measured = measure_traffic(log, plan)
+    several = len(plan.buses) > 1
+    measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
     if as_json:
-        print_json(measured.as_dict())
+        print_json({channel: one.as_dict() for channel, one in measured.items()})
     else:
-        print(measured.text(), end="")
-    return 0 if measured.as_planned else 3
+        print("\n".join(one.text() for one in measured.values()), end="")
+    return 0 if all(one.as_planned for one in measured.values()) else 3

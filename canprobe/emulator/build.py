@@ -24,7 +24,7 @@ from canprobe.scene_geometry import T_flange_probe, approach_normal, true_object
 
 PARKED_ABOVE_MM = 5.0
 """How far above the approach's first point an emulated arm stands at power on."""
-EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk")
+EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
 @dataclass(frozen=True, slots=True)

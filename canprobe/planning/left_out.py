@@ -124,6 +124,8 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
     ("taxel hysteresis", _switch("hysteresis")),
     ("taxel creep", _switch("creep")),
     ("taxel crosstalk", _switch("crosstalk")),
+    ("taxel saturation", _switch("saturation")),
+    ("the array's own threshold", _switch("threshold")),
     ("figure", _no_figure),
     ("replay to share (report.html)", _no_page),
     ("bridges to other tools", _no_bridge),

@@ -30,6 +30,8 @@ from canprobe.planning.traffic import plan_traffic
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
 
+SYNC_COUNTER = 0x1019
+
 
 def make_plan(scene: Scene) -> Plan:
     """Derive the plan of a scene; what the scene leaves open ("auto") is chosen so that it fits.
@@ -133,6 +135,9 @@ def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
     sync, problems = plan_sync(scene)
     ratio, found = plan_ratio(scene)
     planning = PdoPlanning(problems=[*problems, *found])
+    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if SYNC_COUNTER not in device.od]:
+        sync = replace(sync, overflow=0)
+        planning.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
     plan_drive_pdos(planning, scene, sync, devices)
     if scene.sensor is not None:
         plan_tactile_pdos(planning, scene, sync, ratio, devices[scene.sensor.node_id])

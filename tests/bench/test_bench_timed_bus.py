@@ -88,9 +88,10 @@ class Bare:
 
     def __init__(self, bus):
         self.bus, self.count = bus, 0
-        for i in range(1, 7):
-            bus.attach(Scripted(answers={0x80: [(0x180 + i, bytes(range(i, i + 8)))]}))
-        bus.attach(Scripted(answers={0x80: [(0x511 + i, bytes(range(i, i + 8))) for i in range(9)]}))
+        self.nodes = [Scripted(answers={0x80: [(0x180 + i, bytes(range(i, i + 8)))]}) for i in range(1, 7)]
+        self.nodes.append(Scripted(answers={0x80: [(0x511 + i, bytes(range(i, i + 8))) for i in range(9)]}))
+        for node in self.nodes:
+            bus.attach(node)
         self.port = bus.port()
 
     def cycle(self):
@@ -102,8 +103,8 @@ class Bare:
         self.count += 1
         clock.sleep_until_ns(self.count * CYCLE_NS)
         got += len(port.drain())
-        for node, _ in self.bus._participants:
-            node.owner.heard.clear()
+        for node in self.nodes:
+            node.heard.clear()
         return got
 
 

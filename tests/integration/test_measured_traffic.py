@@ -42,7 +42,7 @@ def test_a_touch_is_as_planned_to_the_frame(press):
 def test_the_summary_says_the_same(press):
     result, folder = press
     measured = canprobe.measure_traffic(folder / "bus.log", result.plan).as_dict()
-    summary = result.summary["traffic"]
+    summary = result.summary["traffic"]["can0"]
     assert summary["as_planned"] is True and summary["stuff_bits_counted"] is False
     for kind, one in summary["classes"].items():
         assert one["frames"] == measured["classes"][kind]["frames"]
@@ -55,7 +55,7 @@ def test_plan_measured_on_the_command_line(press, capsys):
     assert main(["plan", "press", "--measured", str(folder)]) == 0
     assert "drive TPDO" in capsys.readouterr().out
     assert main(["plan", "press", "--measured", str(folder / "bus.log"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["as_planned"] is True
+    assert json.loads(capsys.readouterr().out)["can0"]["as_planned"] is True
     assert main(["plan", "free", "--measured", str(folder)]) == 3
     assert "not in the plan: 511h" in capsys.readouterr().out
 
@@ -88,5 +88,5 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     buses = [session.lockstep for session in (first, second)]
     assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
     assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
-    assert first.meter.report().as_planned
+    assert first.meters["can0"].report().as_planned
     assert first.cell.drives.missed == 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from canprobe.planning import make_plan
-from canprobe.planning.measured import TrafficMeter, expected_messages
+from canprobe.planning.traffic_meter import TrafficMeter, expected_messages
 from canprobe.protocol.frame_bits import best_case_bits, exact_bits
 from canprobe.scene_loader import load_scene
 
@@ -77,7 +77,7 @@ def test_bits_are_those_of_the_frames(plan):
 
 def test_times_behind_sync_are_shares_of_the_plans_worst_case(plan):
     report = by_kind(measure(plan, course()))
-    expected = expected_messages(plan)
+    expected = expected_messages(plan, plan.buses[0])
     shortest = best_case_bits(1) * US
     assert expected[0x186].latest_ns == next(p.response_ns for p in plan.pdos if p.cob_id == 0x186) - shortest
     assert report["drive TPDO"].slowest == pytest.approx(

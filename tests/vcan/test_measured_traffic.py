@@ -43,4 +43,4 @@ def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
             allowed = max(0.02 * one.planned_frames, one.messages) + lost * one.messages
             assert one.frames == pytest.approx(one.planned_frames, abs=allowed), (log, kind)
             assert one.bits <= one.planned_bits, (log, kind)
-    assert results.summary["traffic"]["unlisted"] == []
+    assert results.summary["traffic"]["vcan0"]["unlisted"] == []
