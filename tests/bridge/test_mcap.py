@@ -186,8 +186,10 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
 
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     canprobe.run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
+    with (tmp_path / "scene.toml").open("a") as scene:
+        scene.write('\n[bridge]\nuse = ["ros2"]\n')  # fed the run, not its replay
     replayed = replay_into(tmp_path, ("mcap",))
-    assert replayed.result is None
+    assert replayed.result is None and replayed.bridges.keys() == {"mcap"}
     topics = [topic for topic, _, _ in messages_of(tmp_path / "run.mcap")]
     assert topics.count("/joint_states") > 40 and "/wrench" not in topics
 
