@@ -1,6 +1,7 @@
 """The one encoder of all sinks: ROS 2 messages → CDR, their definitions, and their RIHS01 hashes, by `rosbags`.
 
-Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen, which it does not.
+Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
+ros2_socketcan_msgs, which it does not.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from canprobe.bridge.sample import CanFrame
 
 CAN_FRAME = "can_msgs/msg/Frame"
+CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"
 _CAN_FRAME_MSG = """\
 std_msgs/Header header
 uint32 id
@@ -23,6 +25,14 @@ uint8 dlc
 uint8[8] data
 """
 
+_CAN_FD_FRAME_MSG = """\
+std_msgs/Header header
+uint32 id
+bool is_extended
+bool is_error
+uint8 len
+uint8[<=64] data
+"""
 _CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
 """Encapsulation, stamp, an empty frame_id, id, three flags, dlc, data: a bus has twenty of them a cycle."""
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
@@ -52,6 +62,7 @@ class Encoder:
     def __init__(self) -> None:
         self.store: Any = get_typestore(Stores.ROS2_JAZZY)
         self.store.register(get_types_from_msg(_CAN_FRAME_MSG, CAN_FRAME))
+        self.store.register(get_types_from_msg(_CAN_FD_FRAME_MSG, CAN_FD_FRAME))
 
     def encode(self, type_name: str, message: object) -> bytes:
         """A message as CDR, little-endian, with its four bytes of encapsulation."""

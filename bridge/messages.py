@@ -16,6 +16,7 @@ from canprobe.bridge.sample import (
     FLANGE,
     JOINT_NAMES,
     PROBE,
+    CanFrame,
     ContactFrame,
     Joints,
     Sample,
@@ -68,13 +69,30 @@ class Messages:
 
     def of(self, sample: Sample) -> Iterator[Message]:
         """Every message of a sample that is wanted; the time of each is its own."""
-        if self._wanted(topics.CAN_FRAMES):
-            for frame in sample.frames:
-                t_ns = self._epoch_time(frame.t_ns)
-                yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+        yield from self._can_frames(sample.frames)
         for topic, t_ns, make in self._parts(sample):
             if self._wanted(topic):
                 yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
+
+    def _can_frames(self, frames: tuple[CanFrame, ...]) -> Iterator[Message]:
+        """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
+        classic, fd = self._wanted(topics.CAN_FRAMES), self._wanted(topics.CAN_FD_FRAMES)
+        for frame in frames:
+            t_ns = self._epoch_time(frame.t_ns)
+            if len(frame.data) <= 8:
+                if classic:
+                    yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+            elif fd:
+                message = self._make(
+                    topics.CAN_FD_FRAMES.type_name,
+                    header=self._header(frame.t_ns, ""),
+                    id=frame.can_id,
+                    is_extended=frame.extended,
+                    is_error=False,
+                    len=len(frame.data),
+                    data=np.frombuffer(frame.data, np.uint8),
+                )
+                yield topics.CAN_FD_FRAMES, t_ns, self.encoder.encode(topics.CAN_FD_FRAMES.type_name, message)
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
         """What there is in a sample: topic, time, and how to make the message."""

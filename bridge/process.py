@@ -51,6 +51,7 @@ class BridgeProcess:
         self.requests: deque[dict[str, Any]] = deque(maxlen=100)
         self._config = {"scene": dump_scene(plan.scene), "out": str(out.resolve()) if out is not None else None}
         self._virtual = virtual
+        self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
         self._epoch: bytes | None = None
         self._where: str | None = None
         self._error: str | None = None
@@ -72,12 +73,19 @@ class BridgeProcess:
         os.set_blocking(self._back, False)
         self._feed = Feed(writer, batch=self._batch, lossless=virtual)
 
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
     def await_ready(self) -> str:
-        """Wait until the bridge says where it is to be found.
+        """Wait until the bridge says where it is to be found; at once where it has.
 
         Raises:
             UsageError: it could not begin; with its own words.
         """
+        if self._where is not None:
+            return self._where
         self._feed.put(marshal.dumps(self._config))
         self._feed.flush(READY_TIMEOUT_S)
         self._feed.taken = 0
@@ -93,16 +101,16 @@ class BridgeProcess:
         return self._where
 
     def observe(self, observation: Observation) -> None:
-        """Hand one observation over, or drop it; see now and then what came back."""
+        """Hand one observation over, or drop it; where commands are allowed, see now and then whether there is one."""
         if self._epoch is None:
             epoch = 0 if self._virtual else epoch_now_ns() - observation.t_ns
             self._epoch = epoch.to_bytes(8, "little")
         feed = self._feed
         feed.put(_OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
-        self._poll_in -= 1
-        if self._poll_in <= 0:
-            self._poll_in = self._batch
-            if not feed.broken:
+        if self._takes_requests and not feed.broken:
+            self._poll_in -= 1
+            if self._poll_in <= 0:
+                self._poll_in = self._batch
                 self._listen(0.0)
 
     def _listen(self, timeout_s: float) -> bool:

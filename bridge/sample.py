@@ -166,7 +166,7 @@ class CanFrame:
     Attributes:
         t_ns: when, on the clock of the samples.
         can_id: 11 or 29 bits.
-        data: up to 8 bytes.
+        data: up to 8 bytes; up to 64 in CAN FD.
         extended: the identifier has 29 bits.
         remote: a remote request.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from canprobe.bridge.cdr import CAN_FRAME
+from canprobe.bridge.cdr import CAN_FD_FRAME, CAN_FRAME
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +33,8 @@ TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", depth=1, transient=Tru
 TAXELS = Topic("/taxels/image", "sensor_msgs/msg/Image", depth=5, best_effort=True)
 PATCH = Topic("/surface_patch", "sensor_msgs/msg/PointCloud2", depth=5)
 CURVATURE = Topic("/curvature", "geometry_msgs/msg/Vector3Stamped")
+CAN_FD_FRAMES = Topic("/can_fd_frames", CAN_FD_FRAME, depth=500)
 CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 
-TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, DIAGNOSTICS)
+TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS)

@@ -27,6 +27,8 @@ from canprobe.planning.bridges import BRIDGES
 from canprobe.scene import BridgeSettings
 from canprobe.scene_loader import parse_scene
 
+NICE = 10
+"""Whatever a bridge computes, the cell and its nodes come first."""
 OBSERVATION, END = b"o"[0], b"e"[0]
 """First byte of a record: what follows."""
 
@@ -91,6 +93,7 @@ def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> int:
 def main() -> int:
     """The process: Ctrl-C is for the cell, which ends this one by the end of its records."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICE)
     fd = os.dup(1)
     os.dup2(2, 1)  # what a library prints does not mix with the lines back
     return run(sys.argv[1], read_records(sys.stdin.buffer), fd)

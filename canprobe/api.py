@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.bridging import Bridges
 from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
-from canprobe.planning import make_plan
+from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
@@ -42,6 +42,8 @@ __all__ = [
     "up",
 ]
 
+ROWS_OF_UP = 4000
+"""Cycles that :func:`up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
@@ -51,6 +53,7 @@ def run(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -66,6 +69,7 @@ def run(
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, bitrate: in the place of the scene's bus.
+        sensor_channel: the sensor's bus, where it is another one.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
@@ -80,7 +84,14 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
     """
     resolved = resolve_scene(
-        scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s, bridge=bridge
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        duration_s=duration_s,
+        bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
     plan = make_plan(resolved)
@@ -90,7 +101,7 @@ def run(
         session = Session(resolved, folder, say, (*observers, *bridges.observers))
         try:
             with session:
-                session.run(controller, _report(progress, resolved.task.duration_s))
+                session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
         except (CanprobeError, KeyboardInterrupt) as error:
             failure = error
             if not session.opened:
@@ -101,6 +112,25 @@ def run(
             failure.summary = result.summary
         raise failure
     return result
+
+
+def _requested(
+    plan: Plan, task: Controller | None, make: Callable[[], Controller] | None, bridges: Bridges
+) -> Controller:
+    """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
+    if not bridges.requests:
+        return task if task is not None else _Hold()
+    from canprobe.cell.tasks.requested import RequestedTask
+
+    return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
+
+
+class _Hold:
+    """Stay where the drives are."""
+
+    def step(self, _: Measurement) -> Command:
+        """Nothing to do."""
+        return Command()
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -181,12 +211,14 @@ def open_cell(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
     say: Say = quiet,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
+    rows_kept: int | None = None,
 ) -> Iterator[Session]:
     """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
 
@@ -197,20 +229,29 @@ def open_cell(
 
     Args:
         scene: from :func:`canprobe.load_scene`.
-        interface, channel, bitrate, seed: in the place of the scene's.
+        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
         observers, bridge: as for :func:`run`.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by 3 KiB a cycle.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed.
     """
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, bridge=bridge)
+    resolved = resolve_scene(
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        bridge=bridge,
+    )
     folder = Path(out) if out is not None else None
     with (
         Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
-        Session(resolved, folder, say, (*observers, *bridges.observers)) as session,
+        Session(resolved, folder, say, (*observers, *bridges.observers), rows_kept) as session,
     ):
         yield session
 
@@ -220,6 +261,7 @@ def up(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     say: Say = quiet,
     bridge: Sequence[str] = (),
@@ -231,9 +273,16 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say, bridge=bridge) as session:
-        say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
-        session.run(lambda _: Command())
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
+    )
+    plan = make_plan(resolved)
+    with (
+        Bridges(plan, None, virtual=False, say=say) as bridges,
+        Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
+    ):
+        say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

@@ -64,6 +64,13 @@ class Bridges:
     ) -> None:
         self.end(None)
 
+    @property
+    def requests(self) -> tuple[Any, ...]:
+        """Where requests of other tools arrive; empty where none are allowed."""
+        settings = self._plan.scene.bridge
+        allowed = settings is not None and settings.ros2_commands
+        return tuple(bridge.requests for bridge in self.observers) if allowed else ()
+
     def status(self) -> dict[str, dict[str, Any]] | None:
         """What stands in the summary of each bridge; None without any."""
         return {bridge.name: bridge.status() for bridge in self.observers} or None

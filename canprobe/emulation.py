@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from canprobe.errors import NodeError, UsageError
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
-from canprobe.session import Say, quiet, resolve_scene
+from canprobe.session import Say, data_bitrate, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
@@ -49,9 +49,13 @@ def emulate(
     from canprobe.emulator.build import make_world
     from canprobe.planning import make_plan
 
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
+    name = None if split else channel
+    resolved = resolve_scene(scene, interface=interface, channel=name, bitrate=bitrate, seed=seed)
     plan = make_plan(resolved)
-    with _free_port(interface, channel, bitrate, node_ids, "end that node, or name others with --nodes") as port:
+    fast = data_bitrate(plan.scene.bus)
+    way_out = "end that node, or name others with --nodes"
+    with _free_port(interface, channel, bitrate, node_ids, way_out, data_bitrate=fast) as port:
         rehearse(resolved)
         world = make_world(plan, node_ids, truth=truth_path is not None)
         _keep(world.nodes, store_folder)
@@ -105,13 +109,21 @@ def emulate_eds(
 
 
 @contextlib.contextmanager
-def _free_port(interface: str, channel: str, bitrate: int, node_ids: tuple[int, ...], way_out: str) -> Iterator[Port]:
+def _free_port(
+    interface: str,
+    channel: str,
+    bitrate: int,
+    node_ids: tuple[int, ...],
+    way_out: str,
+    *,
+    data_bitrate: int | None = None,
+) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids."""
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
     from canprobe.bus.probe import answering_nodes
 
-    port = open_port(interface, channel, bitrate, MonotonicClock())
+    port = open_port(interface, channel, bitrate, MonotonicClock(), data_bitrate=data_bitrate)
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.bridging import Bridges
 from canprobe.bus.candump import read_candump
@@ -20,6 +21,7 @@ from canprobe.cell.observe import Observation
 from canprobe.cell.recording import Recording, read_recording
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import BRIDGES
+from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.recorded import ReplayResult, find_log, replay, scene_of
 from canprobe.scene import Scene
@@ -123,8 +125,17 @@ class _Observations:
         stamps = self._recording.sync_stamps
         if not self._ours:
             return int(stamps[0])
-        numbers, deadlines = find_deadlines(stamps, self._plan.sync.period_ns, None)
-        return int(deadlines[0]) - int(numbers[0]) * self._plan.sync.period_ns
+        numbers, _ = find_deadlines(stamps, self._plan.sync.period_ns, None)
+        return int(np.min(stamps - self._wire_times() - numbers * self._plan.sync.period_ns))
+
+    def _wire_times(self) -> NDArray[np.int64]:
+        """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate has the ends of frames."""
+        bus, recording = self._plan.scene.bus, self._recording
+        if bus.interface != LOCKSTEP or not bus.timed or bus.fd is True:
+            return np.zeros(len(recording.syncs), np.int64)
+        syncs = (recording.frames[i] for i in recording.syncs.tolist())
+        bits = np.array([exact_bits(can_id, data) - INTERMISSION_BITS for can_id, data, _ in syncs])
+        return bits * 1_000_000_000 // bus.bitrate
 
     def _command(self, m: Measurement) -> Command | None:
         phase = self._phases.get(m.t_ns)

@@ -17,9 +17,10 @@ Auto = Literal["auto"]  # the plan chooses
 TactileModeName = Literal["window", "image", "features", "auto"]
 CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
-ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
+ObjectKind = Literal["plane", "sphere", "cylinder", "ellipsoid", "saddle", "bowl", "torus", "wave", "fillet", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
-Fidelity = Literal["ideal"]
+Fidelity = Literal["ideal", "dynamic"]
+Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
 TransmitQueue = Literal["priority", "fifo"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
@@ -32,6 +33,9 @@ NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 TOUCHING = Only("kind", ("scan", "press"))
 SCANNING = Only("kind", ("scan",))
 FREE = Only("kind", ("free",))
+DYNAMIC = Only("fidelity", ("dynamic",))
+TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
+WAVE = Only("kind", ("wave",), required=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,17 +112,26 @@ class ProbeSettings:
 class ObjectSettings:
     """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
 
-    The object frame's origin lies on the surface with z outward. The cylinder's axis runs along x; a saddle is
-    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); a bowl is the inside of a
-    sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
+    The object frame's origin lies on the surface with z outward. A cylinder, a wave and a fillet are straight along
+    x: a wave is z = amplitude (cos(2π y/wavelength) − 1), a fillet an arc that turns by angle between two planes. A
+    saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); an ellipsoid has
+    three positive semi-axes; a torus lies flat, the origin on its crown, x outward from its axis; a bowl is the inside
+    of a sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
     radius_mm: Annotated[
-        float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder", "bowl"), required=True)
+        float | None,
+        Range(1, 100_000),
+        Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
     ] = None
-    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
-    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
+    ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None  # half of trough to crest
+    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )
@@ -199,10 +212,23 @@ class ServoSettings:
 
 @dataclass(frozen=True, slots=True)
 class PlantSettings:
-    """`[plant]`: how the emulated arm, contact and array behave."""
+    """`[plant]`: how the emulated arm, contact and array behave.
+
+    Fidelity `ideal`: each drive tracks as a second-order system, whatever it pushes against. `dynamic`: rigid links,
+    friction, drive cascade, and the object pushes back; the keys that say "dynamic" belong to it.
+    """
 
     fidelity: Fidelity = "ideal"
+    arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
+    integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0  # of the integrator
+    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
+    # K/h of the layer that is really there, N/m³; the probe's by default
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
     noise: bool = True
     gain_error: bool = True
@@ -210,6 +236,8 @@ class PlantSettings:
     hysteresis: bool = True
     creep: bool = True
     crosstalk: bool = True
+    saturation: bool = True
+    threshold: bool = True  # of the array itself, before the node's own
 
 
 @dataclass(frozen=True, slots=True)

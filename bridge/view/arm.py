@@ -16,7 +16,7 @@ from canprobe.bridge.transforms import link_transforms
 from canprobe.bridge.view.meshes import Array, Mesh, cylinder, dome, link, merged, revolved
 from canprobe.robot.puma260 import PumaModel
 
-WHITE, GREY, DARK = (238, 236, 229), (150, 156, 163), (58, 64, 72)
+WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
 RIM = 5e-3
 SHOULDER, ELBOW, WRIST = 0.050, 0.040, 0.026
 """Radii round joints 2, 3 and 5, m."""

@@ -15,7 +15,7 @@ from canprobe.bridge.view.panel import Panel
 from canprobe.bridge.view.path_nodes import GrowingPath
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
+from canprobe.bridge.view.trail import Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
 from canprobe.scene_geometry import true_object
 
@@ -37,10 +37,10 @@ class LiveView:
         shape = None if scene.object is None else true_object(scene.object)
         errors = error_scale(shape)
         self._stack = ExitStack()
-        server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
+        server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._address = address(server)
         self._stage = Stage(server, scene)
-        self._panel = Panel(server, scene, errors, true_kappa(shape))
+        self._panel = Panel(server, scene, errors)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail, errors)
         self._follower = Follower(shape)
@@ -70,14 +70,15 @@ class LiveView:
             self._show(moment, now_ns)
 
     def _show(self, moment: Moment, now_ns: int) -> None:
-        self._stage.show(moment)
-        self._path.refresh()
-        if now_ns - self._plot_ns < PLOT_NS:
-            self._panel.show(moment)
-            return
-        self._plot_ns = now_ns
-        columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
-        self._panel.show(moment, Curves(dict(zip(NAMES, columns, strict=True))))
+        curves = None
+        if now_ns - self._plot_ns >= PLOT_NS:
+            self._plot_ns = now_ns
+            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
+            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.refresh()
+            self._panel.show(moment, curves)
 
     def close(self, summary: str | None) -> None:
         """Take the page away."""

@@ -21,7 +21,7 @@ from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.replay import shape_of, trail_of
 from canprobe.bridge.view.server import open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import error_scale, true_kappa
+from canprobe.bridge.view.trail import error_scale
 
 FRAME_S = 0.04
 MOST_FRAMES = 900
@@ -55,11 +55,12 @@ def _record(run: RecordedRun, times: Any) -> str:
         path = LoadedPath(server.scene, trail_of(run), error_scale(shape_of(run)))
         recorder = server.get_scene_serializer()
         before = float(times[0])
-        for t in times.tolist():
-            recorder.insert_sleep(t - before)
-            before = t
-            stage.show(run.at(t))
-            path.until(t)
+        with server.atomic():  # nobody listens: nothing is sent
+            for t in times.tolist():
+                recorder.insert_sleep(t - before)
+                before = t
+                stage.show(run.at(t))
+                path.until(t)
         return str(recorder.as_html())
 
 
@@ -79,7 +80,7 @@ def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
         "target": task.force_n if task.kind in ("scan", "press") else None,
-        "kappa_true": true_kappa(shape),
+        "truth": shape is not None,
         "shape": run.scene.shape is not None,
         "sensor": run.scene.sensor is not None,
         "taxels": base64.b64encode(taxels).decode("ascii"),

@@ -8,7 +8,7 @@ import numpy as np
 
 from canprobe.bridge.view.trail import ErrorScale, Trail
 
-THICKNESS_M = 1.2e-3
+THICKNESS_M = 1.5e-3
 STRETCH = 150
 """Segments of one node of a live path."""
 

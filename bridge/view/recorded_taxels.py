@@ -35,8 +35,10 @@ def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
     if mode is TactileMode.FEATURES or not file.is_file():
         return ()
     plan = make_plan(scene)
-    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(scene.sensor.node_id, "tpdo")]
-    assembler = FrameAssembler(cob_ids, mode, TACTILE_DEADLINE_CYCLES * plan.sync.period_ns)
+    pdos = plan.pdos_of(scene.sensor.node_id, "tpdo")
+    cob_ids = [pdo.cob_id for pdo in pdos]
+    sizes = [pdo.layout.length for pdo in pdos]
+    assembler = FrameAssembler(cob_ids, mode, TACTILE_DEADLINE_CYCLES * plan.sync.period_ns, sizes)
     start: int | None = None
     frames = []
     for t_ns, _, can_id, data in read_candump(file, only={SYNC_ID, *cob_ids}):

@@ -6,14 +6,17 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from canprobe.bridge.view.curves import curves_of
 from canprobe.bridge.view.panel import Panel
 from canprobe.bridge.view.path_nodes import LoadedPath
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
+from canprobe.bridge.view.trail import Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
+from canprobe.cell.tasks.touch import Phase
 from canprobe.scene_geometry import true_object
 from canprobe.touch.objects import PlacedShape
 
@@ -50,9 +53,9 @@ class Player:
     """
 
     def __init__(self, server: Any, run: RecordedRun) -> None:
+        self._server = server
         self._run = run
-        shape = shape_of(run)
-        errors = error_scale(shape)
+        errors = error_scale(shape_of(run))
         self._stage = Stage(server, run.scene)
         self._path = LoadedPath(server.scene, trail_of(run), errors)
         gui = server.gui
@@ -61,7 +64,7 @@ class Player:
             self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
             self._play = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
-        self._panel = Panel(server, run.scene, errors, true_kappa(shape))
+        self._panel = Panel(server, run.scene, errors)
         self._curves = curves_of(run.at(t) for t in run.times(max(FRAME_S, run.duration_s / MOST_POINTS)))
         self._panel.show(run.at(start), self._curves)
         self._shown = math.nan
@@ -77,9 +80,10 @@ class Player:
             return
         self._shown = t
         moment = self._run.at(t)
-        self._stage.show(moment)
-        self._path.until(t)
-        self._panel.show(moment)
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.until(t)
+            self._panel.show(moment)
 
 
 def shape_of(run: RecordedRun) -> PlacedShape | None:
@@ -89,11 +93,15 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
 
 def trail_of(run: RecordedRun) -> Trail:
     """The path of a run's contact, coloured by the error of its estimates; by their deviation without a true object."""
-    trail = Trail()
-    with_truth = run.scene.object is not None
-    for t in run.times(2e-3 + 5e-4):
-        moment = run.at(t)
-        if moment.contact is not None and moment.phase != "approach":
-            value = moment.error if with_truth else moment.sigma
-            trail.add(moment.t_s, moment.contact.point, moment.contact.normal, value)
+    trail, log = Trail(), run.log
+    if "contact_mm" not in log:
+        return trail
+    touched = np.isfinite(log["contact_mm"]).all(axis=1) & (log["phase"] != Phase.APPROACH)
+    rows = np.nonzero(touched)[0]
+    answers = np.searchsorted(run.answers, rows, side="right") - 1
+    known = run.sigmas if run.scene.object is None else run.errors
+    values = np.append(known, math.nan)[answers].tolist()  # the last for −1: before the first answer
+    times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
+    for t_s, point, normal, value in zip(times, points, log["normal"][rows], values, strict=True):
+        trail.add(t_s, point, normal, value)
     return trail

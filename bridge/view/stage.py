@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,12 @@ from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene
 from canprobe.scene_geometry import T_flange_probe, true_object
 
-OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (52, 60, 72), (255, 170, 60), (250, 196, 60), (214, 56, 44)
+OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (78, 88, 104), (255, 150, 40), (250, 190, 40), (214, 40, 30)
 FORCE_M_PER_N = 0.02
 """Length of the force arrow."""
 LEAST_FORCE_N = 0.05
+ALONE = (0.0, 0.0, 0.12)
+"""Where the probe stands, pole up, in a scene without an arm, m."""
 
 
 class Stage:
@@ -83,16 +86,18 @@ class Stage:
         )  # fmt: skip
 
     def _add_probe(self, radius: float, *, taxels: bool) -> None:
-        self._probe = self._api.add_frame("/probe", show_axes=False)
+        self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
         holder, elastic = probe_parts(radius, self._tool)
         self._add("/probe/holder", holder, PROBE)
-        self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.25, side="double", cast_shadow=False)
+        self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.14, side="double", cast_shadow=False)
         if taxels:
             places, turns = taxel_poses(radius)
             vertices, faces = tile()
+            blank = np.zeros(len(places), np.uint8)
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=taxel_colours(np.zeros(256, np.uint8)), batched_opacities=_opacities(np.zeros(256, np.uint8)), side="double", cast_shadow=False, lod="off",
+                batched_colors=taxel_colours(blank), batched_opacities=_opacities(blank), side="double",
+                cast_shadow=False, lod="off",
             )  # fmt: skip
         else:
             self._taxels = None
@@ -117,20 +122,17 @@ class Stage:
         ]
 
     def _look(self, server: Any, scene: Scene) -> None:
-        target = self.middle(scene)
-        server.initial_camera.look_at = target
-        server.initial_camera.position = target + np.array((-0.44, 0.20, 0.13))
-        server.initial_camera.up = (0.0, 0.0, 1.0)
-        server.initial_camera.fov = np.radians(42.0)
-
-    def middle(self, scene: Scene) -> Array:
-        """(3,) what the camera looks at, m: the object, or where the task touches, or the arm."""
-        if self._shape is not None:
-            point: Array = self._shape.T_base_object[:3, 3] + np.array((0.02, 0.02, 0.03))
-            return point
-        if scene.task.kind in ("scan", "press"):
-            return np.array(scene.task.start_mm) * 1e-3
-        return np.array((0.0, 0.0, 0.3))
+        """From the side on which the arm hides nothing; close where something is touched."""
+        camera = server.initial_camera
+        if self._shape is not None or scene.task.kind in ("scan", "press"):
+            place = np.array(scene.task.start_mm) * 1e-3 if self._shape is None else self._shape.T_base_object[:3, 3]
+            target, away = place + np.array((0.0, 0.015, 0.035)), np.array((-0.35, 0.20, 0.18))
+        elif self._model is not None:
+            target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
+        else:
+            target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
+        camera.look_at, camera.position, camera.up = target, target + away, (0.0, 0.0, 1.0)
+        camera.fov = math.radians(38.0)
 
     # showing
 
@@ -148,7 +150,7 @@ class Stage:
     def _move_arm(self, q: Array) -> None:
         assert self._model is not None
         frames = link_frames(self._model, q)
-        for handle, T in zip(self._links, frames, strict=True):
+        for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
             _place(self._probe, frames[6] @ self._tool)
@@ -181,7 +183,7 @@ class Stage:
 
 def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Taxels that feel nothing are hardly there."""
-    return np.where(counts > 0, 0.9, 0.12).astype(np.float32)
+    return np.where(counts > 0, 0.85, 0.04).astype(np.float32)
 
 
 def _place(handle: Any, T: Array) -> None:

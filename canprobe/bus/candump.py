@@ -47,30 +47,17 @@ class CandumpWriter:
     """
 
     def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
-        self._channel = channel
         self._t0_ns = t0_ns
         self.failure: str | None = None
         self._path = path
         self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
         self._size = 0
         self._lines: list[str] = []
-        self._t_ns: int | None = None
-        self._prefix = ""
-        self._names: dict[int, str] = {}
+        self.write = self.on(channel)
 
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Add one frame that was on the bus at `t_ns`; the same line as `format_line`, for a fifth of its time."""
-        if t_ns != self._t_ns:
-            self._t_ns = t_ns
-            self._prefix = _format_prefix(self._channel, t_ns - self._t0_ns)
-        name = self._names.get(can_id)
-        if name is None:
-            name = self._names[can_id] = _format_id(can_id) + "#"
-        lines = self._lines
-        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
-        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
-        if len(lines) >= _LINES:
-            self.flush()
+    def on(self, channel: str) -> Callable[[int, bytes, int], None]:
+        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file."""
+        return _ChannelWriter(self._lines, self.flush, channel, self._t0_ns).write
 
     def flush(self) -> None:
         """Hand what was written to the file."""
@@ -99,6 +86,32 @@ class CandumpWriter:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
         self.close()
+
+
+class _ChannelWriter:
+    """Lines of one channel."""
+
+    __slots__ = ("_channel", "_flush", "_lines", "_names", "_prefix", "_t0_ns", "_t_ns")
+
+    def __init__(self, lines: list[str], flush: Callable[[], None], channel: str, t0_ns: int) -> None:
+        self._lines, self._flush, self._channel, self._t0_ns = lines, flush, channel, t0_ns
+        self._t_ns: int | None = None
+        self._prefix = ""
+        self._names: dict[int, str] = {}
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Add one frame that was on the bus at `t_ns`; the same line as `format_line`, for a fifth of its time."""
+        if t_ns != self._t_ns:
+            self._t_ns = t_ns
+            self._prefix = _format_prefix(self._channel, t_ns - self._t0_ns)
+        name = self._names.get(can_id)
+        if name is None:
+            name = self._names[can_id] = _format_id(can_id) + "#"
+        lines = self._lines
+        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
+        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
+        if len(lines) >= _LINES:
+            self._flush()
 
 
 def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:

@@ -37,6 +37,7 @@ def make_cell(
     times: BringUpTimes | None = None,
     log_failure: Callable[[], str | None] = lambda: None,
     observers: Observers | None = None,
+    rows_kept: int | None = None,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered.
 
@@ -47,6 +48,7 @@ def make_cell(
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
     """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
@@ -67,6 +69,7 @@ def make_cell(
         times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
         observers=observers,
+        rows_kept=rows_kept,
     )
 
 

@@ -10,7 +10,7 @@ from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.log import RunLog
+from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
@@ -44,6 +44,7 @@ class Cell:
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
 
     Attributes:
         log: one row a cycle.
@@ -65,8 +66,10 @@ class Cell:
         times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
+        rows_kept: int | None = None,
     ) -> None:
-        self.log = RunLog()
+        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
         self.faults: list[str] = []
@@ -117,6 +120,7 @@ class Cell:
                 tactile=self.tactile,
                 watch=self.watch,
                 other=self._network.feed,
+                kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
             self.supervisor.seen.first_alarm = len(self.watch.alarms)

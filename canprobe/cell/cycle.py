@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass, field
 
 from canprobe.bus.clock import elapsed_ns
@@ -28,7 +29,7 @@ class CycleSettings:
         sync_overflow: of the SYNC counter (1019h).
         heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
-        looks_ns: times after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
+        looks_ns: times after SYNC went out at which TPDOs are looked for, until all are in; then they are late.
             Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender,
             so that many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway.
     """
@@ -45,8 +46,15 @@ class CycleStatistics:
     """What the cycle counted and timed: an entry a cycle, and a computing time every ``TIMED_CYCLES``."""
 
     overruns: int = 0
-    period_error_ns: list[int] = field(default_factory=list)
-    compute_ns: list[int] = field(default_factory=list)
+    period_error_ns: MutableSequence[int] = field(default_factory=list)
+    compute_ns: MutableSequence[int] = field(default_factory=list)
+
+    @classmethod
+    def of_last(cls, cycles: int | None) -> CycleStatistics:
+        """With the times of the last cycles only; None for all."""
+        if cycles is None:
+            return cls()
+        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles))
 
 
 class Cycle:
@@ -59,6 +67,7 @@ class Cycle:
         tactile: the sensor's receiver; None in a scene without a sensor.
         watch: sees heartbeats and EMCYs.
         other: takes what nobody here expects (SDO answers).
+        kept: cycles whose times are kept; None for all.
     """
 
     def __init__(
@@ -70,9 +79,10 @@ class Cycle:
         tactile: TactileReceiver | None,
         watch: NodeWatch,
         other: Callable[[list[TimedFrame]], None],
+        kept: int | None = None,
     ) -> None:
         self.number = -1
-        self.statistics = CycleStatistics()
+        self.statistics = CycleStatistics.of_last(kept)
         self.t_first_ns = port.clock.now_ns() + settings.period_ns
         self.t_ns = 0
         self.sync_ns = 0
@@ -114,7 +124,7 @@ class Cycle:
     def _collect(self) -> None:
         port, clock, intake = self._port, self._port.clock, self._intake
         for look_ns in self._s.looks_ns:
-            clock.sleep_until_ns(self._deadline + look_ns)
+            clock.sleep_until_ns(self.sync_ns + look_ns)
             self._route(port.drain())
             if intake.complete:
                 break

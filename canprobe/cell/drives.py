@@ -79,6 +79,10 @@ class DriveGroup:
         axes: the drives, joint 1 first.
         model: the arm, for counts ↔ joint angles.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
+
+    Attributes:
+        late, missed, malformed: TPDOs that were not used, or not there.
+        answer_ns: from the SYNC to the last TPDO that was used.
     """
 
     def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
@@ -89,6 +93,7 @@ class DriveGroup:
         self.late = 0
         self.missed = 0
         self.malformed = 0
+        self.answer_ns = 0
         self.implausible = 0
         self._model = model
         self._axis_of = {axis.feedback.cob_id: i for i, axis in enumerate(axes)}
@@ -144,6 +149,7 @@ class DriveGroup:
         self.statuswords[i] = word
         self._heard[i] = self._cycle
         self._pending -= 1
+        self.answer_ns = t_ns - self._sync_ns
         if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=enabled):
             self.implausible += 1
 

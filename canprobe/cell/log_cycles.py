@@ -76,7 +76,8 @@ class LogCycles:
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
         looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
-        self._looks = _looks(recording, deadlines, looks)
+        on_time = stamps - deadlines <= (plan.traffic.budget.sync_ns or 0)  # it may have waited for the bus
+        self._looks = _looks(recording, np.where(on_time, deadlines, stamps), looks)
         axes = self.drives.axes if self.drives is not None else ()
         self._commands = {frame.cob_id: frame for frame in command_frames(axes)}
         self._targets: list[int | None] = [None] * len(axes)
@@ -151,8 +152,8 @@ class LogCycles:
         return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
 
 
-def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:
-    """Where each look of each cycle ends among the frames; a late SYNC's looks come at once."""
+def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:
+    """Where each look of each cycle ends among the frames; the delays count from when its SYNC was sent."""
     stamps, syncs = recording.sync_stamps, recording.syncs
     following = np.append(syncs[1:], len(recording.frames))
     ends = []
@@ -160,7 +161,7 @@ def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: Sequen
         if math.isinf(delay):
             ends.append(following)
         else:
-            instants = np.maximum(deadlines + int(delay), stamps)
+            instants = np.maximum(sent_ns + int(delay), stamps)
             ends.append(np.searchsorted(recording.times, instants, side="right"))
     clipped = np.clip(np.stack(ends, axis=1), syncs[:, None] + 1, following[:, None])
     return [[int(end) for end in row] for row in clipped]

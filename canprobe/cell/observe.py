@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
@@ -13,6 +14,10 @@ from canprobe.cell.measurement import Command, Measurement
 
 MOST_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
+
+
+COSTS_KEPT = 100_000
+"""Costs that are kept: a cell may be left up for days."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +59,7 @@ class Observers:
 
     def __init__(self, observers: Iterable[Observer | Callable[[Observation], None]]) -> None:
         self.origin_ns = 0
-        self.cost_ns: list[int] = []
+        self.cost_ns: deque[int] = deque(maxlen=COSTS_KEPT)
         self.faults: list[str] = []
         self._calls = [one.observe if hasattr(one, "observe") else one for one in observers]
         self._frames: list[TimedFrame] = []

@@ -54,6 +54,7 @@ def run(args: argparse.Namespace) -> int:
                 scene,
                 interface=target.interface,
                 channel=target.channel,
+                sensor_channel=target.sensor_channel,
                 bitrate=target.bitrate,
                 out=folder,
                 seed=args.seed,

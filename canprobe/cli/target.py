@@ -20,31 +20,32 @@ _LOCKSTEP = "lockstep"
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """An interface, its channel and bit rate."""
+    """An interface, its channel and bit rate; and the sensor's channel where the scene gives it one of its own."""
 
     interface: str
     channel: str
     bitrate: int
+    sensor_channel: str | None = None
 
 
 def target_of(args: argparse.Namespace, scene: Scene) -> Target:
-    """The scene's bus with the command line's changes.
+    """The scene's buses with the command line's changes.
 
     Where neither names a bus and the scene has real nodes, which no lockstep bus has, python-can's configuration does.
 
     Raises:
         UsageError: when `--channel NAME=CH` names no channel of the scene, or nothing is configured.
     """
-    channel = _channel(args.channel or [], scene.bus.channel)
+    sensors = scene.sensor.channel if scene.sensor is not None and scene.sensor.channel != "auto" else None
+    channels = _channels(args.channel or [], scene.bus.channel, sensors)
     open_to_configuration = args.bus is None and scene.bus.interface == _LOCKSTEP and _has_real_nodes(scene)
-    found = _configured(CONFIG if args.bus == CONFIG else None) if args.bus == CONFIG or open_to_configuration else None
+    found = _configured(args.bus) if args.bus == CONFIG or open_to_configuration else None
+    sensor_channel = None if sensors is None else channels.get(sensors, sensors)
     if found is None:
-        return Target(args.bus or scene.bus.interface, channel or scene.bus.channel, args.bitrate or scene.bus.bitrate)
-    return Target(
-        found.interface,
-        channel or found.channel or scene.bus.channel,
-        args.bitrate or found.bitrate or scene.bus.bitrate,
-    )
+        channel = channels.get(scene.bus.channel, scene.bus.channel)
+        return Target(args.bus or scene.bus.interface, channel, args.bitrate or scene.bus.bitrate, sensor_channel)
+    channel = channels.get(scene.bus.channel) or found.channel or scene.bus.channel
+    return Target(found.interface, channel, args.bitrate or found.bitrate or scene.bus.bitrate, sensor_channel)
 
 
 def add_realtime(parser: argparse.ArgumentParser) -> None:
@@ -92,11 +93,16 @@ def _has_real_nodes(scene: Scene) -> bool:
     return any(part is not None and not part.emulated for part in (scene.arm, scene.sensor))
 
 
-def _channel(given: list[tuple[str | None, str]], of_scene: str) -> str | None:
-    for name, _ in given:
-        if name is not None and name != of_scene:
-            hint = did_you_mean(name, [of_scene])
-            raise UsageError(f"--channel {name}=…: the scene has no channel {name}, only {of_scene}{hint}")
-    if len(given) > 1:
-        raise UsageError(f"--channel given {len(given)} times, but the scene has one channel, {of_scene}")
-    return given[0][1] if given else None
+def _channels(given: list[tuple[str | None, str]], main: str, sensors: str | None) -> dict[str, str]:
+    """What stands for which of the scene's channels; a channel without a name stands for the main one."""
+    names = [main] if sensors in (None, main) else [main, str(sensors)]
+    found: dict[str, str] = {}
+    for name, target in given:
+        if name is not None and name not in names:
+            hint = did_you_mean(name, names)
+            raise UsageError(f"--channel {name}=…: the scene has no channel {name}, only {', '.join(names)}{hint}")
+        if (name or main) in found:
+            have = "one channel, " + main if len(names) == 1 else f"the channels {' and '.join(names)}"
+            raise UsageError(f"--channel given {len(given)} times, but the scene has {have}")
+        found[name or main] = target
+    return found

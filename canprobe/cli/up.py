@@ -40,6 +40,7 @@ def run(args: argparse.Namespace) -> int:
             scene,
             interface=target.interface,
             channel=target.channel,
+            sensor_channel=target.sensor_channel,
             bitrate=target.bitrate,
             say=say,
             bridge=args.bridge or (),

@@ -14,6 +14,7 @@ from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.drive_faults import DriveFaults
 from canprobe.emulator.drive_feedback import DriveFeedback
+from canprobe.emulator.drive_loop import DriveLoop
 from canprobe.emulator.drive_mode import DriveParts
 from canprobe.emulator.drive_mode_selection import ModeSelection
 from canprobe.emulator.drive_motion import STEP_NS, AxisPlant, Motion
@@ -57,6 +58,8 @@ class DriveApplication(Application):
         self._faults = DriveFaults(node, lambda t_ns: self._states.event(Event.FAULT_DETECTED, t_ns))
         self._states = DriveStates(self._entered_state, lambda: self._parameters.quick_stop in STAYS_STOPPED)
         self._supervision = Supervision(node, self._parameters, self._abort_connection)
+        self._loop = DriveLoop(self._axis, self._plant, self._parameters, self._values)
+        dictionary.on_write(0x6072, lambda _sub, _value: self._loop.limit())
         self._modes = ModeSelection(self._parts(), lambda: self._states.state is _ENABLED)
         self._pass_on = timers.new(self._states.pass_on)
         node.store.volatile |= _VOLATILE
@@ -73,6 +76,7 @@ class DriveApplication(Application):
             motion=self._motion,
             feedback=self._feedback,
             supervision=self._supervision,
+            loop=self._loop,
             show=self._show,
             fault=self._faults.find,
         )
@@ -93,6 +97,7 @@ class DriveApplication(Application):
         self._faults.reset()
         self._standstill = False
         self._parameters.read()
+        self._loop.release()
         self._feedback.reset(t_ns)
         self._motion.hold(t_ns)
         self._modes.reset()

@@ -16,6 +16,7 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.planning.timeline import Slot, timeline
 
 SCHEMA = 1
 
@@ -44,6 +45,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
         "bus_load": {one.channel: _bus(one) for one in plan.buses},
         "choices": [{"key": choice.key, "value": choice.value, "why": choice.why} for choice in plan.choices],
+        "timeline": [_slot(slot) for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
         "estimator": plan.estimator,
         "offline_estimators": list(plan.offline_estimators),
@@ -89,7 +91,19 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
         "bits_worst": pdo.bits_worst,
         "deadline_us": _us(pdo.deadline_ns),
         "response_us": _us(pdo.response_ns),
+        "slack_us": _us(pdo.slack_ns),
         "event_timer_ms": pdo.event_timer_ms or None,
+    }
+
+
+def _slot(slot: Slot) -> dict[str, Any]:
+    return {
+        "part": slot.part,
+        "channel": slot.channel or None,
+        "cob_id": slot.cob_id,
+        "cycle": slot.cycle,
+        "start_us": _us(slot.start_ns),
+        "end_us": _us(slot.end_ns),
     }
 
 

@@ -74,7 +74,8 @@ def _no_truth(scene: Scene) -> str | None:
 
 
 def _no_dynamics(scene: Scene) -> str | None:
-    emulated_arm = scene.arm is not None and scene.arm.emulated
+    ideal = scene.plant is not None and scene.plant.fidelity == "ideal"
+    emulated_arm = scene.arm is not None and scene.arm.emulated and ideal
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 
@@ -123,6 +124,8 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
     ("taxel hysteresis", _switch("hysteresis")),
     ("taxel creep", _switch("creep")),
     ("taxel crosstalk", _switch("crosstalk")),
+    ("taxel saturation", _switch("saturation")),
+    ("the array's own threshold", _switch("threshold")),
     ("figure", _no_figure),
     ("replay to share (report.html)", _no_page),
     ("bridges to other tools", _no_bridge),

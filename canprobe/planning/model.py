@@ -89,6 +89,11 @@ class PlannedPdo:
         return self.layout.cob_id
 
     @property
+    def slack_ns(self) -> int | None:
+        """What its deadline leaves after the worst case; None where that has no bound."""
+        return None if self.response_ns is None else self.deadline_ns - self.response_ns
+
+    @property
     def entries(self) -> tuple[PdoEntry, ...]:
         """Mapped objects, dummies included."""
         return self.layout.entries

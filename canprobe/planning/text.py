@@ -14,7 +14,11 @@ from canprobe.planning.model import (
     PlannedPdo,
     Traffic,
 )
+from canprobe.planning.timeline import timeline_rows
 from canprobe.protocol.pdo import PdoEntry
+
+TIMELINE_WIDTH = 100
+"""Characters of a cycle."""
 
 
 def plan_text(plan: Plan) -> str:
@@ -37,6 +41,7 @@ def _lines(plan: Plan) -> Iterator[str]:
     for one in plan.buses:
         yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
     yield from _titled(f"one cycle of {_us(sync.period_ns)} µs, worst case", list(_budget_rows(plan.traffic.budget)))
+    yield from _titled(_timeline_title(plan), timeline_rows(plan, TIMELINE_WIDTH))
     if plan.choices:
         rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
         yield from _titled("chosen by the plan", rows)
@@ -49,6 +54,13 @@ def _lines(plan: Plan) -> Iterator[str]:
     yield from _titled("leaves out", [list(row) for row in plan.left_out])
     if plan.not_available:
         yield from _titled("could not have", [list(row) for row in plan.not_available])
+
+
+def _timeline_title(plan: Plan) -> str:
+    return (
+        f"as it goes, worst-case lengths, one character {_us(plan.sync.period_ns // TIMELINE_WIDTH)} µs "
+        "(S SYNC, f feedback, C controller, r commands, t tactile)"
+    )
 
 
 def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
@@ -71,7 +83,7 @@ def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
 
 
 def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
-    rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline µs", "content"]]
+    rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline", "slack µs", "content"]]
     for pdo in pdos:
         rows.append(
             [
@@ -84,6 +96,7 @@ def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
                 str(pdo.bits_worst),
                 _us(pdo.response_ns),
                 _us(pdo.deadline_ns),
+                _us(pdo.slack_ns),
                 _content(pdo.entries),
             ]
         )

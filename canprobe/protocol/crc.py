@@ -1,4 +1,4 @@
-"""The three CRCs of CAN, bit by bit over integers, and byte by byte where speed counts.
+"""The three CRCs of CAN: bit by bit over integers, and tables for whole bytes where speed counts.
 
 Source: ISO 11898-1:2015, CRC sequence: generators of CRC-15 (classical), CRC-17 (FD, up to 16 bytes) and CRC-21 (FD,
 more than 16 bytes). The FD registers start with their highest bit set; before 2015 (Bosch CAN FD 1.0) they began at 0.
@@ -37,9 +37,14 @@ class Crc:
                 register ^= self.polynomial
         return register
 
-    def byte_table(self) -> tuple[int, ...]:
-        """What eight bits do to the register: next = (register << 8 ^ table[register >> (width − 8) ^ byte]) & mask."""
-        return tuple(self.add(0, byte, 8) for byte in range(256))
+    def byte_tables(self, places: int) -> tuple[tuple[int, ...], ...]:
+        """What each byte does to the register, when `places` − 1, …, 1, 0 bytes follow it: the CRC is linear."""
+        mask, shift = (1 << self.width) - 1, self.width - 8
+        last = tuple(self.add(0, byte, 8) for byte in range(256))
+        found = [last]
+        for _ in range(places - 1):
+            found.append(tuple((register << 8 & mask) ^ last[register >> shift] for register in found[-1]))
+        return tuple(reversed(found))
 
 
 CRC15 = Crc(15, 0x4599)

@@ -12,12 +12,12 @@ RTSS 2014, whose formula lacks the stuff count that ISO added in 2015 (4 bits an
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.crc import CRC15
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.protocol.stuffing import START_OF_FRAME, STUFF_BY_BYTE, STUFF_BY_SEVEN, feed, most_stuff_bits
+from canprobe.protocol.stuffing import START_OF_FRAME, Table, feed, most_stuff_bits, tables
 
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8
@@ -30,8 +30,6 @@ FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
 
 _TAIL = 1 + 1 + 1 + 7 + INTERMISSION_BITS  # CRC delimiter, ACK slot, ACK delimiter, end of frame
 _FD_TAIL = _TAIL - 1  # its CRC delimiter belongs to the data phase
-_CRC15_MASK = 0x7FFF
-_CRC15_BYTES = CRC15.byte_table()
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,18 +104,23 @@ def exact_bits(can_id: int, data: bytes, *, dlc: int | None = None) -> int:
     code = len(data) if dlc is None else dlc
     if not 0 <= code <= 15 or len(data) != (0 if can_id & RTR_FLAG else min(code, 8)):
         raise ProtocolError(f"{can_id:X}: no classical frame has {len(data)} data bytes and the length code {code}")
-    bits, register, stuffing = _header(can_id, code)
-    for byte in data:
-        register = (register << 8 ^ _CRC15_BYTES[register >> 7 ^ byte]) & _CRC15_MASK
-        stuffing = (stuffing & ~15) + STUFF_BY_BYTE[(stuffing & 15) << 8 | byte]
-    stuffing = (stuffing & ~15) + STUFF_BY_BYTE[(stuffing & 15) << 8 | register >> 7]
-    stuffing = (stuffing & ~15) + STUFF_BY_SEVEN[(stuffing & 15) << 7 | register & 127]
-    return bits + 8 * len(data) + (stuffing >> 4)
+    bits, register, table, effects = _header(can_id, code)
+    for byte, effect in zip(data, effects, strict=True):
+        register ^= effect[byte]
+        table, stuffed = table[byte]
+        bits += stuffed
+    table, stuffed = table[register >> 7]
+    return bits + stuffed + table[256][register & 127]  # type: ignore[no-any-return]
 
 
 @lru_cache(maxsize=4096)
-def _header(can_id: int, code: int) -> tuple[int, int, int]:
-    """Bits of a frame besides data and stuff bits; CRC register and stuffing at the end of its control field."""
+def _header(can_id: int, code: int) -> tuple[int, int, Table, tuple[tuple[int, ...], ...]]:
+    """What a frame's header settles.
+
+    Returns:
+        Its bits without those that data and CRC stuff, its CRC with data of 0, its stuffing, and what each data byte
+        does to the CRC.
+    """
     remote = 1 if can_id & RTR_FLAG else 0
     identifier = can_id & ~(EFF_FLAG | RTR_FLAG)
     if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
@@ -127,7 +130,16 @@ def _header(can_id: int, code: int) -> tuple[int, int, int]:
         value, n_bits = identifier << 7 | remote << 6 | code, 19
     else:
         raise ProtocolError(f"{can_id:X} is no CAN identifier; one of 29 bits carries the flag {EFF_FLAG:X}")
-    return n_bits + 15 + _TAIL, CRC15.of(value, n_bits), feed(START_OF_FRAME, value, n_bits - 1)
+    n_bytes = 0 if remote else min(code, 8)
+    n_data = 8 * n_bytes
+    stuffing = feed(START_OF_FRAME, value, n_bits - 1)
+    bits = n_bits + (stuffing >> 4) + n_data + 15 + _TAIL
+    return bits, CRC15.of(value << n_data, n_bits + n_data), tables()[stuffing & 15], _crc15_bytes()[8 - n_bytes :]
+
+
+@cache
+def _crc15_bytes() -> tuple[tuple[int, ...], ...]:
+    return CRC15.byte_tables(8)
 
 
 def fd_dlc(n_data: int) -> int:
@@ -162,9 +174,11 @@ def exact_fd_bits(can_id: int, data: bytes, *, brs: bool = True, esi: bool = Fal
     # the last bit before the CRC field is left out: the field begins with a stuff bit, whatever came before
     rest = ((esi << 4 | fd_dlc(len(data))) << 8 * len(data) | int.from_bytes(data, "big")) >> 1
     stuffing = feed(stuffing, rest >> 8 * len(data), 4)
+    count, table = (stuffing >> 4) - before, tables()[stuffing & 15]
     for byte in (rest & (1 << 8 * len(data)) - 1).to_bytes(len(data), "big"):
-        stuffing = (stuffing & ~15) + STUFF_BY_BYTE[(stuffing & 15) << 8 | byte]
-    nominal, fast = n_bits + before + _FD_TAIL, _fd_data_phase(len(data)) + (stuffing >> 4) - before
+        table, stuffed = table[byte]
+        count += stuffed
+    nominal, fast = n_bits + before + _FD_TAIL, _fd_data_phase(len(data)) + count
     return FrameLength(nominal, fast) if brs else FrameLength(nominal + fast)
 
 

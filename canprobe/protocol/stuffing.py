@@ -5,6 +5,9 @@ A stuffing is one integer: stuff bits so far × 16 + state, the state being the 
 
 from __future__ import annotations
 
+from functools import cache
+from typing import Any
+
 RUN = 5
 
 
@@ -32,15 +35,20 @@ def feed(stuffing: int, value: int, n_bits: int) -> int:
     return count << 4 | state
 
 
-def _table(n_bits: int) -> tuple[int, ...]:
-    return tuple(feed(state, value, n_bits) for state in range(10) for value in range(1 << n_bits))
+Table = list[Any]
+"""What a byte does in one state: at its value (the next state's table, stuff bits); at 256 the stuff bits of 7 bits."""
 
 
-STUFF_BY_BYTE = _table(8)
-"""What a byte adds: next = (stuffing & ~15) + STUFF_BY_BYTE[(stuffing & 15) << 8 | byte]."""
-
-STUFF_BY_SEVEN = _table(7)
-"""The same for seven bits."""
+@cache
+def tables() -> list[Table]:
+    """By state; made when the first frame is measured."""
+    found: list[Table] = [[None] * 257 for _ in range(10)]
+    for state, table in enumerate(found):
+        for value in range(256):
+            after = feed(state, value, 8)
+            table[value] = (found[after & 15], after >> 4)
+        table[256] = tuple(feed(state, value, 7) >> 4 for value in range(128))
+    return found
 
 
 def most_stuff_bits(pattern: str) -> int:

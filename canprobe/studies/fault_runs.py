@@ -328,14 +328,15 @@ class _Run:
     def _score_log(self) -> None:
         """Every frame that was on the bus until the end is in the log, and every cycle has its row."""
         session = self.session
-        assert session.out is not None and session.traffic is not None
+        assert session.out is not None
         try:
             lines = sum(1 for _ in read_candump(session.out / "bus.log"))
         except CanprobeError as error:
             self.failures.append(f"log: {error}")
             return
-        if lines != session.traffic.frames:
-            self.failures.append(f"log: {lines} lines of {session.traffic.frames} frames")
+        frames = sum(counter.frames for counter in session.traffic.values())
+        if lines != frames:
+            self.failures.append(f"log: {lines} lines of {frames} frames")
         if session.opened and (rows := len(session.cell.log)) < self.steps:
             self.failures.append(f"log: {rows} rows of {self.steps} cycles")
 

@@ -92,11 +92,11 @@ class Hold:
 
 
 @contextmanager
-def served(channel: str) -> Iterator[None]:
+def served(channel: str, child: EmulatorChild | None = None) -> Iterator[None]:
     """The nodes of `cylinder` in their process; they take rates and mappings from the master, not from their scene."""
-    bus = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel)
-    child = EmulatorChild(bus, None)
-    port = open_port("socketcan", channel, bus.bus.bitrate, MonotonicClock())
+    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel)
+    child = child or EmulatorChild(scene, None, channel)
+    port = open_port("socketcan", channel, scene.bus.bitrate, MonotonicClock())
     try:
         child.start()
         child.await_boot_ups(port)

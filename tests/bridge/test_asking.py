@@ -29,7 +29,7 @@ def test_every_bridge_is_a_module_of_its_own_with_an_extra(name, request):
     info = BRIDGES[name]
     pyproject = (request.config.rootpath / "pyproject.toml").read_text()
     assert f"\n{info.extra} = [" in pyproject
-    assert (request.config.rootpath / "bridge" / f"{info.module}.py").is_file()
+    assert request.config.rootpath.joinpath("bridge", *info.module.split(".")).with_suffix(".py").is_file()
 
 
 def test_a_scene_that_asks_for_none_names_that_in_its_plan():

@@ -13,6 +13,9 @@ from rosbags.highlevel import AnyReader
 
 import canprobe
 import canprobe.errors
+from canprobe.bridge.cdr import Encoder
+from canprobe.bridge.messages import Messages
+from canprobe.bridge.sample import CanFrame, Sample
 from canprobe.bus.candump import read_candump
 from canprobe.eds import eds_path
 from canprobe.recorded_bridges import replay_into
@@ -162,6 +165,17 @@ def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     )
     assert len(live) > 10_000
     assert again == live
+
+
+def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
+    """64 bytes do not fit can_msgs: they go where ros2_socketcan puts them, whole."""
+    encoder = Encoder()
+    data = bytes(range(64))
+    sample = Sample(7, frames=(CanFrame(5, 0x181, data), CanFrame(6, 0x182, data[:8])))
+    messages = list(Messages(recorded.result.plan, encoder).of(sample))
+    assert [topic.name for topic, _, _ in messages][:2] == ["/can_fd_frames", "/can_frames"]
+    frame = encoder.decode("ros2_socketcan_msgs/msg/FdFrame", messages[0][2])
+    assert (frame.id, frame.len, bytes(frame.data)) == (0x181, 64, data)
 
 
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 
 import pytest
+from mcap.reader import make_reader
 
 import canprobe
 from canprobe.bridge import process as process_module
@@ -102,3 +106,23 @@ def test_samples_count_what_was_dropped_before_them(plan):
 
     sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))
     assert sample.dropped == 17
+
+
+def test_an_interrupt_ends_run_and_bridge_with_a_whole_file(tmp_path):
+    """Ctrl-C at a terminal goes to the whole group; the run ends as always, and the file is closed properly."""
+    command = [sys.executable, "-m", "canprobe", "run", "free", "--duration", "600", "--bridge", "mcap"]
+    run = subprocess.Popen([*command, "--out", tmp_path], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    try:
+        while run.poll() is None:
+            if (tmp_path / "bus.log").exists() and (tmp_path / "bus.log").stat().st_size > 500_000:
+                run.send_signal(signal.SIGINT)
+                break
+        _, error = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 130 and b"interrupted" in error
+    with (tmp_path / "run.mcap").open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_summary().statistics.message_count > 1000
+        summary = json.loads(next(a.data for a in reader.iter_attachments() if a.name == "summary.json"))
+    assert summary["stop_reason"] == "interrupted" and summary["bridges"]["mcap"]["dropped"] == 0

@@ -191,3 +191,25 @@ def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monk
         "pcan", "X", 250_000
     )
     assert target_of(Namespace(bus="slcan", channel=None, bitrate=None), real) == Target("slcan", "can0", 1_000_000)
+
+
+def test_channels_of_a_scene_with_two_buses(bare):
+    from argparse import Namespace
+    from dataclasses import replace
+
+    from canprobe.cli.target import Target, target_of
+    from canprobe.scene_loader import load_scene
+
+    scene = load_scene("press")
+    scene = replace(scene, sensor=replace(scene.sensor, channel="can1"))
+
+    def target(*channels):
+        return target_of(Namespace(bus="socketcan", channel=list(channels), bitrate=None), scene)
+
+    assert target() == Target("socketcan", "can0", 1_000_000, "can1")
+    assert target((None, "vcan0")) == Target("socketcan", "vcan0", 1_000_000, "can1")
+    assert target(("can0", "a"), ("can1", "b")) == Target("socketcan", "a", 1_000_000, "b")
+    with pytest.raises(UsageError, match="no channel can2, only can0, can1; did you mean can1"):
+        target(("can2", "x"))
+    with pytest.raises(UsageError, match="given 2 times, but the scene has the channels can0 and can1"):
+        target(("can0", "x"), (None, "y"))

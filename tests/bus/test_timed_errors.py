@@ -223,3 +223,15 @@ def test_a_babbling_idiot_shuts_everybody_below_it_up():
     assert {can_id for can_id, _, t in seen if 1_100_000 < t < 4_900_000} == {0x000}
     with pytest.raises(ValueError):
         Babbler(shout, 0)
+
+
+def test_a_port_shows_the_state_of_its_controller():
+    bus, _ = make_bus(Scripted(), errors=ErrorsAt(dict.fromkeys(range(32), 3)))
+    port = bus.port()
+    port.send_batch([FRAME])
+    seen = set()
+    for t_ns in range(0, 3_000_000, 10_000):
+        bus.clock.sleep_until_ns(t_ns)
+        seen.add(port.state)
+    assert seen == {ACTIVE, WARNING, PASSIVE, OFF}
+    assert port.state is ACTIVE, "it is back"

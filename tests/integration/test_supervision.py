@@ -567,7 +567,7 @@ def test_a_full_disk(tmp_path):
             super()._run()
 
     def fill(run):
-        log = run.session._log
+        log = run.session._candump
 
         class Full:
             closed = False

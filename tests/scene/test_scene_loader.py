@@ -117,7 +117,7 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
         ("shape", "also = ['recursive']", "shape.also", ("besides the main one",)),
         ("shape", "also = ['ml', 'ml']", "shape.also", ("all different",)),
         ("object", "radius_mm = 3", "object.radius_mm", ("only with kind", 'kind = "plane"')),
-        ("plant", "fidelity = 'dynamic'", "plant.fidelity", ("one of ideal",)),
+        ("plant", "fidelity = 'exact'", "plant.fidelity", ("one of ideal, dynamic",)),
         ("probes", "radius_mm = 3", "probes", ("unknown section", "did you mean probe?")),
     ],
 )
