@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 INK, FAINT = "#1f2933", "#d9dee4"
 COLOURS = {
-    "semi-implicit": "#b45309",
+    "semi-implicit": "#ca8a04",
     "rk4": "#c2410c",
     "implicit": "#64748b",
     "rosenbrock": "#0f6e84",

@@ -54,7 +54,9 @@ def test_the_choice_is_linearly_implicit_accurate_over_the_span_and_stands():
     good = over_the_span("rosenbrock", 9.0, 625.0)
     rows = [*good, *over_the_span("rk4", 2.0, 625.0), *over_the_span("implicit", 3.0, 625.0, stands=False)]
     rows += [row("rosenbrock", 1.0, 0.5, step=1250.0), row("rosenbrock", 1.0, 3.0, step=1250.0, stiffness=1.27e9)]
-    assert workprec.choice(rows) == ("rosenbrock", 625.0)
+    assert workprec.choice(rows) == (("rosenbrock", 625.0), 27.0)
+    assert workprec.choice(rows, workprec.METHODS) == (("rk4", 625.0), 6.0)
+    assert "rk4 at 625 µs costs least, 0.22 × as much" in findings(rows, {})[0]
     assert workprec.choice(rows[3:]) is None
 
 
@@ -86,4 +88,4 @@ def test_findings_say_whether_the_default_is_the_knee():
     assert "the knee, and the default" in said
     assert "2.9 × the cost" in said
     others = [r | {"method": "implicit", "step_us": 78.0} for r in rows]
-    assert "is not it" in "\n".join(findings(others, floor))
+    assert "not the default" in "\n".join(findings(others, floor))
