@@ -48,7 +48,8 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(quiet=args.no_open)
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    ends = () if args.html is not None else (KeyboardInterrupt,)  # how to leave a page, but not to write a file
+    with contextlib.suppress(*ends), termination_interrupts():
         if not folder.is_dir():
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.page import write_page

@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike
 
 SIGMA_ROOT = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
+MOST_SCATTER = 0.1
+"""RMS distance from the line, √N, above which it is none: three times the noise."""
 LEAST_FORCE_N = 0.1
 """Below it threshold and noise of the array bend the line."""
 LEAST_SAMPLES = 6
@@ -28,7 +30,7 @@ class PushFit:
     def __init__(self) -> None:
         self._n = 0
         self._push = self._root = 0.0  # means
-        self._spread = self._joint = 0.0  # sums of products about them
+        self._spread = self._joint = self._root_spread = 0.0  # sums of products about them
 
     def add(self, push: float, force: float) -> None:
         """Take one sample.
@@ -43,9 +45,11 @@ class PushFit:
         self._n += 1
         from_mean = push - self._push
         self._push += from_mean / self._n
-        self._root += (root - self._root) / self._n
+        root_from_mean = root - self._root
+        self._root += root_from_mean / self._n
         self._spread += from_mean * (push - self._push)
         self._joint += from_mean * (root - self._root)
+        self._root_spread += root_from_mean * (root - self._root)
 
     @property
     def slope(self) -> float:
@@ -58,8 +62,18 @@ class PushFit:
         return SIGMA_ROOT / math.sqrt(self._spread) if self._determined else math.inf
 
     def certain(self, share: float) -> bool:
-        """Whether the slope is positive and known to this share of itself (1σ)."""
-        return self.slope > 0.0 and self.sigma < share * self.slope
+        """Whether the slope is positive, known to this share of itself (1σ), and the samples lie on the line.
+
+        A sensor that sends nonsense has a slope too; its samples are off the line.
+        """
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER
+
+    @property
+    def scatter(self) -> float:
+        """RMS distance of √F from the line, √N; infinite where there is no slope."""
+        if not self._determined:
+            return math.inf
+        return math.sqrt(max(self._root_spread - self._joint**2 / self._spread, 0.0) / (self._n - 2))
 
     @property
     def _determined(self) -> bool:

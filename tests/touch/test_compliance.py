@@ -58,6 +58,14 @@ def test_too_little_is_not_certain():
     assert fit.sigma == math.inf
 
 
+def test_nonsense_has_a_slope_and_is_not_believed():
+    rng, fit = np.random.default_rng(3), PushFit()
+    for depth in np.linspace(0.1e-3, 0.5e-3, 100):
+        fit.add(depth, rng.uniform(0.1, 6.0))
+    assert fit.sigma < math.inf and fit.scatter > 0.3
+    assert not fit.certain(10.0)
+
+
 def test_its_standard_deviation_covers_a_force_known_to_six_percent():
     depths = np.linspace(0.15e-3, 0.42e-3, 60)
     true = pushed(1.27e8, (0.0, 0.0), depths).slope

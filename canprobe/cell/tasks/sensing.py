@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 SETTLING = 0.08
 """Uncertainty of the curvatures over that of the probe at which they tell the layer's stiffness from the touch."""
+MOST_RATIO = 6.0
+"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
 REFUTED = 0.25
 """Difference of the logarithms of two stiffnesses that the error of a touch does not explain."""
 HOLLOWEST = 0.9
@@ -127,8 +129,9 @@ class ContactSensing:
 
     def set_slope(self, slope: float) -> None:
         """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
-        self._slope = slope
-        self._depth_at_1_n = 1.0 / slope
+        flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
+        self._slope = min(max(slope, flat / MOST_RATIO), flat * MOST_RATIO)
+        self._depth_at_1_n = 1.0 / self._slope
 
     def _settle_stiffness(self, felt: float) -> None:
         """What was felt, now that the curvature is known: believed where it refutes the stiffness that was stated."""
