@@ -12,7 +12,7 @@ from canprobe.bridge.sample import SurfacePatch
 from canprobe.bridge.view.meshes import Array
 from canprobe.bridge.view.moments import Moment
 
-NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "error", "sigma")
+NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "true1", "true2", "error", "sigma")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,7 +54,7 @@ def row_of(moment: Moment) -> tuple[float, ...]:
             for x in ((k, k - 1.96 * s, k + 1.96 * s) if math.isfinite(s) else (k, nan, nan))
         )
     sigma = moment.sigma if math.isfinite(moment.sigma) else nan
-    return (moment.t_s, moment.force, *bands, moment.error, sigma)
+    return (moment.t_s, moment.force, *bands, *moment.kappa_true, moment.error, sigma)
 
 
 def curves_of(moments: Iterable[Moment]) -> Curves:

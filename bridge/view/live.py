@@ -15,7 +15,7 @@ from canprobe.bridge.view.panel import Panel
 from canprobe.bridge.view.path_nodes import GrowingPath
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
+from canprobe.bridge.view.trail import Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
 from canprobe.scene_geometry import true_object
 
@@ -40,7 +40,7 @@ class LiveView:
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
         self._address = address(server)
         self._stage = Stage(server, scene)
-        self._panel = Panel(server, scene, errors, true_kappa(shape))
+        self._panel = Panel(server, scene, errors)
         self._trail = Trail()
         self._path = GrowingPath(server.scene, self._trail, errors)
         self._follower = Follower(shape)

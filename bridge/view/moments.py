@@ -29,6 +29,8 @@ class Moment:
         taxels: (16, 16) counts of the newest frame; None before the first.
         force: N, of the newest frame; NaN before the first.
         error: of the patch, 1/m; NaN where there is no truth or no whole answer.
+        kappa_true: principal curvatures of the true object at the patch's contact point, 1/m, larger first; NaN
+            without either.
         sigma: stated standard deviation of the patch's curvature, as a Frobenius norm, 1/m; infinite where a part of
             it was not observed, NaN before the first.
         dropped: samples lost on the way so far.
@@ -42,6 +44,7 @@ class Moment:
     taxels: NDArray[np.uint8] | None = None
     force: float = math.nan
     error: float = math.nan
+    kappa_true: tuple[float, float] = (math.nan, math.nan)
     sigma: float = math.nan
     dropped: int = 0
 
@@ -54,6 +57,12 @@ def curvature_error(patch: SurfacePatch, shape: PlacedShape) -> float:
     axes = patch.T_base_contact[:3, :2]
     tensor = (true.directions.T * true.kappa) @ true.directions
     return float(np.linalg.norm(patch.K - axes.T @ tensor @ axes))
+
+
+def true_kappa(patch: SurfacePatch, shape: PlacedShape) -> tuple[float, float]:
+    """Principal curvatures of the true object at the patch's contact point, 1/m, larger first."""
+    first, second = shape.closest(patch.T_base_contact[:3, 3]).kappa.tolist()
+    return first, second
 
 
 def curvature_sigma(patch: SurfacePatch) -> float:
@@ -90,9 +99,9 @@ class Follower:
         elif sample.t_ns - self._felt_ns > SILENT_NS:
             now = replace(now, contact=None)
         if sample.patch is not None:
-            now = replace(now, patch=sample.patch, sigma=curvature_sigma(sample.patch), error=self._error(sample.patch))
+            now = replace(now, patch=sample.patch, sigma=curvature_sigma(sample.patch))
+            if self.shape is not None:
+                error, kappa = curvature_error(sample.patch, self.shape), true_kappa(sample.patch, self.shape)
+                now = replace(now, error=error, kappa_true=kappa)
         self.moment = now
         return now
-
-    def _error(self, patch: SurfacePatch) -> float:
-        return math.nan if self.shape is None else curvature_error(patch, self.shape)

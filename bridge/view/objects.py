@@ -6,8 +6,12 @@ import math
 
 import numpy as np
 
-from canprobe.bridge.view.meshes import Array, Mesh, dome, grid
-from canprobe.touch.objects import Bowl, Cylinder, PlacedShape, Sphere
+from canprobe.bridge.view.meshes import Array, Mesh, dome, grid, revolved
+from canprobe.touch.bowl import Bowl
+from canprobe.touch.objects import Cylinder, Sphere
+from canprobe.touch.placed import PlacedShape
+from canprobe.touch.profiles import Wave
+from canprobe.touch.torus import Torus
 
 REACH_M = 0.055
 """How much of a surface without end is shown round the object's origin, to each side."""
@@ -19,8 +23,8 @@ STEPS = 40
 def object_mesh(shape: PlacedShape, reach_m: float = REACH_M) -> Mesh:
     """The surface of an object near its origin, base frame.
 
-    Balls, cylinders and bowls of ordinary size are shown whole (a cylinder over `reach_m` to each side), everything
-    else over a square of twice `reach_m`.
+    Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `reach_m` to each side),
+    everything else over a square of twice `reach_m`.
 
     Args:
         shape: the true object.
@@ -33,6 +37,8 @@ def object_mesh(shape: PlacedShape, reach_m: float = REACH_M) -> Mesh:
         return _placed(shape, _tube(radius, reach_m), -radius)
     if radius <= WHOLE_M and isinstance(shape, Bowl):
         return _placed(shape, _hollow(radius), radius)
+    if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
+        return _ring(shape)
     return grid(_sheet(shape, reach_m))
 
 
@@ -65,8 +71,23 @@ def _sheet(shape: PlacedShape, reach_m: float) -> Array:
     T = shape.T_base_object
     across = min(reach_m, 0.85 * shape.radius) if isinstance(shape, Cylinder) else reach_m
     xs, ys = np.linspace(-reach_m, reach_m, STEPS + 1), np.linspace(-across, across, STEPS + 1)
-    plane = [[T[:3, 3] + x * T[:3, 0] + y * T[:3, 1] for y in ys] for x in xs]
+    plane = [[T[:3, 3] + x * T[:3, 0] + y * T[:3, 1] + _height(shape, y) * T[:3, 2] for y in ys] for x in xs]
     return np.array([[shape.closest(point).point for point in row] for row in plane])
+
+
+def _height(shape: PlacedShape, y: float) -> float:
+    """Where to look for a foot: in the troughs too."""
+    if isinstance(shape, Wave):
+        return shape.amplitude * (math.cos(2.0 * math.pi * y / shape.wavelength) - 1.0)
+    return 0.0
+
+
+def _ring(shape: Torus) -> Mesh:
+    """A whole torus."""
+    angle = np.linspace(-math.pi, math.pi, 49)
+    profile = np.column_stack([shape.ring_radius + shape.radius * np.cos(angle), shape.radius * np.sin(angle)])
+    mesh = revolved(profile, 96)
+    return _placed(shape, Mesh(mesh.vertices - (shape.ring_radius, 0.0, 0.0), mesh.faces), -shape.radius)
 
 
 def _placed(shape: PlacedShape, mesh: Mesh, height_m: float) -> Mesh:

@@ -21,7 +21,7 @@ from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.replay import shape_of, trail_of
 from canprobe.bridge.view.server import open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import error_scale, true_kappa
+from canprobe.bridge.view.trail import error_scale
 
 FRAME_S = 0.04
 MOST_FRAMES = 900
@@ -80,7 +80,7 @@ def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
         "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
         "phases": [m.phase for m in moments],
         "target": task.force_n if task.kind in ("scan", "press") else None,
-        "kappa_true": true_kappa(shape),
+        "truth": shape is not None,
         "shape": run.scene.shape is not None,
         "sensor": run.scene.sensor is not None,
         "taxels": base64.b64encode(taxels).decode("ascii"),

@@ -28,15 +28,13 @@ class Panel:
         server: a `viser.ViserServer`.
         scene: that is shown.
         errors: what the path's colours mean.
-        kappa_true: principal curvatures of the true object, 1/m; None where it is not known.
     """
 
-    def __init__(self, server: Any, scene: Scene, errors: ErrorScale, kappa_true: tuple[float, float] | None) -> None:
+    def __init__(self, server: Any, scene: Scene, errors: ErrorScale) -> None:
         gui = server.gui
         gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
         gui.set_panel_label(f"canprobe · {scene.name}")
         self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
-        self._kappa_true = kappa_true
         self._status = gui.add_markdown("")
         self._plots: list[tuple[Any, tuple[str, ...]]] = []
         self._taxels = None
@@ -48,15 +46,16 @@ class Panel:
             self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
             self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
         if scene.shape is not None:
-            names = ("kappa1", "low1", "high1", "kappa2", "low2", "high2")
-            self._add_plot(gui, "principal curvatures, 95 % bands (1/m)", names, (FIRST, *2 * (FIRST,), *3 * (SECOND,)))
-            self._add_plot(gui, "error and stated std. deviation of K (1/m)", ("error", "sigma"), (INK, FAINT))
+            names = ("true1", "true2", "low1", "high1", "low2", "high2", "kappa1", "kappa2")
+            colours = (FAINT, FAINT, FIRST, FIRST, SECOND, SECOND, FIRST, SECOND)
+            self._add_plot(gui, "κ1, κ2 with 95 % bands; grey: true (1/m)", names, colours)
+            self._add_plot(gui, "error of K; grey: stated deviation (1/m)", ("error", "sigma"), (INK, FAINT))
 
     def _add_plot(self, gui: Any, title: str, names: tuple[str, ...], colours: tuple[str, ...]) -> None:
         uplot = import_viser().uplot
         series = [uplot.Series(label="t (s)")]
         for name, colour in zip(names, colours, strict=True):
-            thin = name.startswith(("low", "high")) or name in ("target", "sigma")
+            thin = name.startswith(("low", "high", "true")) or name in ("target", "sigma")
             series.append(uplot.Series(label=name, stroke=colour, width=1.0 if thin else 2.0))
         empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.full(2, np.nan) for i in range(len(series)))
         handle = gui.add_uplot(
@@ -91,8 +90,8 @@ class Panel:
         if moment.patch is not None:
             kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in moment.patch.kappa)
             rows.append(("κ", f"{kappa} 1/m"))
-            if self._kappa_true is not None:
-                rows.append(("κ true", f"{self._kappa_true[0]:.2f}, {self._kappa_true[1]:.2f} 1/m"))
+            if math.isfinite(moment.kappa_true[0]):
+                rows.append(("κ true", f"{moment.kappa_true[0]:.2f}, {moment.kappa_true[1]:.2f} 1/m"))
             rows.append(("error of K", "–" if math.isnan(moment.error) else f"{moment.error:.2f} 1/m"))
         if moment.dropped:
             rows.append(("samples dropped", str(moment.dropped)))

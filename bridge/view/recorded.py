@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.meshes import Array
-from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigma
+from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigma, true_kappa
 from canprobe.bridge.view.recorded_taxels import read_taxels
 from canprobe.cell.tasks.touch import Phase
 from canprobe.errors import UsageError
@@ -37,6 +37,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "K_covariance_per_m2": (3, 3),
 }
 """Columns of ``log.npz`` that are shown, and the shape of a row."""
+_UNKNOWN = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -49,7 +50,7 @@ class RecordedRun:
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answers: rows at which the estimator gave a new answer.
         patches: the answers.
-        errors, sigmas: of each answer, 1/m, as in `Moment`.
+        errors, sigmas, true: of each answer, 1/m, as in `Moment`; `true` (n, 2).
         taxels: (t_s, (16, 16) counts) of each tactile frame.
     """
 
@@ -60,6 +61,7 @@ class RecordedRun:
     patches: tuple[SurfacePatch, ...]
     errors: Array
     sigmas: Array
+    true: Array
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
 
     @property
@@ -87,6 +89,7 @@ class RecordedRun:
             taxels=self.taxels[frame][1] if frame >= 0 else None,
             force=float(log["force_n"][row]) if "force_n" in log else math.nan,
             error=float(self.errors[answer]) if answer >= 0 else math.nan,
+            kappa_true=(float(self.true[answer, 0]), float(self.true[answer, 1])) if answer >= 0 else _UNKNOWN,
             sigma=float(self.sigmas[answer]) if answer >= 0 else math.nan,
         )
 
@@ -126,10 +129,11 @@ def read_run(folder: Path) -> RecordedRun:
     answers, patches = _answers(log)
     shape = None if scene.object is None else true_object(scene.object)
     errors = [math.nan if shape is None else curvature_error(patch, shape) for patch in patches]
+    true = [_UNKNOWN if shape is None else true_kappa(patch, shape) for patch in patches]
     taxels = read_taxels(folder / "bus.log", scene) if scene.sensor is not None else ()
     return RecordedRun(
         scene, scene.title or scene.name, log, answers, patches, np.array(errors),
-        np.array([curvature_sigma(patch) for patch in patches]), taxels,
+        np.array([curvature_sigma(patch) for patch in patches]), np.array(true).reshape(-1, 2), taxels,
     )  # fmt: skip
 
 

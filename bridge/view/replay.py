@@ -14,7 +14,7 @@ from canprobe.bridge.view.path_nodes import LoadedPath
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
+from canprobe.bridge.view.trail import Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
 from canprobe.cell.tasks.touch import Phase
 from canprobe.scene_geometry import true_object
@@ -55,8 +55,7 @@ class Player:
     def __init__(self, server: Any, run: RecordedRun) -> None:
         self._server = server
         self._run = run
-        shape = shape_of(run)
-        errors = error_scale(shape)
+        errors = error_scale(shape_of(run))
         self._stage = Stage(server, run.scene)
         self._path = LoadedPath(server.scene, trail_of(run), errors)
         gui = server.gui
@@ -65,7 +64,7 @@ class Player:
             self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
             self._play = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
-        self._panel = Panel(server, run.scene, errors, true_kappa(shape))
+        self._panel = Panel(server, run.scene, errors)
         self._curves = curves_of(run.at(t) for t in run.times(max(FRAME_S, run.duration_s / MOST_POINTS)))
         self._panel.show(run.at(start), self._curves)
         self._shown = math.nan

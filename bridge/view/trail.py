@@ -50,14 +50,6 @@ def error_scale(shape: PlacedShape | None) -> ErrorScale:
     return ErrorScale(max(SHARE * float(np.linalg.norm(kappa)), LEAST_PER_M), "error ‖K − K true‖ (1/m)")
 
 
-def true_kappa(shape: PlacedShape | None) -> tuple[float, float] | None:
-    """Principal curvatures at the object's origin, 1/m, larger first."""
-    if shape is None:
-        return None
-    first, second = shape.closest(shape.T_base_object[:3, 3]).kappa.tolist()
-    return first, second
-
-
 class Trail:
     """Collects contacts into segments.
 

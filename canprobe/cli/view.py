@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import os
 import webbrowser
 from pathlib import Path
@@ -49,16 +48,20 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(quiet=args.no_open)
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    ends = () if args.html is not None else (KeyboardInterrupt,)  # how to leave a page, but not to write a file
+    with contextlib.suppress(*ends), termination_interrupts():
         if not folder.is_dir():
             folder = _run_scene(args, browser)
-        recorded = importlib.import_module("canprobe.bridge.view.recorded").read_run(folder)
+        from canprobe.bridge.view.page import write_page
+        from canprobe.bridge.view.recorded import read_run
+        from canprobe.bridge.view.replay import serve_run
+
+        recorded = read_run(folder)
         if args.html is not None:
-            importlib.import_module("canprobe.bridge.view.page").write_page(recorded, args.html)
+            write_page(recorded, args.html)
             print(args.html)
-            return 0
-        serve = importlib.import_module("canprobe.bridge.view.replay").serve_run
-        serve(recorded, port=args.port, host=args.host, ready=browser.show)
+        else:
+            serve_run(recorded, port=args.port, host=args.host, ready=browser.show)
     return 0
 
 

@@ -13,7 +13,7 @@ from canprobe.emulator.plant.field import pad_coordinates
 from canprobe.robot.kinematics import chain, forward, tool_z_offset
 from canprobe.robot.puma260 import MODELS
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.objects import make_object
+from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 
 MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
 QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))
@@ -177,11 +177,20 @@ KINDS = {
     "large sphere": {"radius": 0.5},
     "cylinder": {"radius": 0.036},
     "large cylinder": {"radius": 0.4},
+    "ellipsoid": {"radius_x": 0.08, "radius_y": 0.06, "radius_z": 0.05},
+    "torus": {"ring_radius": 0.06, "radius": 0.02},
+    "large torus": {"ring_radius": 0.4, "radius": 0.1},
+    "wave": {"amplitude": 4e-3, "wavelength": 0.04},
+    "fillet": {"radius": 0.02, "angle": 1.0},
     "saddle": {"radius_x": 0.05, "radius_y": -0.12},
     "bowl": {"radius": 0.08},
     "large bowl": {"radius": 0.6},
     "quadric": {"matrix": np.array([[6, 2, 0, 0], [2, 9, 0, 0], [0, 0, 3, 0.5], [0, 0, 0.5, 0]], float)},
 }
+
+
+def test_every_kind_of_object_has_a_ghost_here():
+    assert {name.split()[-1] for name in KINDS} == set(OBJECT_PARAMETERS)
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -18,10 +18,10 @@ from canprobe.bridge.codec import pack_observation, unpack_observation
 from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
 from canprobe.bridge.source import SampleSource
 from canprobe.bridge.view.curves import curves_of, kappa_sigmas, row_of
-from canprobe.bridge.view.moments import SILENT_NS, Follower, Moment, curvature_error, curvature_sigma
+from canprobe.bridge.view.moments import SILENT_NS, Follower, Moment, curvature_error, curvature_sigma, true_kappa
 from canprobe.bridge.view.recorded import read_run
 from canprobe.bridge.view.replay import trail_of
-from canprobe.bridge.view.trail import GAP_M, LIFT_M, Trail, error_scale, true_kappa
+from canprobe.bridge.view.trail import GAP_M, LIFT_M, Trail, error_scale
 from canprobe.errors import CanprobeError
 from canprobe.scene_geometry import true_object
 from canprobe.touch.frames import homogeneous, tangent_rotation
@@ -158,6 +158,7 @@ def test_curves_hold_the_bands_of_the_answers(run):
     s1, s2 = kappa_sigmas(last)
     assert curves["high1"][-1] - curves["low1"][-1] == pytest.approx(2 * 1.96 * s1)
     assert curves["high2"][-1] - curves["low2"][-1] == pytest.approx(2 * 1.96 * s2)
+    assert (curves["true1"][-1], curves["true2"][-1]) == pytest.approx((1 / 0.036, 0.0), abs=1e-6)
     assert all(math.isnan(x) for x in row_of(Moment())[1:])
 
 
@@ -189,8 +190,15 @@ def test_colours_of_the_path_span_five_per_cent_of_the_curvature():
     shape = make_object("sphere", T_base_object=np.eye(4), radius=0.05)
     assert error_scale(shape).high == pytest.approx(0.05 * math.sqrt(2) / 0.05)
     assert error_scale(make_object("plane", T_base_object=np.eye(4))).high == 0.5
-    assert "stated" in error_scale(None).text and true_kappa(None) is None
-    assert true_kappa(make_object("cylinder", T_base_object=np.eye(4), radius=0.04)) == pytest.approx((25.0, 0.0))
+    assert "stated" in error_scale(None).text
+
+
+def test_the_true_curvature_is_that_under_the_contact():
+    """A torus of 60 and 20 mm, felt on its outside, where the larger ring has a radius of 80 mm."""
+    shape = make_object("torus", T_base_object=np.eye(4), ring_radius=0.06, radius=0.02)
+    outside = homogeneous(tangent_rotation(np.array([-1.0, 0.0, 0.0])), np.array([0.02, 0.0, -0.02]))
+    patch = SurfacePatch(0, outside, np.diag([12.5, 50.0]), np.eye(3), (True, True))
+    assert true_kappa(patch, shape) == pytest.approx((50.0, 12.5))
 
 
 # the page
@@ -230,7 +238,7 @@ def test_the_page_holds_the_whole_run(page, run):
     assert data["curves"]["t_s"][-1] == pytest.approx(run.duration_s, rel=1e-4)
     frames = base64.b64decode(data["taxels"])
     assert frames[-256:] == run.at(run.duration_s).taxels.tobytes()
-    assert len(frames) == 256 * len(data["phases"]) and data["kappa_true"] == pytest.approx([1 / 0.036, 0.0])
+    assert len(frames) == 256 * len(data["phases"]) and data["truth"] is True
 
 
 def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
