@@ -1,9 +1,9 @@
 """ros2_canopen's `bus.yml`: a plan written as one, and the nodes of one read.
 
 The file's keys are those of Lely's dcfgen, which makes the master's configuration of it; ros2_canopen adds `driver`
-and `package`. dcfgen maps no dummies: an RPDO with one is written by `sdo` entries, in the order of bring-up, and the
-master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration file"; lely-core's
-dcfgen.
+and `package`. dcfgen maps neither dummies nor PDOs of CAN FD: such a one is written by `sdo` entries, in the order of
+bring-up, and the master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration
+file"; lely-core's dcfgen.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from canprobe.eds import eds_file
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, PlannedNode, PlannedPdo
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Direction
+from canprobe.planning.wire_bits import CLASSIC_BYTES
 
 _PURPOSE = "a bus.yml"
 _DRIVERS = {
@@ -146,19 +147,18 @@ def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
     direction: Direction = "rpdo" if write.index < 0x1800 else "tpdo"
     pdos = {pdo.number: pdo for pdo in plan.pdos_of(node.node_id, direction)}
     pdo = pdos.get((write.index & 0x1FF) + 1)
-    return pdo is not None and (
-        _has_dummy(pdo) or (direction == "rpdo" and write.index < 0x1600 and write.subindex == 5)
-    )
+    return pdo is not None and (_by_hand(pdo) or (direction == "rpdo" and write.index < 0x1600 and write.subindex == 5))
 
 
-def _has_dummy(pdo: PlannedPdo) -> bool:
-    return any(entry.is_dummy for entry in pdo.entries)
+def _by_hand(pdo: PlannedPdo) -> bool:
+    """Whether dcfgen cannot map it: dummies, and what is longer than a classical frame."""
+    return pdo.layout.length > CLASSIC_BYTES or any(entry.is_dummy for entry in pdo.entries)
 
 
 def _pdos(plan: Plan, node: PlannedNode, setup: NodeSetup, direction: Direction) -> dict[int, Any]:
     off = {n: {"enabled": False, "cob_id": _Hex(INVALID)} for way, n in node.switched_off if way == direction}
     written = {write.index for write in setup.writes}
-    on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _has_dummy(pdo)}
+    on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _by_hand(pdo)}
     return dict(sorted((off | on).items()))
 
 

@@ -60,15 +60,20 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
         dropped: how many were lost before it.
     """
     command = observation.command
-    phase: Any = None
+    phase: float | None = None
     estimate = None
     if command is not None:
-        phase = command.columns.get("phase")
+        phase = _number(command.columns.get("phase"))
         if command.estimate is not None:
             estimate = _pack_estimate(command.estimate)
     measurement = observation.measurement
     parts: Any = _pack_measurement(measurement) if measurement is not None else None
     return marshal.dumps((observation.t_ns, parts, phase, estimate, observation.frames, dropped))
+
+
+def _number(value: object) -> float | None:
+    """A plain float of whatever a controller has put there; None where it is no number."""
+    return float(value) if isinstance(value, int | float | np.number) else None
 
 
 def unpack_observation(data: bytes) -> Received:

@@ -10,7 +10,17 @@ from canprobe.bridge.signals import FrameDescription, FrameSignal, describe_fram
 from canprobe.planning import Plan
 
 FORMATS = ("dbc", "kcd")
+_PURPOSE = "a DBC or KCD file"
 _CLASSIC_BYTES = 8
+_FRAME_FORMATS = ["StandardCAN", "ExtendedCAN", *["reserved"] * 12, "StandardCAN_FD", "ExtendedCAN_FD"]
+_FD_ATTRIBUTES = f"""VERSION ""
+BU_:
+BA_DEF_ "BusType" STRING ;
+BA_DEF_ BO_ "VFrameFormat" ENUM {",".join(f'"{name}"' for name in _FRAME_FORMATS)};
+BA_DEF_DEF_ "BusType" "CAN";
+BA_DEF_DEF_ "VFrameFormat" "StandardCAN";
+BA_ "BusType" "CAN FD";
+"""
 
 
 def plan_database(plan: Plan) -> Any:
@@ -25,11 +35,13 @@ def plan_database(plan: Plan) -> Any:
     Raises:
         UsageError: cantools is not installed.
     """
-    can = need("cantools.database.can", "can", "a DBC or KCD file")
+    can = need("cantools.database.can", "can", _PURPOSE)
     nodes = [can.Node(name) for name in node_names(plan).values()]
-    messages = [_message(can, frame, plan) for frame in describe_frames(plan)]
-    bus = can.Bus(identifier(plan.scene.bus.channel), baudrate=plan.scene.bus.bitrate)
-    return can.Database(messages=messages, nodes=nodes, buses=[bus], version=plan.scene.name)
+    messages = [_message(can, frame) for frame in describe_frames(plan)]
+    buses = [can.Bus(identifier(bus.channel), baudrate=plan.scene.bus.bitrate) for bus in plan.buses]
+    attributes = need("cantools.database", "can", _PURPOSE).load_string(_FD_ATTRIBUTES, "dbc").dbc
+    specifics = attributes if any(message.is_fd for message in messages) else None
+    return can.Database(messages=messages, nodes=nodes, buses=buses, version=plan.scene.name, dbc_specifics=specifics)
 
 
 def write_database(plan: Plan, folder: Path, form: str) -> Path:
@@ -50,7 +62,7 @@ def write_database(plan: Plan, folder: Path, form: str) -> Path:
     return path
 
 
-def _message(can: Any, frame: FrameDescription, plan: Plan) -> Any:
+def _message(can: Any, frame: FrameDescription) -> Any:
     return can.Message(
         frame_id=frame.cob_id,
         name=frame.name,
@@ -60,12 +72,12 @@ def _message(can: Any, frame: FrameDescription, plan: Plan) -> Any:
         senders=[frame.sender],
         cycle_time=None if frame.period_ms is None else max(1, round(frame.period_ms)),
         is_fd=frame.length > _CLASSIC_BYTES,
-        bus_name=identifier(plan.scene.bus.channel),
+        bus_name=identifier(frame.channel),
     )
 
 
 def _signal(can: Any, signal: FrameSignal) -> Any:
-    conversion = need("cantools.database.conversion", "can", "a DBC or KCD file").BaseConversion
+    conversion = need("cantools.database.conversion", "can", _PURPOSE).BaseConversion
     return can.Signal(
         name=signal.name,
         start=signal.start,

@@ -26,7 +26,8 @@ from canprobe.planning.model import Plan
 from canprobe.scene_writer import dump_scene
 
 READY_TIMEOUT_S = 60.0
-END_TIMEOUT_S = 10.0
+END_TIMEOUT_S = 30.0
+"""For everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
@@ -91,7 +92,7 @@ class BridgeProcess:
         self._feed.taken = 0
         deadline = elapsed_ns() + round(READY_TIMEOUT_S * 1e9)
         while self._where is None and self._error is None:
-            left = (deadline - elapsed_ns()) * 1e-9
+            left = _left_s(deadline)
             if left <= 0:
                 self._error = f"not ready after {READY_TIMEOUT_S:g} s"
             elif not self._listen(left):
@@ -151,22 +152,22 @@ class BridgeProcess:
         Returns:
             `status`, with what was lost until the very end.
         """
+        deadline = elapsed_ns() + round(END_TIMEOUT_S * 1e9)
         try:
-            self._feed.flush(END_TIMEOUT_S)
+            self._feed.flush(_left_s(deadline))
             taken, dropped = self._feed.taken, self._feed.dropped
             self._feed.put(_END + (summary or "").encode())
-            self._feed.flush(END_TIMEOUT_S)
+            self._feed.flush(_left_s(deadline))
             self._feed.taken, self._feed.dropped = taken, max(dropped, self._feed.dropped - 1)
             self._feed.close()
-            self._wait()
+            self._wait(deadline)
         finally:
             self.kill()
         return self.status()
 
-    def _wait(self) -> None:
+    def _wait(self, deadline_ns: int) -> None:
         """Until the process has said its last, or its time is up."""
-        deadline = elapsed_ns() + round(END_TIMEOUT_S * 1e9)
-        while (left := (deadline - elapsed_ns()) * 1e-9) > 0:
+        while (left := _left_s(deadline_ns)) > 0:
             if not self._listen(left):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(max(left, 0.1))
@@ -192,3 +193,7 @@ class BridgeProcess:
         self._errors.seek(0)
         lines = self._errors.read().decode(errors="replace").strip().splitlines()
         return lines[-1] if lines else ""
+
+
+def _left_s(deadline_ns: int) -> float:
+    return max((deadline_ns - elapsed_ns()) * 1e-9, 0.0)

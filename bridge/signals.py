@@ -78,6 +78,7 @@ class FrameDescription:
         period_ms: between two frames; None where it comes on an event.
         comment: for people.
         signals: in the order of the data.
+        channel: the bus; of what goes to every bus, the first one.
     """
 
     name: str
@@ -87,6 +88,7 @@ class FrameDescription:
     period_ms: float | None
     comment: str
     signals: tuple[FrameSignal, ...]
+    channel: str
 
 
 def node_names(plan: Plan) -> dict[int, str]:
@@ -107,8 +109,9 @@ def describe_frames(plan: Plan) -> list[FrameDescription]:
     for pdo in plan.pdos:
         shared.setdefault(pdo.cob_id, []).append(pdo)
     frames = [_sync(plan, names), *(_pdo_frame(pdos, names) for pdos in shared.values())]
-    frames += [_emergency(node_id, names) for node_id in plan.node_ids]
-    frames += [_heartbeat(node_id, names) for node_id in (*plan.node_ids, MASTER_NODE_ID)]
+    channels = {node.node_id: node.channel for node in plan.nodes} | {MASTER_NODE_ID: plan.buses[0].channel}
+    frames += [_emergency(node_id, names, channels[node_id]) for node_id in plan.node_ids]
+    frames += [_heartbeat(node_id, names, channels[node_id]) for node_id in (*plan.node_ids, MASTER_NODE_ID)]
     return sorted(frames, key=lambda frame: frame.cob_id)
 
 
@@ -116,7 +119,8 @@ def _sync(plan: Plan, names: dict[int, str]) -> FrameDescription:
     readers = tuple(names[node_id] for node_id in plan.node_ids)
     counter = FrameSignal("counter", 0, 8, False, "", "1 to 1019h", readers)
     period_ms = plan.sync.period_ns / 1e6
-    return FrameDescription("SYNC", SYNC_ID, 1, MASTER, period_ms, "synchronisation object", (counter,))
+    comment, channel = "synchronisation object", plan.buses[0].channel
+    return FrameDescription("SYNC", SYNC_ID, 1, MASTER, period_ms, comment, (counter,), channel)
 
 
 def _pdo_frame(pdos: list[PlannedPdo], names: dict[int, str]) -> FrameDescription:
@@ -132,6 +136,7 @@ def _pdo_frame(pdos: list[PlannedPdo], names: dict[int, str]) -> FrameDescriptio
         period_ms=1000 / first.rate_hz if cyclic else None,
         comment=f"transmission type {first.transmission_type}, {first.rate_hz:g} a second",
         signals=tuple(sorted(signals, key=lambda signal: signal.start)),
+        channel=first.channel,
     )
 
 
@@ -166,17 +171,17 @@ def _whole(entry: PdoEntry) -> _Field:
     return name, entry.bits, entry.signed, _UNITS.get(entry.index, "")
 
 
-def _emergency(node_id: int, names: dict[int, str]) -> FrameDescription:
+def _emergency(node_id: int, names: dict[int, str], channel: str) -> FrameDescription:
     fields = (("error_code", 0, 16), ("error_register", 16, 8), ("manufacturer", 24, 40))
     signals = tuple(FrameSignal(name, start, bits, False, "", "", (MASTER,)) for name, start, bits in fields)
     name = f"{names[node_id]}_EMCY"
-    return FrameDescription(name, EMCY_BASE + node_id, 8, names[node_id], None, "emergency object", signals)
+    return FrameDescription(name, EMCY_BASE + node_id, 8, names[node_id], None, "emergency object", signals, channel)
 
 
-def _heartbeat(node_id: int, names: dict[int, str]) -> FrameDescription:
+def _heartbeat(node_id: int, names: dict[int, str], channel: str) -> FrameDescription:
     readers = (MASTER,) if node_id != MASTER_NODE_ID else tuple(n for i, n in names.items() if i != MASTER_NODE_ID)
     state = FrameSignal("nmt_state", 0, 7, False, "", "", readers, _STATES)
     name = f"{names[node_id]}_heartbeat"
     return FrameDescription(
-        name, HEARTBEAT_BASE + node_id, 1, names[node_id], HEARTBEAT_PRODUCED_MS, "NMT error control", (state,)
+        name, HEARTBEAT_BASE + node_id, 1, names[node_id], HEARTBEAT_PRODUCED_MS, "NMT error control", (state,), channel
     )

@@ -25,6 +25,7 @@ from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.patch import Patch
 
 Array = NDArray[np.float64]
+_PHASES = {float(phase): phase.name.lower() for phase in Phase}
 
 
 class SampleSource:
@@ -58,7 +59,7 @@ class SampleSource:
         return Sample(
             t_ns,
             cycle=measurement.cycle,
-            phase=Phase(int(received.phase)).name.lower() if received.phase is not None else None,
+            phase=_PHASES.get(received.phase) if received.phase is not None else None,
             joints=self._joints(measurement),
             taxels=taxels,
             wrench=wrench,

@@ -22,8 +22,11 @@ from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
+    from canprobe.cell.monitor import CellView
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
+
+MONITOR_PERIOD_NS = 100_000_000
 
 __all__ = [
     "Command",
@@ -32,6 +35,7 @@ __all__ = [
     "RunResult",
     "emulate",
     "emulate_eds",
+    "monitor",
     "open_cell",
     "run",
     "scan",
@@ -295,5 +299,50 @@ def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> 
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
         return scan_nodes(port, timeout_s)
+    finally:
+        port.close()
+
+
+def monitor(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    duration_s: float | None = None,
+) -> Iterator[CellView]:
+    """Look at a running cell ten times a second, sending nothing.
+
+    Args:
+        scene: what is on the bus.
+        interface, channel, bitrate: in the place of the scene's bus.
+        duration_s: how long; for ever by default.
+
+    Yields:
+        What is known by then; the same object each time.
+
+    Raises:
+        UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
+        InterfaceError: no such interface, or it was lost.
+    """
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.cell.monitor import Monitor
+    from canprobe.planning import make_plan
+
+    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate)
+    bus = resolved.bus
+    if bus.interface == LOCKSTEP:
+        raise UsageError("monitor: a lockstep bus lives inside one run; name a real interface with --bus")
+    clock = MonotonicClock()
+    port = open_port(bus.interface, bus.channel, bus.bitrate, clock)
+    try:
+        listener = Monitor(make_plan(resolved))
+        start_ns = next_ns = clock.now_ns()
+        while duration_s is None or next_ns < start_ns + duration_s * 1e9:
+            next_ns += MONITOR_PERIOD_NS
+            clock.sleep_until_ns(next_ns)
+            listener.push(port.drain())
+            yield listener.view(clock.now_ns())
     finally:
         port.close()

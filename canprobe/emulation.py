@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from canprobe.errors import NodeError, UsageError
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
-from canprobe.session import Say, data_bitrate, quiet, resolve_scene
+from canprobe.session import Say, quiet, resolve_scene
+from canprobe.session_bus import data_bitrate
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port

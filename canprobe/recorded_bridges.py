@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,12 +20,12 @@ from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.observe import Observation
 from canprobe.cell.recording import Recording, read_recording
 from canprobe.planning import Plan, make_plan
-from canprobe.planning.bridges import BRIDGES
+from canprobe.planning.bridges import BRIDGES, check_bridges
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.recorded import ReplayResult, find_log, replay, scene_of
-from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Say, resolve_scene
+from canprobe.scene import BridgeSettings, Scene
+from canprobe.session import LOCKSTEP, Say
 from canprobe.touch.estimate import SurfaceEstimate
 
 
@@ -63,7 +63,8 @@ def replay_into(
         UsageError: as :func:`canprobe.replay`; or a bridge cannot be had.
     """
     path, folder = find_log(Path(log))
-    resolved = resolve_scene(scene_of(path, folder, scene), bridge=bridge)
+    check_bridges(bridge)
+    resolved = _only(scene_of(path, folder, scene), bridge)
     plan = make_plan(resolved)
     estimated = method is not None or (resolved.shape is not None and resolved.task.kind == "scan")
     result = replay(log, scene=resolved, method=method) if estimated else None
@@ -74,6 +75,12 @@ def replay_into(
             for one in bridges.observers:
                 one.observe(observation)
         return RecordedBridges(result, bridges.end(None) or {})
+
+
+def _only(scene: Scene, bridge: Sequence[str]) -> Scene:
+    """The scene with these bridges in the place of those that fed the run."""
+    settings = scene.bridge or BridgeSettings()
+    return replace(scene, bridge=replace(settings, use=tuple(dict.fromkeys(bridge))))  # type: ignore[arg-type]
 
 
 def _in_real_time(observations: _Observations) -> Iterator[Observation]:

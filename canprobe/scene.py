@@ -221,12 +221,14 @@ class PlantSettings:
     fidelity: Fidelity = "ideal"
     arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
-    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 1250.0  # of the integrator
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0  # of the integrator
     friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
     integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
     velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
     torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
+    # K/h of the layer that is really there, N/m³; the probe's by default
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
     noise: bool = True
     gain_error: bool = True

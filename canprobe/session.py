@@ -9,7 +9,6 @@ import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -32,10 +31,8 @@ from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
-from canprobe.planning.wire_bits import exact_frame_bits
-from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene import BridgeSettings, BusSettings, Scene
+from canprobe.scene import BridgeSettings, Scene
+from canprobe.session_bus import Sink, TrafficCounter, channel_routes, data_bitrate, lockstep_bus
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -93,37 +90,6 @@ def hush_canopen() -> None:
     logger = logging.getLogger("canopen")
     if not logger.handlers:
         logger.addHandler(logging.NullHandler())
-
-
-class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
-
-    Args:
-        write: of the log.
-        speed_up: data bit rate of CAN FD over the nominal one.
-    """
-
-    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
-        self._write = write
-        self._by_length = [0] * 65
-        self._speed_up = speed_up
-
-    @property
-    def frames(self) -> int:
-        """Frames so far."""
-        return sum(self._by_length)
-
-    @property
-    def bits(self) -> int:
-        """Bits so far, those of a data phase as bits of the nominal rate."""
-        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
-        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
-        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
-
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Count one frame and pass it on."""
-        self._by_length[len(data)] += 1
-        self._write(can_id, data, t_ns)
 
 
 class Session:
@@ -283,7 +249,7 @@ class Session:
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
         clock = VirtualClock()
-        buses = {bus.channel: _lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
+        buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
             bus.recorder = self._writer(channel, 0)
         self.lockstep = buses[self.plan.buses[0].channel]
@@ -322,7 +288,7 @@ class Session:
         for planned in self.plan.buses:
             real = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
             self._stack.callback(real.close)
-            ports[planned.channel] = RecordingPort(real, _Sink(self._writer(planned.channel, t0_ns)))
+            ports[planned.channel] = RecordingPort(real, Sink(self._writer(planned.channel, t0_ns)))
         port = self._join(ports)
         child = None
         if self.scene.emulated_node_ids:
@@ -342,40 +308,3 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
-
-
-def data_bitrate(bus: BusSettings) -> int | None:
-    """Of CAN FD frames, None where the scene has none."""
-    return bus.data_bitrate if bus.fd is True else None
-
-
-def channel_routes(plan: Plan) -> dict[int, str]:
-    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
-    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
-    for node in plan.nodes:
-        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
-            routes[base + node.node_id] = node.channel
-    return routes
-
-
-def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
-    """A bus in virtual time, with the bit rate of the scene or without one."""
-    if not scene.bus.timed:
-        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
-    from canprobe.bus.timed import TimedBus
-    from canprobe.bus.wire_errors import BitErrors
-
-    rate = scene.bus.bit_error_rate
-    errors = BitErrors(rate, scene.seed) if rate > 0 else None
-    bus = scene.bus
-    length = partial(exact_frame_bits, bus=bus)
-    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
-    timed.fd = bus.fd is True
-    return timed
-
-
-class _Sink:
-    """What a RecordingPort writes to."""
-
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
-        self.write = write

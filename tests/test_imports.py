@@ -46,6 +46,7 @@ COMPOSITION = {
     "bridging",
     "results",
     "session",
+    "session_bus",
     "child",
     "rehearsal",
     "recorded",

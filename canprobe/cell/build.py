@@ -12,8 +12,8 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
-from canprobe.cell.limits import limits_of
-from canprobe.cell.measurement import Controller, TactileSample
+from canprobe.cell.limits import force_of, limits_of
+from canprobe.cell.measurement import Controller
 from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.planning.model import (
@@ -23,7 +23,7 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import BringUpSettings, Scene
+from canprobe.scene import BringUpSettings
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
@@ -64,7 +64,7 @@ def make_cell(
         drives=make_drives(plan),
         tactile=make_tactile(plan),
         limits=limits_of(plan),
-        force_of=_force_of(plan.scene),
+        force_of=force_of(plan.scene) if plan.scene.arm is not None else None,
         say=say,
         times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
@@ -82,18 +82,6 @@ def _times(settings: BringUpSettings) -> BringUpTimes:
         retries=settings.retries,
         store=settings.store,
     )
-
-
-def _force_of(scene: Scene) -> Callable[[TactileSample], float] | None:
-    """Force of a tactile sample where an arm can press; None where nothing can."""
-    if scene.arm is None or scene.sensor is None:
-        return None
-    from canprobe.cell.tasks.calibration import array_calibration
-    from canprobe.cell.tasks.sensing import patch_of
-
-    radius = {} if scene.probe is None else {"radius_m": scene.probe.radius_mm * 1e-3}
-    calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, **radius)
-    return lambda sample: patch_of(sample, calibration).force
 
 
 def make_drives(plan: Plan) -> DriveGroup | None:

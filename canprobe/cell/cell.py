@@ -179,6 +179,7 @@ class Cell:
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         self._cycle_until((), WARM_UP_S)
+        self._await_rest()
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
             i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
@@ -187,6 +188,18 @@ class Cell:
                 f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
                 + "".join(f"; {event}" for event in self.watch.alarms[-1:]),
             )
+
+    def _await_rest(self) -> None:
+        """Enable nothing that is not known to stand still: a drive is told to stay where it says it is."""
+        assert self.drives is not None
+        for _ in range(int(ENABLE_TIMEOUT_S * 1e9 / self._settings.period_ns)):
+            if self.drives.at_rest:
+                return
+            self._cycle_until((), 1.5e-9 * self._settings.period_ns)
+        axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
+        raise NodeError(
+            axis.node_id, f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+        )
 
     def _cycle_until(
         self,

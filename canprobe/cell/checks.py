@@ -70,7 +70,15 @@ def foreign_master(seen: Seen) -> SafetyStop | None:
 
 def missed_pdos(seen: Seen) -> int:
     """TPDOs of drives that were not there in time."""
-    return seen.drives.missed if seen.drives is not None else 0
+    return seen.drives.missed + seen.drives.implausible if seen.drives is not None else 0
+
+
+def drive_late(seen: Seen) -> NodeError | None:
+    """A drive has not told where it is for some cycles: the others must not go on without it."""
+    for axis, age in zip(seen.drives.axes if seen.drives is not None else (), seen.measurement.q_age, strict=True):
+        if age >= seen.limits.hold_cycles:
+            return NodeError(axis.node_id, f"no usable TPDO for {age} cycles")
+    return None
 
 
 def drive_silent(seen: Seen) -> NodeError | None:
@@ -80,7 +88,7 @@ def drive_silent(seen: Seen) -> NodeError | None:
     limit = seen.limits.missed_cycles
     for axis, age in zip(seen.drives.axes, seen.measurement.q_age, strict=True):
         if age > limit:
-            return NodeError(axis.node_id, f"lost: no TPDO for {age} cycles")
+            return NodeError(axis.node_id, f"lost: no usable TPDO for {age} cycles")
     return None
 
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.position_track import STEADY, PositionTrack
 from canprobe.errors import ProtocolError
 from canprobe.protocol.cia402 import DriveState, controlword_toward, state_of
 from canprobe.protocol.frames import Frame
@@ -20,6 +21,11 @@ Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
 _COMMAND_OBJECTS = (0x6040, 0x607A)
+
+
+def is_enabled(statusword: int) -> bool:
+    """Whether a statusword tells operation enabled; see `state_of` for the others."""
+    return statusword & 0x6F == DriveState.OPERATION_ENABLED.value
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +94,11 @@ class DriveGroup:
         self.missed = 0
         self.malformed = 0
         self.answer_ns = 0
+        self.implausible = 0
         self._model = model
         self._axis_of = {axis.feedback.cob_id: i for i, axis in enumerate(axes)}
-        self._counts = [0] * len(axes)
+        self._tracks = tuple(PositionTrack() for _ in axes)
+        self._deadline_ns = 0
         self._heard = [-1] * len(axes)
         self._targets: list[int] | None = None
         self._words = [0] * len(axes)
@@ -108,9 +116,10 @@ class DriveGroup:
         """COB-IDs of the TPDOs that belong to the group."""
         return frozenset(self._axis_of)
 
-    def begin(self, cycle: int, t_ns: int = 0) -> None:
-        """A new SYNC is out, at ``t_ns``: every TPDO is expected once more."""
+    def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
+        """A new SYNC is out, at ``t_ns``, meant for ``deadline_ns``: every TPDO is expected once more."""
         self._cycle = cycle
+        self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
         self._sync_ns = t_ns
         self._pending = len(self.axes)
         self._open = True
@@ -124,7 +133,7 @@ class DriveGroup:
         """Take one TPDO that arrived at ``t_ns``.
 
         One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used; nor
-        is one of another length.
+        is one of another length. The position of one that an enabled drive cannot have reached is not used.
         """
         i = self._axis_of[can_id]
         if not self._open or t_ns < self._sync_ns or self._heard[i] == self._cycle:
@@ -135,10 +144,14 @@ class DriveGroup:
         except ProtocolError:
             self.malformed += 1  # and missed, unless another one comes
             return
-        self.statuswords[i], self._counts[i], self.torque_permille[i] = values
+        word, counts, self.torque_permille[i] = values
+        enabled = is_enabled(word) and is_enabled(self.statuswords[i])
+        self.statuswords[i] = word
         self._heard[i] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
+        if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=enabled):
+            self.implausible += 1
 
     def end_collect(self) -> None:
         """The collection window of this cycle is over: what is not in is missed."""
@@ -151,12 +164,23 @@ class DriveGroup:
         return min(self._heard) >= 0
 
     def ages(self) -> tuple[int, ...]:
-        """Cycles since each drive was last heard."""
-        return tuple(self._cycle - heard for heard in self._heard)
+        """Cycles since each drive last told a position that can be believed."""
+        return tuple([self._cycle - track.cycle for track in self._tracks])
+
+    @property
+    def at_rest(self) -> bool:
+        """Every drive has told the same position for a while."""
+        return all(self.rests)
+
+    @property
+    def rests(self) -> tuple[bool, ...]:
+        """Whether each drive has told the same position for a while."""
+        return tuple([track.steady >= STEADY for track in self._tracks])
 
     def joints(self) -> Vector:
-        """Joint angles (6,), rad, as last reported."""
-        return counts_to_joints(self._model, np.array(self._counts, dtype=float))
+        """Joint angles (6,), rad, at this SYNC; where a report is missing, carried on for a few cycles."""
+        now_ns = self._deadline_ns
+        return counts_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
 
     @property
     def states(self) -> tuple[DriveState, ...]:
@@ -169,12 +193,16 @@ class DriveGroup:
 
     def set_target(self, q: Vector | None) -> None:
         """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
-        if q is not None:
-            self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
+        if q is None:
+            return
+        before = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
+        for track, target, last in zip(self._tracks, self._targets, before, strict=True):
+            track.aim(abs(target - last))
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
-        targets = self._targets if self._targets is not None else self._counts
+        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         key = (self.goal, *self.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
             words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]

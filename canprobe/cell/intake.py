@@ -44,7 +44,7 @@ class Intake:
         self._sync_times.append(t_ns)
         self._sync_stamps.append(sync_ns)
         if self.drives is not None:
-            self.drives.begin(number, sync_ns)
+            self.drives.begin(number, sync_ns, t_ns)
 
     def route(self, frames: list[TimedFrame]) -> list[TimedFrame]:
         """Take the PDOs among ``frames``; the others are returned."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from canprobe.cell.measurement import TactileSample
 from canprobe.cell.supervision import Limits, Vector
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan
 from canprobe.robot.kinematics import forward
@@ -63,3 +64,15 @@ def workspace_of(limits: LimitSettings) -> Vector | None:
     if low is None and high is None:
         return None
     return np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * 1e-3
+
+
+def force_of(scene: Scene) -> Callable[[TactileSample], float] | None:
+    """Force (N) of a tactile sample of the scene's sensor; None without one."""
+    if scene.sensor is None:
+        return None
+    from canprobe.cell.tasks.calibration import array_calibration
+    from canprobe.cell.tasks.sensing import patch_of
+
+    radius = {} if scene.probe is None else {"radius_m": scene.probe.radius_mm * 1e-3}
+    calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, **radius)
+    return lambda sample: patch_of(sample, calibration).force

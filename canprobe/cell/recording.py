@@ -73,7 +73,8 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
     """Read the frames of a plan's nodes from a log.
 
     Args:
-        path: the log; it may hold other nodes, other channels and error frames.
+        path: the log; it may hold other nodes, other channels and error frames. Where the plan has several buses, the
+            log has them by the plan's names, and they are read as one.
         plan: which identifiers and lengths to expect.
         as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order in which it
             took the frames in. False puts them into the order of the bus.
@@ -100,7 +101,11 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     channels: dict[str, _Channel] = {}
     error_frames = 0
-    for t_ns, name, can_id, data in read_log(path):
+    main, *others = [bus.channel for bus in plan.buses]
+    for t_ns, on, can_id, data in read_log(path):
+        if on in others and can_id == SYNC_ID:
+            continue  # the cell has one SYNC, which goes to all its buses
+        name = main if on in others else on
         channel = channels.get(name)
         if channel is None:
             channel = channels[name] = _Channel()

@@ -39,6 +39,7 @@ class Limits:
 
     Attributes:
         period_ns: of the cycle.
+        hold_cycles: without a TPDO of one drive after which all of them hold.
         missed_cycles: without a TPDO after which a drive is lost, and SYNCs after which it takes its master for dead.
         heartbeat_produced_ns, heartbeat_timeout_ns: between two heartbeats, and silence after which a node is lost.
         tactile_cycles: between two tactile frames.
@@ -55,6 +56,7 @@ class Limits:
     """
 
     period_ns: int
+    hold_cycles: int = 3
     missed_cycles: int = 5
     heartbeat_produced_ns: int = 100_000_000
     heartbeat_timeout_ns: int = 250_000_000

@@ -10,7 +10,7 @@ from canprobe.bus.port import ControllerState, PortCounters
 from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
 from canprobe.cell.joint_guard import JointGuard
 from canprobe.cell.measurement import Command, Measurement, TactileSample
-from canprobe.cell.supervision import Condition, Contact, Seen
+from canprobe.cell.supervision import Condition, Contact, Reaction, Seen
 from canprobe.errors import CanprobeError
 
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
@@ -80,13 +80,17 @@ class Supervisor:
                 self.first.setdefault(condition.key, measurement.cycle)
 
     def finding(self, *, enabling: bool = False) -> Finding | None:
-        """The first condition of the table that holds now."""
+        """The first condition of the table that holds now; a hold only where nothing worse is found."""
+        hold: Finding | None = None
         for condition in self._enabling if enabling else CYCLE_CHECKS:
             error = condition.check(self.seen)  # type: ignore[misc]  # CYCLE_CHECKS have one
-            if error is not None:
-                self.first.setdefault(condition.key, self.seen.measurement.cycle)
+            if error is None:
+                continue
+            self.first.setdefault(condition.key, self.seen.measurement.cycle)
+            if condition.reaction is not Reaction.HOLD:
                 return Finding(condition, error)
-        return None
+            hold = hold or Finding(condition, error)
+        return hold
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """What must not go on in a touch, whatever the controller thinks of it."""

@@ -77,7 +77,7 @@ def _plant_config(scene: Scene) -> PlantConfig:
         model=MODELS[arm.model] if arm is not None else None,
         T_flange_probe_centre=T_flange_probe(probe),
         radius_m=probe.radius_mm * 1e-3,
-        stiffness_n_m3=probe.stiffness_n_m3,
+        stiffness_n_m3=settings.stiffness_n_m3 or probe.stiffness_n_m3,
         damping_s_m=settings.contact_damping_s_m,
         object=true_object(scene.object) if scene.object is not None else None,
         taxels=_taxels(scene, settings),

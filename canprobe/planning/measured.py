@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
 
-Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "heartbeat", "NMT", "EMCY", "SDO"]
+Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "event PDO", "heartbeat", "NMT", "EMCY", "SDO"]
 TOLERANCE = 0.02
 """Share by which a count may differ from the plan; a frame of each message may always be missing at the edges."""
 
@@ -40,10 +40,15 @@ class ClassTraffic:
 
     @property
     def as_planned(self) -> bool:
-        """The count is the plan's within its tolerance, and its bits are no more than the worst case."""
+        """The count is the plan's within its tolerance, and its bits are no more than the worst case.
+
+        What is sent on a change, too, is planned at its slowest rate: there may be more of it.
+        """
         if self.planned_frames is None or self.planned_bits is None:
             return True
         allowed = max(TOLERANCE * self.planned_frames, self.messages)
+        if self.kind == "event PDO":
+            return self.frames >= self.planned_frames - allowed
         return abs(self.frames - self.planned_frames) <= allowed and self.bits <= self.planned_bits
 
 
@@ -119,7 +124,8 @@ class MeasuredTraffic:
         for one in self.classes:
             load = _load(one.bits, self.bitrate, self.duration_s)
             worst = _load(one.planned_bits, self.bitrate, self.duration_s)
-            planned = "" if one.planned_frames is None else f"{one.planned_frames:.0f}"
+            least = "≥ " if one.kind == "event PDO" else ""
+            planned = "" if one.planned_frames is None else f"{least}{one.planned_frames:.0f}"
             slowest = "" if one.slowest is None else f"{100 * one.slowest:.0f} %"
             note = "" if one.as_planned else "  not as planned"
             yield (

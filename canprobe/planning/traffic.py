@@ -22,7 +22,7 @@ from canprobe.scene import BusSettings
 
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
 _SYNC_BITS = worst_case_bits(_SYNC_BYTES)
-_SYNCHRONOUS = 240
+SYNCHRONOUS = 240
 
 
 def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
@@ -59,7 +59,7 @@ def plan_traffic(
 
 def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int) -> CycleMessages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
-    cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
+    cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
     feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.kind == "drive"]
     heartbeats = [
         Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
@@ -86,7 +86,7 @@ def _message(pdo: PlannedPdo, sync: SyncPlan, bitrate: int) -> Message:
 
 
 def _period_ns(pdo: PlannedPdo, sync: SyncPlan) -> int:
-    if pdo.transmission_type <= _SYNCHRONOUS:
+    if pdo.transmission_type <= SYNCHRONOUS:
         return sync.period_ns * pdo.transmission_type
     return round(1e9 / pdo.rate_hz)
 
@@ -106,7 +106,7 @@ def _parts(
 
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> tuple[Demand, ...]:
     """What one SYNC releases, and what a tactile frame waits for until its last PDO is through."""
-    cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
+    cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
     drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
     tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
     what = "SYNC and drive PDOs" if drives > _SYNC_BITS else "SYNC"

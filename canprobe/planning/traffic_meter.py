@@ -7,8 +7,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from canprobe.planning.measured import ClassTraffic, Kind, MeasuredTraffic
-from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus
-from canprobe.planning.traffic import on_the_wire
+from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus, PlannedPdo
+from canprobe.planning.traffic import SYNCHRONOUS, on_the_wire
 from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
@@ -39,11 +39,9 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
     shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.scene.bus.bitrate
     found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, worst_case_bits(sync_bytes)), Expected(NMT_ID, "NMT")]
     for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
-        kind: Kind = "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
-        triggered = pdo.response_ns is not None and pdo.transmission_type <= 240
+        triggered = pdo.transmission_type <= SYNCHRONOUS
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
-        kind = "tactile PDO" if pdo.kind == "tactile" else kind
-        found.append(Expected(pdo.cob_id, kind, pdo.rate_hz, pdo.bits_worst, latest))
+        found.append(Expected(pdo.cob_id, _kind(pdo), pdo.rate_hz, pdo.bits_worst, latest))
     beat = 1000 / HEARTBEAT_PRODUCED_MS
     for node in (*bus.node_ids, MASTER_NODE_ID):
         found.append(Expected(HEARTBEAT_BASE + node, "heartbeat", beat, worst_case_bits(1)))
@@ -51,6 +49,14 @@ def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
         found += [Expected(EMCY_BASE + node, "EMCY"), Expected(SDO_TX_BASE + node, "SDO")]
         found.append(Expected(SDO_RX_BASE + node, "SDO"))
     return {message.cob_id: message for message in found}
+
+
+def _kind(pdo: PlannedPdo) -> Kind:
+    if pdo.transmission_type > SYNCHRONOUS:
+        return "event PDO"
+    if pdo.kind == "tactile":
+        return "tactile PDO"
+    return "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
 
 
 @dataclass(slots=True)
@@ -118,9 +124,7 @@ class TrafficMeter:
             classes=tuple(self._classes(counts, ns * 1e-9)),
             unlisted={can_id: n for can_id, n in seen.items() if can_id not in self._expected},
             missing=tuple(
-                one.cob_id
-                for one in self._expected.values()
-                if one.kind in ("drive TPDO", "drive RPDO", "tactile PDO") and one.cob_id not in seen
+                one.cob_id for one in self._expected.values() if one.kind.endswith("PDO") and one.cob_id not in seen
             ),
             error_frames=self.error_frames,
             planned_worst=self._bus.traffic.load,

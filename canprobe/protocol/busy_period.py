@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Arrivals:
+class Arrivals(NamedTuple):
     """When the frames of one message are queued in a busy period that begins at 0.
 
     Attributes:
@@ -100,7 +100,7 @@ class Level:
 def _demand(messages: Sequence[Arrivals], t: int) -> int:
     """Time that the frames queued in [0, t) take; `Arrivals.before`, where it is called most."""
     demand = 0
-    for one in messages:
-        later = -((one.first - t) // one.period)
-        demand += (one.early + later if later > 0 else one.early) * one.cost
+    for cost, period, early, first in messages:
+        later = -((first - t) // period)
+        demand += (early + later if later > 0 else early) * cost
     return demand

@@ -64,6 +64,7 @@ CASES = (
     Case(("foxglove",), watched=True),
     Case(("ros2",)),
     Case(("ros2",), watched=True),
+    Case(("view",)),
     Case(("mcap", "foxglove", "ros2")),
 )
 

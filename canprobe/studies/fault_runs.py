@@ -45,7 +45,8 @@ RELEASE_NS = 100_000_000
 """Time that the retreat has, from its command, to bring the force below the limit."""
 AT_REST_RAD = 2e-4
 _KINDS = tuple(FaultKind)
-_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
+_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE)
+"""What the wire corrupts on the way to a node, its CRC drops; what a node itself corrupts has the right CRC."""
 
 
 class HangError(Exception):

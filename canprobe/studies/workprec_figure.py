@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 INK, FAINT = "#1f2933", "#d9dee4"
 COLOURS = {
-    "semi-implicit": "#b45309",
+    "semi-implicit": "#ca8a04",
     "rk4": "#c2410c",
     "implicit": "#64748b",
     "rosenbrock": "#0f6e84",
@@ -34,8 +34,8 @@ def draw_workprec(
     figure = Figure(figsize=(4.2 * len(floors), 10.0), dpi=110, layout="constrained")
     figure.suptitle(
         "Dynamic plant: error against processor time a cycle of 2.5 ms, each dot a step size\n"
-        "solid: mass matrix, bias and contact geometry held over a cycle; dotted: evaluated in every call; "
-        "ring: the default; grey: accurate enough",
+        "solid: mass matrix, bias and contact geometry held over a cycle; dotted: evaluated in every call\n"
+        "ring: the default; open: rattles against a contact of 10 MN/m; grey: accurate enough",
         x=0.01, ha="left", fontsize=11, color=INK,
     )  # fmt: skip
     grid = figure.subplots(len(MEASURES), len(floors), squeeze=False, sharex=True, sharey="row")
@@ -63,8 +63,14 @@ def _draw(axes: Axes, rows: Sequence[dict[str, Any]], key: str, floor: float, de
             mine = [r for r in rows if r["method"] == method and r["held"] is held]
             axes.plot(
                 [r["cost_us"] for r in mine], [max(r[key], floor) for r in mine], line, color=colour, linewidth=1.2,
-                marker="o", markersize=3.5, label=method if held else None,
+                label=method if held else None,
             )  # fmt: skip
+            for stands in (True, False):
+                dots = [r for r in mine if r["stands"] is stands]
+                axes.plot(
+                    [r["cost_us"] for r in dots], [max(r[key], floor) for r in dots], "o", color=colour, markersize=4.5,
+                    markerfacecolor=colour if stands else "white",
+                )  # fmt: skip
     chosen = [r for r in rows if all(r[name] == value for name, value in default.items())]
     axes.plot(
         [r["cost_us"] for r in chosen], [max(r[key], floor) for r in chosen], "o", markersize=12,

@@ -30,6 +30,7 @@ Array = npt.NDArray[np.float64]
 
 CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0
+NUDGE_COUNTS, AT_REST_COUNTS_S = 5.0, 20.0
 _POINT, _TOOL, _RADIUS = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0), 0.036
 
 
@@ -82,6 +83,28 @@ def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: boo
                 return None
     found = np.array(seen)
     return found if np.all(np.isfinite(found)) and np.abs(found).max() < 1e9 else None
+
+
+def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
+    """Whether the arm comes to rest in contact after a nudge of one motor, as it does in truth.
+
+    Args:
+        stiffness_n_m3: of the layer.
+        cycles: of 2.5 ms.
+        stepping: how it is integrated.
+    """
+    config, _ = trial(stiffness_n_m3, 1)
+    arm = DynamicArm(UPENN, config.q0, make_equations(config), stepping)
+    start, fastest = arm.motor_counts(0), []
+    arm.set_ramp(0, start, start + NUDGE_COUNTS, 0, CYCLE_NS)
+    with np.errstate(all="ignore"):
+        for k in range(cycles):
+            arm.advance((k + 1) * CYCLE_NS)
+            try:
+                fastest.append(max(map(abs, arm.motors()[1])))
+            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+                return False
+    return bool(max(fastest[-cycles // 4 :]) < AT_REST_COUNTS_S)  # false for NaN too
 
 
 def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:

@@ -5,9 +5,12 @@ import math
 import numpy as np
 import pytest
 
+import canprobe
 from canprobe.bridge.codec import pack_observation, unpack_observation
+from canprobe.bridge.source import SampleSource
 from canprobe.cell.measurement import Command, Measurement, TactileSample
 from canprobe.cell.observe import Observation
+from canprobe.planning import make_plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
 
 WINDOW = TactileFrame(
@@ -53,6 +56,16 @@ def test_frames_alone_and_a_command_without_an_arm():
     command = Command(columns={"phase": 3.0, "force_n": 1.0})
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
     assert got.phase == 3.0 and got.measurement.q is None
+
+
+@pytest.mark.parametrize(("value", "phase"), [(np.float64(2.5), 2.5), (np.int64(3), 3.0), (np.zeros(3), None)])
+def test_a_controller_of_ones_own_may_call_anything_a_phase(value, phase):
+    """Its columns are its own business: they neither stop the bridge nor are taken for our task's phases."""
+    command = Command(columns={"phase": value})
+    got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
+    assert got.phase == phase
+    sample = SampleSource(make_plan(canprobe.load_scene("free"))).sample(got)
+    assert sample.phase == ("scan" if phase == 3.0 else None)
 
 
 def test_an_estimate_keeps_what_was_not_observed():

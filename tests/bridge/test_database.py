@@ -93,3 +93,18 @@ def test_a_missing_extra_names_the_line_that_installs_it(monkeypatch, press_plan
     monkeypatch.setitem(sys.modules, "cantools", None)
     with pytest.raises(UsageError, match=r"needs cantools.*pip install 'canprobe\[can\]'"):
         write_database(press_plan, tmp_path, "dbc")
+
+
+def test_long_pdos_are_messages_of_can_fd(tmp_path):
+    scene = load_scene("listen")
+    scene = dataclasses.replace(
+        scene,
+        sensor=dataclasses.replace(scene.sensor, mode="image", eds="tactile_array_fd.eds"),
+        bus=dataclasses.replace(scene.bus, fd=True),
+    )
+    database = cantools.database.load_file(write_database(make_plan(scene), tmp_path, "dbc"))
+    message = database.get_message_by_frame_id(0x513)
+    assert (message.length, message.is_fd, len(message.signals)) == (64, True, 64)
+    assert not database.get_message_by_frame_id(0x511).is_fd
+    data = bytes(range(64))
+    assert message.decode(data) == {f"taxel_{64 + i}": i for i in range(64)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cantools
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -52,6 +53,11 @@ def test_profile_encodings_and_attachments(recorded):
     assert attachments["scene.toml"] == (recorded.folder / "scene.toml").read_bytes()
     for eds in ("puma260_joint.eds", "tactile_array.eds"):
         assert attachments[eds] == eds_path(eds).read_bytes()
+    frames = {
+        message.frame_id
+        for message in cantools.database.load_string(attachments["cylinder.dbc"].decode("cp1252")).messages
+    }
+    assert {pdo.cob_id for pdo in recorded.result.plan.pdos} <= frames
     assert json.loads(attachments["summary.json"]) == json.loads((recorded.folder / "summary.json").read_text())
     assert not (recorded.folder / "run.mcap.part").exists()
 
@@ -180,8 +186,10 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
 
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
     canprobe.run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
+    with (tmp_path / "scene.toml").open("a") as scene:
+        scene.write('\n[bridge]\nuse = ["ros2"]\n')  # fed the run, not its replay
     replayed = replay_into(tmp_path, ("mcap",))
-    assert replayed.result is None
+    assert replayed.result is None and replayed.bridges.keys() == {"mcap"}
     topics = [topic for topic, _, _ in messages_of(tmp_path / "run.mcap")]
     assert topics.count("/joint_states") > 40 and "/wrench" not in topics
 

@@ -59,12 +59,12 @@ def test_a_tpdo_twice_or_after_the_window_is_late_and_not_used():
     hear(group, [98.0] * 6)
     assert group.late == 12
     group.begin(1)
-    hear(group, [20.0] * 6, skip=(2,))
+    hear(group, [15.0] * 6, skip=(2,))
     group.end_collect()
     assert group.missed == 1
     assert group.ages() == (0, 0, 1, 0, 0, 0)
     counts = joints_to_counts(MODEL, group.joints())
-    assert counts == pytest.approx([20, 20, 10, 20, 20, 20], abs=1e-6)
+    assert counts == pytest.approx([15, 15, 10, 15, 15, 15], abs=1e-6)
 
 
 def test_a_tpdo_from_before_the_sync_is_late_though_it_is_read_afterwards():

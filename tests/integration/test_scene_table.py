@@ -23,6 +23,7 @@ TABLE = {
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 @pytest.mark.parametrize("name", TABLE)
 def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
     force_percent, kappa_percent = TABLE[name]
@@ -40,6 +41,7 @@ def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(600)
 def test_a_dynamic_arm_is_as_deterministic_and_keeps_the_force(tmp_path):
     scene = canprobe.load_scene("press")
     scene = replace(scene, plant=replace(scene.plant, fidelity="dynamic"))

@@ -205,11 +205,12 @@ def test_another_master():
 def test_missed_pdos_are_lived_with(kind):
     def lose(run):
         if kind is FaultKind.CORRUPT:
-            altered(run.nodes[5], 0x185, lambda data: data[:5])
+            twice = iter((5, 5))
+            altered(run.nodes[5], 0x185, lambda data: data[: next(twice, 8)])
             return
         run.fault(kind, 5, duration_ns=8_000_000, amount_ns=2_000_000)
 
-    run = Injected("free", FREE_CYCLE, lose, until=2 if kind is FaultKind.CORRUPT else 20)
+    run = Injected("free", FREE_CYCLE, lose, until=20)
     run.assert_counted("pdo_missed")
     if kind is FaultKind.CORRUPT:
         assert run.session.cell.drives.malformed > 0
@@ -218,7 +219,7 @@ def test_missed_pdos_are_lived_with(kind):
 def test_a_silent_drive():
     run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[5], 0x185, lambda _: None))
     run.assert_within("drive_silent").assert_drives_off()
-    assert "node 5: lost: no TPDO for 6 cycles" in str(run.error)
+    assert "node 5: lost: no usable TPDO for 6 cycles" in str(run.error)
 
 
 def test_torn_frames_are_dropped():
@@ -252,6 +253,34 @@ def test_a_stale_sensor_makes_the_probe_retreat():
     run.assert_within("sensor_stale").assert_drives_off()
     assert "no tactile frame for 13 cycles" in str(run.error)
     assert run.session.truth["force"][-1] == 0.0
+
+
+def test_a_drive_that_is_late_makes_all_of_them_hold():
+    """Four cycles without node 5: the others stand still meanwhile, then all go on."""
+    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.MUTE, 5, duration_ns=9_000_000), until=40)
+    assert run.error is None
+    targets = np.isfinite(run.session.cell.log.arrays()["q_target_rad"][:, 0])
+    held = np.flatnonzero(~targets[run.at : run.until]) + run.at
+    assert len(held) in (1, 2)
+    assert (held[0] - run.at) * run.limits.period_ns <= BY_KEY["drive_late"].within(run.limits)
+    assert any("node 5: no usable TPDO for 3 cycles: hold" in fault for fault in run.session.cell.faults)
+
+
+def test_a_wrong_position_is_not_believed():
+    def lie(run):
+        altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 60) + d[6:])
+
+    class Liar(Injected):
+        def after(self, measurement):
+            if measurement.cycle == self.at + 2:
+                self.nodes[2]._sent = type(self.nodes[2])._sent.__get__(self.nodes[2])
+
+    run = Liar("free", FREE_CYCLE, lie, until=40)
+    run.assert_counted("pdo_missed")
+    assert 2 <= run.session.cell.drives.implausible <= 3
+    q = run.session.cell.log.arrays()["q_rad"][run.at - 5 : run.at + 10, 1]
+    truth = run.session.truth["q"][run.at - 5 : run.at + 10, 1]
+    assert np.abs(q - truth).max() < 1e-3 < 60 / 7000, "sixty counts are 5 mrad"
 
 
 # the bus
@@ -446,15 +475,26 @@ def test_the_workspace_ends_an_own_controllers_motion():
     run.assert_drives_off()
 
 
-def test_a_measured_jump_that_no_joint_can_make():
-    def lie(run):
-        altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:])
+def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():
+    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
+    run.assert_within("drive_silent").assert_drives_off()
+    assert "node 2: lost: no usable TPDO for 6 cycles" in str(run.error)
+    assert np.abs(np.diff(run.session.truth["q"], axis=0)).max() < 0.01
 
-    run = Injected("free", FREE_CYCLE, lie)
+
+def test_a_measured_jump_that_no_joint_can_make():
+    """Where the guard of the positions is off, as it is until the drives are enabled."""
+
+    class Unguarded(Injected):
+        def after(self, measurement):
+            for track in self.session.cell.drives._tracks:
+                track._asked = 1e9
+
+    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
+    run = Unguarded("free", FREE_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
     run.assert_within("joint_speed").assert_drives_off()
     assert "joint 2 reports a motion of" in str(run.error)
-    q = run.session.truth["q"]
-    assert np.abs(np.diff(q, axis=0)).max() < 0.01
 
 
 def test_an_estimator_that_diverges_starts_afresh():
@@ -527,7 +567,7 @@ def test_a_full_disk(tmp_path):
             super()._run()
 
     def fill(run):
-        log = run.session._log
+        log = run.session._candump
 
         class Full:
             closed = False
@@ -580,7 +620,7 @@ def test_every_row_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
     special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
     special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
-    special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk"}
+    special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk", "drive_late": 'BY_KEY["drive_late"]'}
     for condition in CONDITIONS:
         assert special.get(condition.key, f'("{condition.key}")') in source, condition.key
     assert {c.reaction for c in CONDITIONS} == set(Reaction)

@@ -10,6 +10,7 @@ from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.cell.recording import read_recording
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.planning import make_plan
 
@@ -104,3 +105,19 @@ def test_emulated_nodes_on_two_real_buses_are_refused():
     scene = dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, interface="socketcan"))
     with pytest.raises(UsageError, match="share one plant"):
         canprobe.run(scene, files=False)
+
+
+def test_the_log_of_two_buses_is_read_as_the_one_the_cell_had(pressed):
+    result, frames = pressed
+    plan = result.plan
+    recording = read_recording(result.out / "bus.log", plan, as_taken=False)
+    main = [frame for frame in frames if frame[1] == "can0" and frame[2] == 0x080]
+    assert len(recording.syncs) == len(main)
+    for pdo in plan.pdos:
+        assert sum(frame[0] == pdo.cob_id for frame in recording.frames) == sum(f[2] == pdo.cob_id for f in frames)
+
+
+def test_each_bus_is_measured_against_its_own_part_of_the_plan(pressed):
+    result, _ = pressed
+    assert all(report["as_planned"] for report in result.summary["traffic"].values())
+    assert set(result.summary["traffic"]) == {"can0", "can1"}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 
 from canprobe.planning import make_plan
@@ -123,6 +125,17 @@ def test_too_many_frames_are_not_planned(plan):
     doubled = [f for f in course() for _ in range(2 if f[0] == 0x181 else 1)]
     report = measure(plan, doubled)
     assert not by_kind(report)["drive TPDO"].as_planned and not report.as_planned
+
+
+def test_what_is_sent_on_a_change_may_come_more_often_than_planned_but_not_less():
+    plan = make_plan(
+        dataclasses.replace(scene := load_scene("free"), arm=dataclasses.replace(scene.arm, grouped_rpdo=True))
+    )
+    for every_ms, planned in ((100, True), (50, True), (200, False)):
+        frames = [(0x080, b"\1", k * PERIOD) for k in range(801)]
+        frames += [(0x200 + n, bytes(2), k * 1_000_000 + n) for n in range(1, 7) for k in range(1, 2000, every_ms)]
+        frames.sort(key=lambda frame: frame[2])
+        assert by_kind(measure(plan, frames))["event PDO"].as_planned is planned, every_ms
 
 
 def test_strangers_are_named_wherever_they_are_in_the_log(plan):

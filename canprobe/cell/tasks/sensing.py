@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from canprobe.cell.measurement import Measurement, TactileSample
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import PumaModel
+from canprobe.touch.compliance import stiffness_from_slope
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
 from canprobe.touch.patch_image import MomentImage, Moments
@@ -20,6 +21,12 @@ if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
+SETTLING = 0.08
+"""Uncertainty of the curvatures over that of the probe at which they tell the layer's stiffness from the touch."""
+MOST_RATIO = 6.0
+"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
+REFUTED = 0.25
+"""Difference of the logarithms of two stiffnesses that the error of a touch does not explain."""
 HOLLOWEST = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
@@ -86,6 +93,7 @@ class ContactSensing:
         self.flange_probe = flange_probe
         self.radius = radius
         self.stiffness = stiffness
+        self._slope: float | None = None
         self.set_kappa(np.zeros(2))
         self.patch: Patch | None = None
         self.dropped = 0
@@ -102,13 +110,34 @@ class ContactSensing:
         self.patch = patch_of(measurement.tactile, self._calibration)
         return self.patch
 
-    def set_kappa(self, kappa: Vector) -> None:
+    def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
         """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
 
         An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
+        Where the stiffness of this very touch was felt, curvatures that are known less well are of no use.
+
+        Args:
+            kappa: 1/m.
+            sigma: standard deviation of the less certain one, 1/m.
         """
         possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        if self._slope is not None:
+            if sigma > SETTLING / self.radius:
+                return
+            self._settle_stiffness(stiffness_from_slope(self._slope, self.radius, possible))
         self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
+
+    def set_slope(self, slope: float) -> None:
+        """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
+        flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
+        self._slope = min(max(slope, flat / MOST_RATIO), flat * MOST_RATIO)
+        self._depth_at_1_n = 1.0 / self._slope
+
+    def _settle_stiffness(self, felt: float) -> None:
+        """What was felt, now that the curvature is known: believed where it refutes the stiffness that was stated."""
+        self._slope = None
+        if abs(math.log(felt / self.stiffness)) > REFUTED:
+            self.stiffness = felt
 
     def depth(self, force: float) -> float:
         """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""

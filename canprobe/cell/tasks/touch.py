@@ -16,6 +16,7 @@ from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
 from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
+CERTAIN = 0.12
+"""Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
@@ -126,6 +129,8 @@ class TouchTask:
         self._lost = 0.0
         self._contact: ContactSample | None = None
         self._depth0 = 0.0
+        self._push = PushFit()
+        self._push_from: tuple[Vector, Vector] | None = None
         self._pole0: Vector = np.zeros(3)
         self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
@@ -209,9 +214,26 @@ class TouchTask:
             elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._s.period_s
             self._servo.surface.correct(contact.p_base, contact.n_base, elapsed)
             self._sample_t = contact.t_s
+            if self.phase is Phase.SETTLE:
+                self._feel_stiffness(contact)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self._take_shape(contact)
         self._columns = self._columns_of(measurement, patch, contact)
+
+    def _feel_stiffness(self, contact: ContactSample) -> None:
+        """Learn from the growing force how stiff this touch is; what was measured so far moves with it, no bump."""
+        assert self._servo is not None
+        centre = contact.p_base + contact.n_base * (self.sensing.radius - self.sensing.depth(contact.force_n))
+        if self._push_from is None:
+            self._push_from = centre, contact.n_base
+        first, normal = self._push_from
+        self._push.add(float(normal @ (first - centre)), contact.force_n)
+        if self._push.certain(CERTAIN):
+            before = self.sensing.depth(contact.force_n)
+            self.sensing.set_slope(self._push.slope)
+            rise = self.sensing.depth(contact.force_n) - before
+            self._servo.surface.raise_by(rise)
+            self._depth0 += rise
 
     def _take_shape(self, contact: ContactSample) -> None:
         assert self.shape is not None and self._servo is not None
@@ -227,7 +249,8 @@ class TouchTask:
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             before = self.sensing.depth(contact.force_n)
-            self.sensing.set_kappa(np.asarray(estimate.kappa))
+            sigma = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance)[-1]))
+            self.sensing.set_kappa(np.asarray(estimate.kappa), sigma)
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
             if is_too_hollow(estimate, self.sensing.radius):

@@ -51,7 +51,7 @@ class DynamicSettings:
     velocity_feed_forward: float = 0.0
     torque_limit_permille: int = 2000
     method: str = "rosenbrock"
-    step_ns: int = 1_250_000
+    step_ns: int = 625_000
     hold_ns: int = 2_500_000
 
 

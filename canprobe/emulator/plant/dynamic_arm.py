@@ -38,7 +38,7 @@ class Stepping:
     """
 
     method: str = "rosenbrock"
-    step_ns: int = 1_250_000
+    step_ns: int = 625_000
     hold_ns: int = 2_500_000
 
 

@@ -1,0 +1,181 @@
+"""What a bus says about a cell, from listening alone: nodes, joints, touch, load and the steadiness of SYNC. Pure."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.port import TimedFrame
+from canprobe.cell.build import make_tactile
+from canprobe.cell.limits import force_of
+from canprobe.cell.measurement import TactileSample
+from canprobe.errors import ProtocolError
+from canprobe.planning.model import MASTER_NODE_ID, Plan
+from canprobe.protocol.cia402 import state_of
+from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
+from canprobe.protocol.timing import best_case_bits
+from canprobe.robot.puma260 import MODELS, counts_to_joints
+
+SECOND_NS = 1_000_000_000
+CLASSIC_BYTES = 8
+
+
+@dataclass(slots=True)
+class NodeView:
+    """One node as it is heard.
+
+    Attributes:
+        node_id, role: which.
+        state: NMT state of its last heartbeat; None before the first.
+        heard_s: time since that heartbeat, s; None before the first.
+        drive: CiA 402 state of its last statusword; None of a sensor or before the first.
+        emcy: its last emergency in words; None without one or after its end.
+    """
+
+    node_id: int
+    role: str
+    state: str | None = None
+    heard_s: float | None = None
+    drive: str | None = None
+    emcy: str | None = None
+
+
+@dataclass(slots=True, eq=False)
+class CellView:
+    """The cell at one instant; what was not heard is None.
+
+    Attributes:
+        channel: of the bus.
+        t_s: since the first frame, s.
+        nodes: ascending node ids, the master's heartbeat last.
+        q_deg: joint angles (6,), deg.
+        force_n: of the last whole tactile frame, N.
+        taxels: (16, 16) counts of that frame.
+        frames_per_s, load: of the last second; the load without stuff bits, as a share of the bit rate.
+        sync_hz: of the last second.
+        sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
+        torn_frames: tactile frames that were not whole.
+    """
+
+    channel: str
+    t_s: float = 0.0
+    nodes: list[NodeView] = field(default_factory=list)
+    q_deg: list[float] | None = None
+    force_n: float | None = None
+    taxels: NDArray[np.uint8] | None = None
+    frames_per_s: float = 0.0
+    load: float = 0.0
+    sync_hz: float = 0.0
+    sync_jitter_us: tuple[float, float] | None = None
+    torn_frames: int = 0
+
+    def as_document(self) -> dict[str, Any]:
+        """For `--json`."""
+        document = asdict(self)
+        document["taxels"] = self.taxels.tolist() if self.taxels is not None else None
+        return document
+
+
+class Monitor:
+    """Listens to the frames of a plan's nodes.
+
+    Args:
+        plan: what is on the bus.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._view = CellView(plan.scene.bus.channel)
+        roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
+        self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
+        arm = plan.scene.arm
+        self._model = MODELS[arm.model] if arm is not None else None
+        axes = enumerate(arm.node_ids if arm is not None else ())
+        self._feedback = {plan.pdos_of(n, "tpdo")[0].cob_id: (i, n, plan.pdos_of(n, "tpdo")[0].layout) for i, n in axes}
+        self._counts: list[int | None] = [None] * 6
+        self._tactile = make_tactile(plan)
+        self._force_of = force_of(plan.scene)
+        self._heard: dict[int, int] = {}
+        self._first_ns: int | None = None
+        self._recent: deque[tuple[int, int]] = deque()
+        self._syncs: deque[int] = deque()
+
+    def push(self, frames: Iterable[TimedFrame]) -> None:
+        """Take what was on the bus."""
+        for can_id, data, t_ns in frames:
+            if self._first_ns is None:
+                self._first_ns = t_ns
+            self._recent.append((t_ns, best_case_bits(min(len(data), CLASSIC_BYTES))))
+            self._take(can_id, data, t_ns)
+
+    def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
+        node = self._nodes.get(can_id & 0x7F)
+        if can_id == SYNC_ID:
+            self._syncs.append(t_ns)
+        elif can_id in self._feedback:
+            self._take_feedback(can_id, data)
+        elif self._tactile is not None and can_id in self._tactile.cob_ids:
+            self._take_taxels(can_id, data, t_ns)
+        elif node is not None and can_id == HEARTBEAT_BASE + node.node_id:
+            self._take_heartbeat(node, data, t_ns)
+        elif node is not None and can_id == EMCY_BASE + node.node_id and len(data) == CLASSIC_BYTES:
+            emcy = Emcy.unpack(data)
+            node.emcy = None if emcy.code == NO_ERROR else f"{emcy.code:04X}h, {describe(emcy.code)}"
+
+    def _take_feedback(self, can_id: int, data: bytes) -> None:
+        axis, node_id, layout = self._feedback[can_id]
+        try:
+            word, counts, *_ = layout.unpack(data)
+        except ProtocolError:
+            return
+        self._nodes[node_id].drive = state_of(word).name
+        self._counts[axis] = counts
+
+    def _take_taxels(self, can_id: int, data: bytes, t_ns: int) -> None:
+        assert self._tactile is not None
+        frame = self._tactile.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            self._view.taxels = frame.taxels
+            self._view.force_n = self._force_of(TactileSample(frame, t_ns, 0)) if self._force_of is not None else None
+
+    def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
+        try:
+            node.state = unpack_heartbeat(data).name
+        except ProtocolError:
+            return
+        self._heard[node.node_id] = t_ns
+
+    def view(self, now_ns: int) -> CellView:
+        """What is known at an instant."""
+        view = self._view
+        view.t_s = (now_ns - self._first_ns) * 1e-9 if self._first_ns is not None else 0.0
+        for node_id, node in self._nodes.items():
+            node.heard_s = (now_ns - self._heard[node_id]) * 1e-9 if node_id in self._heard else None
+        view.nodes = list(self._nodes.values())
+        counts = [c for c in self._counts if c is not None]
+        if self._model is not None and len(counts) == len(self._counts):
+            view.q_deg = np.degrees(counts_to_joints(self._model, np.array(counts, dtype=float))).tolist()
+        self._measure_bus(view, now_ns)
+        return view
+
+    def _measure_bus(self, view: CellView, now_ns: int) -> None:
+        while self._recent and self._recent[0][0] < now_ns - SECOND_NS:
+            self._recent.popleft()
+        while self._syncs and self._syncs[0] < now_ns - SECOND_NS:
+            self._syncs.popleft()
+        span_s = min(1.0, max(view.t_s, 1e-3))
+        view.frames_per_s = len(self._recent) / span_s
+        view.load = sum(bits for _, bits in self._recent) / (self._plan.scene.bus.bitrate * span_s)
+        view.sync_hz = len(self._syncs) / span_s
+        if len(self._syncs) > 2:
+            errors = np.abs(np.diff(np.array(self._syncs)) - self._plan.sync.period_ns) * 1e-3
+            view.sync_jitter_us = (float(np.percentile(errors, 99)), float(errors.max()))
+        if self._tactile is not None:
+            assembler = self._tactile.assembler
+            view.torn_frames = assembler.torn + assembler.crc_errors + assembler.orphans

@@ -1,0 +1,59 @@
+"""`canprobe monitor`: look at a running cell without sending anything: nodes, joints, force, taxels, load, jitter."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import sys
+
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import print_json
+from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds
+from canprobe.cli.target import target_of
+
+_EXAMPLE = """\
+examples:
+  canprobe monitor cylinder --bus socketcan --channel can0
+  canprobe monitor cylinder --bus socketcan --channel can0 --duration 2 --json
+"""
+
+
+def add_parser(commands: Commands[Parser]) -> None:
+    """Add the command."""
+    parser = commands.add_parser("monitor", help="look at a running cell", description=__doc__, epilog=_EXAMPLE)
+    add_scene(parser)
+    add_bus(parser)
+    parser.add_argument("--duration", metavar="S", type=seconds, help="end after this time [at Ctrl-C; 1 with --json]")
+    add_json(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show the cell ten times a second; with --json print it once, at the end."""
+    from canprobe.scene_loader import load_scene
+
+    scene = load_scene(args.scene)
+    target = target_of(args, scene)
+
+    from canprobe import api
+    from canprobe.cell.monitor_text import lines, screen
+
+    on_terminal = sys.stdout.isatty() and not args.json
+    duration_s = args.duration if args.duration is not None or on_terminal else 1.0
+    view = None
+    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+        for view in api.monitor(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            bitrate=target.bitrate,
+            duration_s=duration_s,
+        ):
+            if on_terminal:
+                sys.stdout.write(screen(view))
+                sys.stdout.flush()
+    if args.json and view is not None:
+        print_json(view.as_document())
+    elif not on_terminal and view is not None:
+        print("\n".join(lines(view)))
+    return 0

@@ -1,0 +1,82 @@
+"""What a session opens: buses in virtual time, the routes between several of them, and what counts their frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.planning import Plan
+from canprobe.planning.wire_bits import exact_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
+from canprobe.scene import BusSettings, Scene
+
+
+class TrafficCounter:
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
+
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
+        self._write = write
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
+
+    @property
+    def frames(self) -> int:
+        """Frames so far."""
+        return sum(self._by_length)
+
+    @property
+    def bits(self) -> int:
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Count one frame and pass it on."""
+        self._by_length[len(data)] += 1
+        self._write(can_id, data, t_ns)
+
+
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Of CAN FD frames, None where the scene has none."""
+    return bus.data_bitrate if bus.fd is True else None
+
+
+def channel_routes(plan: Plan) -> dict[int, str]:
+    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    for node in plan.nodes:
+        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+            routes[base + node.node_id] = node.channel
+    return routes
+
+
+def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    length = partial(exact_frame_bits, bus=bus)
+    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
+    timed.fd = bus.fd is True
+    return timed
+
+
+class Sink:
+    """What a RecordingPort writes to."""
+
+    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+        self.write = write

@@ -1,0 +1,124 @@
+"""The monitor hears of a cell what the cell and the plant know of themselves, and sends nothing."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.bus.candump import read_candump
+from canprobe.cell.monitor import Monitor
+from canprobe.cell.monitor_text import image_lines, lines, screen
+from canprobe.cli import main
+from canprobe.protocol.emcy import Emcy
+from canprobe.scene_loader import load_scene
+
+STEP_NS = 100_000_000
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory):
+    """A short press: its result, its frames, and the monitor at the end of the hold."""
+    folder = tmp_path_factory.mktemp("press")
+    result = canprobe.run(load_scene("press"), out=folder, duration_s=0.3)
+    frames = [(can_id, data, t_ns) for t_ns, _, can_id, data in read_candump(folder / "bus.log")]
+    return result, frames
+
+
+def heard(recorded, until_ns, change=lambda frames: frames):
+    result, frames = recorded
+    monitor = Monitor(result.plan)
+    frames = [frame for frame in change(frames) if frame[2] <= until_ns]
+    for start in range(0, until_ns, STEP_NS):
+        monitor.push(f for f in frames if start <= f[2] < start + STEP_NS)
+    return monitor.view(until_ns)
+
+
+@pytest.fixture(scope="module")
+def in_hold(recorded):
+    result, frames = recorded
+    row = int(np.flatnonzero(result.log["phase"] == 3)[-1]) - 1
+    syncs = [t for can_id, _, t in frames if can_id == 0x080]
+    return row, syncs[row], heard(recorded, syncs[row] + 1_000_000)
+
+
+def test_joints_force_and_image_are_those_of_the_cell(recorded, in_hold):
+    result, _ = recorded
+    row, _, view = in_hold
+    assert view.q_deg == pytest.approx(np.degrees(result.truth["q"][row]), abs=0.05)
+    assert view.force_n == pytest.approx(result.log["force_n"][row], abs=0.1)
+    assert view.taxels.max() > 50 and view.torn_frames == 0
+
+
+def test_nodes_and_their_states(in_hold):
+    _, _, view = in_hold
+    assert [n.node_id for n in view.nodes] == [1, 2, 3, 4, 5, 6, 16, 127]
+    assert {n.state for n in view.nodes} == {"OPERATIONAL"}
+    assert {n.drive for n in view.nodes[:6]} == {"OPERATION_ENABLED"}
+    assert view.nodes[6].drive is None and max(n.heard_s for n in view.nodes) < 0.11
+
+
+def test_load_and_sync(recorded, in_hold):
+    result, frames = recorded
+    _, t_ns, view = in_hold
+    assert view.sync_hz == pytest.approx(400, abs=1)
+    assert 0 < view.sync_jitter_us[1] < 135  # a SYNC waits for the frame on the wire
+    last = [f for f in frames if t_ns + 1_000_000 - 1_000_000_000 <= f[2] <= t_ns + 1_000_000]
+    assert view.frames_per_s == pytest.approx(len(last), abs=1)
+    assert 0.2 < view.load < result.plan.traffic.load
+
+
+def test_jitter_is_that_of_the_syncs(recorded, in_hold):
+    _, t_ns, _ = in_hold
+
+    def late(frames):
+        syncs = 0
+        for can_id, data, t in frames:
+            syncs += can_id == 0x080
+            yield can_id, data, t + 300_000 * (can_id == 0x080 and syncs % 100 == 0)
+
+    view = heard(recorded, t_ns + 1_000_000, late)
+    assert view.sync_jitter_us[1] == pytest.approx(300, abs=135)
+
+
+def test_a_silent_node_and_an_emergency_are_shown(recorded, in_hold):
+    _, t_ns, _ = in_hold
+
+    def trouble(frames):
+        yield from (f for f in frames if f[0] != 0x703 or f[2] < 1_000_000_000)
+        yield 0x084, Emcy(0x4310, 0x08).pack(), t_ns
+
+    text = "\n".join(lines(heard(recorded, t_ns + 1_000_000, lambda f: sorted(trouble(f), key=lambda x: x[2]))))
+    assert "joint 3" in text and "SILENT for" in text.split("joint 3")[1].splitlines()[0]
+    assert "EMCY 4310h, drive over-temperature" in text.split("joint 4")[1].splitlines()[0]
+
+
+def test_the_screen_is_plain_ansi_in_place(in_hold):
+    _, _, view = in_hold
+    text = screen(view)
+    assert text.startswith("\x1b[H") and text.endswith("\x1b[J") and text.count("\r\n") == len(list(lines(view)))
+    assert "node   1  joint 1        OPERATIONAL      OPERATION_ENABLED" in text
+    assert json.loads(json.dumps(view.as_document()))["q_deg"] == view.q_deg
+
+
+def test_the_image_is_the_right_way_round():
+    taxels = np.zeros((16, 16), np.uint8)
+    taxels[2, 5] = 200
+    rows = list(image_lines(taxels))
+    assert len(rows) == 16 and rows[2] == "  " + " " * 10 + "██" + " " * 20
+    assert all(not row.strip() for i, row in enumerate(rows) if i != 2)
+
+
+def test_nothing_heard_is_said_so():
+    monitor = Monitor(canprobe.plan(load_scene("cylinder")))
+    text = "\n".join(lines(monitor.view(0)))
+    assert text.count("not heard") == 8 and "joints" not in text
+    monitor.push([(0x181, b"\x00", 5), (0x701, b"", 6), (0x511, bytes(3), 7), (0x081, b"\1", 8)])
+    assert monitor.view(10).q_deg is None
+
+
+def test_a_lockstep_bus_cannot_be_monitored(capsys):
+    assert main(["monitor", "press"]) == 2
+    assert "lockstep" in capsys.readouterr().err

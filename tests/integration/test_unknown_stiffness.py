@@ -1,0 +1,30 @@
+"""The layer in the plant is another than the scene says: the servo feels it at the touch and keeps the force."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import canprobe
+from canprobe.scene import PlantSettings
+
+NOMINAL = 1.27e8  # N/m³: 9.4 kN/m at 2 N on the cylinder
+pytestmark = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("share", "rms_percent"),
+    [(0.35, 10.0), (4.5, 10.0), (18.0, 20.0)],
+    ids=["5.6 kN/m", "20 kN/m", "40 kN/m"],
+)
+def test_force_is_kept_without_retuning(share, rms_percent):
+    scene = canprobe.load_scene("cylinder")
+    plant = replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL)
+    assert scene.shape is not None
+    scene = replace(scene, plant=plant, shape=replace(scene.shape, also=()))
+    result = canprobe.run(scene, files=False, duration_s=2.0)
+    contact = result.summary["contact"]
+    assert contact["contact_fraction"] == 1.0
+    assert 100 * contact["force_rms_error_n"] / 2.0 < rms_percent
+    assert result.truth["force"].max() < 3.0  # approach included: no overshoot above 1.5 of the target

@@ -1,0 +1,85 @@
+"""Supervision on a real interface: it goes down in mid-run, the emulator stands still, the disk is full."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from typing import Any
+
+import pytest
+
+pytestmark = pytest.mark.vcan
+ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
+
+
+def link(*words: str) -> None:
+    subprocess.run(["ip", "link", "set", "vcan0", *words], check=True, capture_output=True)
+
+
+def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
+    command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=60)
+    bench.bus.port.close()
+    try:
+        link("down")
+        lines = command.end(3)
+    finally:
+        link("up")
+    assert any("vcan0" in line and ("down" in line or "lost" in line) for line in lines)
+    results = bench.results("results")
+    assert results.summary["completed"] is False
+    assert any("while stopping" in fault for fault in results.summary["faults"])
+
+
+def test_the_interface_comes_back_while_the_cell_stops(bench: Any) -> None:
+    command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=60)
+    link("down")
+    link("up")
+    command.end(3)
+    assert bench.results("results").summary["completed"] is False
+
+
+def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
+    command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "results")
+    bench.bus.until_enabled(6, by=command, cycles=60)
+    (child,) = command.children
+    os.kill(child, signal.SIGSTOP)
+    try:
+        (line,) = command.end(3)
+    finally:
+        os.kill(child, signal.SIGCONT)
+    assert "lost: no usable TPDO" in line
+
+
+def test_the_disk_is_full(bench: Any) -> None:
+    small = bench.folder / "small"
+    small.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", str(small)], check=True, capture_output=True)
+    try:
+        command = bench.start("run", bench.scene("free"), *ON_VCAN0, "--out", "small/results")
+        status = command.wait()  # of the stop, or of the files that cannot be written after it
+        lines = command.end(status)
+        assert status in (1, 3)
+        assert any("No space left" in line for line in lines)
+        text = (small / "results" / "bus.log").read_text()
+        assert text.endswith("\n") and text.count("\n") > 1000
+        bench.bus.hear()
+        bench.assert_left_safe(bench.bus.last, *range(1, 7))
+    finally:
+        subprocess.run(["umount", str(small)], check=True, capture_output=True)
+
+
+def test_monitor_sees_the_cell_and_sends_nothing(bench: Any) -> None:
+    command = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    bench.bus.until_enabled(1, by=command)
+    monitor = bench.start("monitor", bench.scene("free"), *ON_VCAN0, "--duration", "2", "--json")
+    monitor.end(0)
+    view = json.loads(monitor.out)
+    assert {node["state"] for node in view["nodes"]} == {"OPERATIONAL"}
+    assert {node["drive"] for node in view["nodes"][:6]} == {"OPERATION_ENABLED"}
+    assert 50 < view["sync_hz"] < 110 and view["q_deg"][0] == pytest.approx(90, abs=0.1)
+    command.send(signal.SIGINT)
+    command.end(0)
