@@ -102,7 +102,10 @@ class LogCycles:
                 intake.route(frames[seen:last])
             position = seen
             self._follow(frames[first:last])
-            yield LogCycle(measurement, self._known_targets(), self._enabled_by_master())
+            targets = self._known_targets()
+            if self.drives is not None and targets is not None:
+                self.drives.aim(targets)
+            yield LogCycle(measurement, targets, self._enabled_by_master())
 
     def _begin(self, t_ns: int, stamp_ns: int) -> None:
         self._intake.begin(self._intake.number + 1, t_ns, stamp_ns)
