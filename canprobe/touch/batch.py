@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, checked
+from canprobe.touch._arrays import Array, checked, solved
 from canprobe.touch.anchor import anchor, solution
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.evidence import evidence_of
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.noise import Correlation, Noise
 from canprobe.touch.nonlinear import fit
 from canprobe.touch.prior import Prior, path_extent
 from canprobe.touch.quadric import design
+from canprobe.touch.rank import spread_of
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
@@ -102,13 +104,16 @@ def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
     result = fit(d, stated.rows(length), touches.whitener())
+    has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, np.zeros(3), length)
+    free = anchor(result.free, T, np.zeros(3), length)
+    spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
     singular = np.linalg.svd(result.root, compute_uv=False)
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
-        solution(a, result.root, result.decision, math.isfinite(stated.sigma_curvature)),
+        solution(a, result.root, result.decision, has_prior),
         length=length,
         T_frame_contact=a.T_frame_contact,
         condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf,
@@ -118,4 +123,13 @@ def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
         method="ml",
         prior=stated.name,
         notes=notes,
+        evidence=evidence_of(free.c, solved(result.free_root.T, free.M.T).T, spread, length),
     )
+
+
+def _turned_spread(spread: Array, angle: float) -> Array:
+    """A covariance (2, 2) in axes turned by an angle (rad)."""
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s], [s, c]])
+    result: Array = R.T @ spread @ R
+    return result
