@@ -60,7 +60,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
     for _ in range(_ITERATIONS):
-        r, J, log_det = rows(c, d)
+        r, J, _ = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
         weight, cost = robust(square)
         w = np.sqrt(weight)[:, None]
@@ -69,10 +69,11 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             beyond = cost - float(weight @ square)
             rw, Jw = mixed(independent, rw[:, :, None])[:, :, 0], mixed(independent, Jw)
             cost = float(np.sum(rw * rw)) + beyond
-        # without log_det a large K, which explains any residual by noise of the points, would look good; without the
-        # prior's part a large c33 on a short path, which flattens f/|∇f|, would
+        # without the prior's part a large c33 on a short path, which flattens f/|∇f|, would look good. The noise's
+        # log-determinant has no place here: with the feet as unknowns it does not belong to the likelihood, and on
+        # tight curvature it draws K down by a tenth
         assumed = prior[0] @ c - prior[1]
-        cost += log_det + float(assumed @ assumed)
+        cost += float(assumed @ assumed)
         if cost > best_cost + 1e-3 * len(square) and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
