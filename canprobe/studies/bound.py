@@ -119,7 +119,7 @@ def measure(cell: tuple[Case, int]) -> list[dict[str, Any]]:
     )  # fmt: skip
     fit = partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
     bound = math.sqrt(float(FROBENIUS @ np.diag(C)))
-    exact = fit(ground.points, ground.normals)
+    exact = fit(ground.points, ground.normals, quadric=True)
     model_bias = _length(ground.error(exact.T_frame_contact, exact.K)) / bound
     why = reasons_outside(case, ground, C, model_bias)
     shared = {

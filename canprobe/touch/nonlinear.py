@@ -21,6 +21,8 @@ _MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
 _START_ROUNDS = 8
+_UPHILL = 0.05
+"""Rise of the cost that a step may bring: with wrong samples the equations' solution is not quite its minimum."""
 _PINNED = 10.0
 """How much narrower the linear start takes the prior on c13, c23, c33."""
 _GROSS = 60.0
@@ -74,7 +76,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
         # tight curvature it draws K down by a tenth
         assumed = prior[0] @ c - prior[1]
         cost += float(assumed @ assumed)
-        if cost > best_cost + 1e-3 * len(square) and halvings < 12:
+        if cost > (1.0 + _UPHILL) * best_cost and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
             continue
