@@ -39,7 +39,7 @@ def error(estimate, cubic=CUBIC):
     return np.array([D[0, 0], D[0, 1], D[1, 1]])
 
 
-@pytest.mark.parametrize("scale", [4.0, -4.0, 15.0])
+@pytest.mark.parametrize("scale", [4.0, -4.0, 8.0])
 def test_a_misfit_that_shows_is_corrected(scale):
     points, normals = felt(scale * CUBIC, 1e-9, 1e-9, 1)
     sigmas = {"sigma_point": 5e-6, "sigma_normal": 2e-4}
@@ -53,7 +53,7 @@ def test_a_misfit_that_shows_is_corrected(scale):
     assert np.array_equal(found.K, 2 * found.S[:2, :2])
 
 
-@pytest.mark.parametrize(("scale", "least", "plain_most"), [(1.0, 0.6, 0.45), (3.0, 0.90, 0.05), (20.0, 0.90, 0.05)])
+@pytest.mark.parametrize(("scale", "least", "plain_most"), [(1.0, 0.6, 0.45), (3.0, 0.90, 0.05), (8.0, 0.90, 0.05)])
 def test_regions_hold_the_truth_whether_it_shows_or_hides(scale, least, plain_most):
     """Half-way between, where a bias of one standard deviation cannot be told from noise, they hold it less often."""
     inside, plain_inside = [], []
