@@ -14,19 +14,23 @@ if TYPE_CHECKING:
     from canprobe.recorded import ReplayResult, replay
     from canprobe.scene_loader import load_scene
     from canprobe.surface_file import load_surface_map
+    from canprobe.tables import load_table
     from canprobe.touch.bound import cramer_rao
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.fit import fit_surface
     from canprobe.touch.surface import SurfaceMatrix
     from canprobe.touch.surface_map import SurfaceMap
+    from canprobe.traffic_log import measure_traffic
 
 __version__ = "0.1.0"
 
 _EXPORTS = {
     "load_scene": ("canprobe.scene_loader", "load_scene"),
     "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
+    "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
     "plan": ("canprobe.planning", "make_plan"),
     "run": ("canprobe.api", "run"),
+    "load_table": ("canprobe.tables", "load_table"),
     "open_cell": ("canprobe.api", "open_cell"),
     "replay": ("canprobe.recorded", "replay"),
     "ReplayResult": ("canprobe.recorded", "ReplayResult"),
@@ -49,6 +53,8 @@ __all__ = [
     "fit_surface",
     "load_scene",
     "load_surface_map",
+    "load_table",
+    "measure_traffic",
     "open_cell",
     "plan",
     "replay",

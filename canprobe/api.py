@@ -3,32 +3,45 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+import importlib
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from canprobe.bridging import Bridges
 from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, UsageError
+from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
-from canprobe.session import LOCKSTEP, Session, hush_canopen, resolve_scene
+from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
-__all__ = ["Command", "Measurement", "RunResult", "emulate", "emulate_eds", "open_cell", "run", "scan", "up"]
+__all__ = [
+    "Command",
+    "Measurement",
+    "Observation",
+    "RunResult",
+    "emulate",
+    "emulate_eds",
+    "open_cell",
+    "run",
+    "scan",
+    "up",
+]
 
-Say = Callable[[str], None]
+ROWS_OF_UP = 4000
+"""Cycles that :func:`up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
-
-
-def _quiet(_: str) -> None:
-    return
+AnyObserver = Observer | Callable[[Observation], None]
 
 
 def run(
@@ -36,24 +49,30 @@ def run(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
     progress: Progress | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
     files: bool = True,
+    observers: Sequence[AnyObserver] = (),
+    bridge: Sequence[str] = (),
 ) -> RunResult:
     """Carry out a scene's task and write what was measured.
 
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, bitrate: in the place of the scene's bus.
+        sensor_channel: the sensor's bus, where it is another one.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
         say: called with each step of bring-up and stop.
         files: False writes nothing.
+        observers: called after each cycle with what it saw, said and had on the bus (`Observation`).
+        bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
@@ -61,25 +80,53 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
     """
     resolved = resolve_scene(
-        scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed, duration_s=duration_s
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        duration_s=duration_s,
+        bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
-    session = Session(resolved, folder, say)
-    controller = make_task(session.plan)
+    plan = make_plan(resolved)
+    controller = make_task(plan)
     failure: BaseException | None = None
-    try:
-        with session:
-            session.run(controller, _report(progress, resolved.task.duration_s))
-    except (CanprobeError, KeyboardInterrupt) as error:
-        failure = error
-        if not session.opened:
-            raise
-    result = _finish(session, controller, failure)
+    with Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges:
+        session = Session(resolved, folder, say, (*observers, *bridges.observers))
+        try:
+            with session:
+                session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
+        except (CanprobeError, KeyboardInterrupt) as error:
+            failure = error
+            if not session.opened:
+                raise
+        result = _finish(session, controller, failure, bridges)
     if failure is not None:
         if isinstance(failure, CanprobeError):
             failure.summary = result.summary
         raise failure
     return result
+
+
+def _requested(
+    plan: Plan, task: Controller | None, make: Callable[[], Controller] | None, bridges: Bridges
+) -> Controller:
+    """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
+    if not bridges.requests:
+        return task if task is not None else _Hold()
+    from canprobe.cell.tasks.requested import RequestedTask
+
+    return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
+
+
+class _Hold:
+    """Stay where the drives are."""
+
+    def step(self, _: Measurement) -> Command:
+        """Nothing to do."""
+        return Command()
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -93,11 +140,12 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
     return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
 
 
-def _finish(session: Session, controller: object, failure: BaseException | None) -> RunResult:
+def _finish(session: Session, controller: object, failure: BaseException | None, bridges: Bridges) -> RunResult:
     estimates = _estimates(session.scene, controller)
     reason = None if failure is None else (str(failure) or "interrupted")
     surface_map, consistency, map_summary = _mapped(session.scene, controller)
-    summary = summarise(session, controller, estimates, reason, map_summary)
+    summary = summarise(session, controller, estimates, reason, map_summary=map_summary, bridges=bridges.status())
+    summary["bridges"] = bridges.end(summary)
     result = RunResult(
         session.plan,
         summary,
@@ -139,6 +187,10 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
 
 
 def _draw(result: RunResult, out: Path) -> None:
+    (out / "report.html").unlink(missing_ok=True)  # of an earlier run
+    if "report.html" in result.plan.outputs:
+        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
+        page.write_page(recorded.read_run(out), out / "report.html")
     try:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface
@@ -155,10 +207,14 @@ def open_cell(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
+    observers: Sequence[AnyObserver] = (),
+    bridge: Sequence[str] = (),
+    rows_kept: int | None = None,
 ) -> Iterator[Session]:
     """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
 
@@ -169,16 +225,30 @@ def open_cell(
 
     Args:
         scene: from :func:`canprobe.load_scene`.
-        interface, channel, bitrate, seed: in the place of the scene's.
+        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
+        observers, bridge: as for :func:`run`.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by 3 KiB a cycle.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed.
     """
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
-    with Session(resolved, Path(out) if out is not None else None, say) as session:
+    resolved = resolve_scene(
+        scene,
+        interface=interface,
+        channel=channel,
+        sensor_channel=sensor_channel,
+        bitrate=bitrate,
+        seed=seed,
+        bridge=bridge,
+    )
+    folder = Path(out) if out is not None else None
+    with (
+        Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
+        Session(resolved, folder, say, (*observers, *bridges.observers), rows_kept) as session,
+    ):
         yield session
 
 
@@ -187,8 +257,10 @@ def up(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
+    bridge: Sequence[str] = (),
 ) -> None:
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 
@@ -197,9 +269,16 @@ def up(
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    with open_cell(scene, interface=interface, channel=channel, bitrate=bitrate, say=say) as session:
-        say(f"the cell is up: nodes {', '.join(map(str, session.plan.node_ids))}; Ctrl-C stops it")
-        session.run(lambda _: Command())
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
+    )
+    plan = make_plan(resolved)
+    with (
+        Bridges(plan, None, virtual=False, say=say) as bridges,
+        Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
+    ):
+        say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

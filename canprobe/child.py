@@ -49,11 +49,15 @@ class EmulatorChild:
     Args:
         scene: the resolved scene.
         out: folder for ``truth.npz``; None uses a temporary one.
+        channel: the bus of its nodes.
+        truth: whether what is true is recorded, which grows with time.
     """
 
-    def __init__(self, scene: Scene, out: Path | None) -> None:
+    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True) -> None:
         self._scene = scene
+        self._channel = channel
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
+        self._wants_truth = truth
         self._truth = (out or self._folder) / "truth.npz"
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -68,9 +72,11 @@ class EmulatorChild:
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
-            *("--bus", bus.interface, "--channel", bus.channel, "--bitrate", str(bus.bitrate)),
-            *("--nodes", ",".join(str(n) for n in nodes), "--truth", str(self._truth), "--parent", str(os.getpid())),
+            *("--bus", bus.interface, "--channel", self._channel, "--bitrate", str(bus.bitrate)),
+            *("--nodes", ",".join(str(n) for n in nodes), "--parent", str(os.getpid())),
         ]
+        if self._wants_truth:
+            command += ["--truth", str(self._truth)]
         self._errors = (self._folder / "stderr").open("w+b")
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,
@@ -79,6 +85,12 @@ class EmulatorChild:
             stderr=self._errors,
             start_new_session=True,
         )
+
+    @property
+    def pid(self) -> int:
+        """Process id, once it is started."""
+        assert self._process is not None
+        return self._process.pid
 
     def await_boot_ups(self, port: Port) -> None:
         """Wait for the boot-up of each of its nodes.

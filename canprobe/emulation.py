@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.errors import NodeError, UsageError
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
-from canprobe.session import resolve_scene
+from canprobe.session import Say, data_bitrate, quiet, resolve_scene
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
     from canprobe.emulator.node import SlaveNode
     from canprobe.emulator.serve import Participant
-
-Say = Callable[[str], None]
-
-
-def _quiet(_: str) -> None:
-    return
 
 
 def emulate(
@@ -34,7 +28,7 @@ def emulate(
     seed: int | None = None,
     truth_path: Path | None = None,
     store_folder: Path | None = None,
-    say: Say = _quiet,
+    say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
 
@@ -55,16 +49,20 @@ def emulate(
     from canprobe.emulator.build import make_world
     from canprobe.planning import make_plan
 
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate, seed=seed)
+    split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
+    name = None if split else channel
+    resolved = resolve_scene(scene, interface=interface, channel=name, bitrate=bitrate, seed=seed)
     plan = make_plan(resolved)
-    with _free_port(interface, channel, bitrate, node_ids, "end that node, or name others with --nodes") as port:
+    fast = data_bitrate(plan.scene.bus)
+    way_out = "end that node, or name others with --nodes"
+    with _free_port(interface, channel, bitrate, node_ids, way_out, data_bitrate=fast) as port:
         rehearse(resolved)
-        world = make_world(plan, node_ids)
+        world = make_world(plan, node_ids, truth=truth_path is not None)
         _keep(world.nodes, store_folder)
         try:
-            _serve(world.participants, node_ids, port, channel, say)
+            _serve(world.participants, node_ids, port, say=say, in_realtime=resolved.cycle.realtime)
         finally:
-            if truth_path is not None:
+            if truth_path is not None and world.recorder is not None:
                 world.recorder.save(truth_path)
 
 
@@ -75,7 +73,8 @@ def emulate_eds(
     channel: str,
     bitrate: int,
     store_folder: Path | None = None,
-    say: Say = _quiet,
+    in_realtime: bool = False,
+    say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
 
@@ -83,6 +82,7 @@ def emulate_eds(
         files: (name or path of an EDS or DCF file, node id) of each node.
         interface, channel, bitrate: of the bus.
         store_folder: as for :func:`emulate`.
+        in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
         say: called with what is odd about the files, and when the nodes are there.
 
     Raises:
@@ -105,17 +105,25 @@ def emulate_eds(
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
         _keep(nodes, store_folder)
-        _serve(nodes, node_ids, port, channel, say)
+        _serve(nodes, node_ids, port, say=say, in_realtime=in_realtime)
 
 
 @contextlib.contextmanager
-def _free_port(interface: str, channel: str, bitrate: int, node_ids: tuple[int, ...], way_out: str) -> Iterator[Port]:
+def _free_port(
+    interface: str,
+    channel: str,
+    bitrate: int,
+    node_ids: tuple[int, ...],
+    way_out: str,
+    *,
+    data_bitrate: int | None = None,
+) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids."""
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
     from canprobe.bus.probe import answering_nodes
 
-    port = open_port(interface, channel, bitrate, MonotonicClock())
+    port = open_port(interface, channel, bitrate, MonotonicClock(), data_bitrate=data_bitrate)
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")
@@ -124,16 +132,18 @@ def _free_port(interface: str, channel: str, bitrate: int, node_ids: tuple[int, 
         port.close()
 
 
-def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, channel: str, say: Say) -> None:
+def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, *, say: Say, in_realtime: bool) -> None:
     from canprobe.bus.memory import reserve_memory
-    from canprobe.bus.priority import ask_for_processor
+    from canprobe.bus.priority import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.emulator.serve import serve
 
     reserve_memory()
     port.drain()  # what passed meanwhile
     ask_for_processor()
-    say(f"serving nodes {', '.join(map(str, node_ids))} on {channel}; Ctrl-C stops them")
-    serve(nodes, port, lambda: False)
+    favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
+    say(f"serving nodes {', '.join(map(str, node_ids))} on {port.channel}; Ctrl-C stops them")
+    with favour:
+        serve(nodes, port, lambda: False)
 
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:

@@ -77,10 +77,12 @@ class NodeError(BusError):
 
     Attributes:
         node_id: the node, 1–127.
+        reason: what it did or did not do.
     """
 
     def __init__(self, node_id: int, message: str) -> None:
         self.node_id = node_id
+        self.reason = message
         super().__init__(f"node {node_id}: {message}")
 
 

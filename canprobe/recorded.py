@@ -75,8 +75,8 @@ def replay(
         UsageError: no log or scene, an unknown method, a line that is not candump's, a node that was never heard, no
             SYNC, or no contact at all.
     """
-    path, folder = _find_log(Path(log))
-    plan = make_plan(_scene_of(path, folder, scene))
+    path, folder = find_log(Path(log))
+    plan = make_plan(scene_of(path, folder, scene))
     methods = _methods(plan.scene, method)
     as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
     recording = read_recording(path, plan, as_taken=as_taken)
@@ -101,8 +101,12 @@ def replay(
 # what to read
 
 
-def _find_log(log: Path) -> tuple[Path, Path | None]:
-    """The candump file; and the run's folder where it is one."""
+def find_log(log: Path) -> tuple[Path, Path | None]:
+    """The candump file; and the run's folder where it is one.
+
+    Raises:
+        UsageError: a folder without a log.
+    """
     if not log.is_dir():
         return log, None
     path = log / "bus.log"
@@ -111,7 +115,12 @@ def _find_log(log: Path) -> tuple[Path, Path | None]:
     return path, log
 
 
-def _scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
+def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
+    """The scene that was named, or the one beside the log.
+
+    Raises:
+        UsageError: there is neither.
+    """
     if isinstance(scene, Scene):
         return scene
     if scene is not None:

@@ -6,7 +6,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from canprobe.cell.cell import Cell
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
@@ -21,6 +22,10 @@ from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
+from canprobe.traffic_log import LOG, measure_traffic
+
+if TYPE_CHECKING:
+    import pandas
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -56,13 +61,52 @@ class RunResult:
         """The summary for people."""
         return summary_text(self.summary, self.out)
 
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (a row a cycle), `truth` (a row a SYNC), or `estimates` (a row an answer of the estimator in
+                the loop; see `estimates` for the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it, `canprobe.tables.parquet_to_npz` turns back.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.tables import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Array]:
+        if what == "estimates":
+            from canprobe.recorded_summary import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth
+
 
 def summarise(
     session: Session,
     controller: object,
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
+    *,
     map_summary: dict[str, Any] | None = None,
+    bridges: dict[str, dict[str, Any]] | None = None,
 ) -> dict[str, Any]:
     """The content of ``summary.json``; what does not apply is None."""
     scene, cell = session.scene, session.cell
@@ -84,11 +128,27 @@ def summarise(
         "shape": summarise_shape(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
-        "cycle": _cycle(cell, controller),
-        "bus_load": {scene.bus.channel: {"planned_worst": session.plan.traffic.load, "measured": session.bus_load}},
+        "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
+        "bus_load": {
+            bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+            for bus in session.plan.buses
+        },
+        "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
-        "faults": list(cell.faults),
+        "bridges": bridges,
+        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+
+
+def _traffic(session: Session) -> dict[str, Any]:
+    """What was on each bus beside the plan; on a real one counted afterwards, from the log."""
+    if session.out is None or session.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    log, plan = session.out / LOG, session.plan
+    try:
+        return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
+    except UsageError:  # it ended before the first SYNC
+        return {}
 
 
 def _scan(controller: object) -> tuple[int, int] | None:
@@ -225,6 +285,11 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
     }
 
 
+def _observed(session: Session) -> dict[str, float | None] | None:
+    """What observers and bridges added to a cycle, after its work; None without any."""
+    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
+
+
 def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
     if not values_ns:
         return dict.fromkeys(("p50", "p99", "p999", "max"))
@@ -274,9 +339,19 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         )
     if shape["method"] is not None:
         lines += shape_lines(shape)
+    lines += bridge_lines(summary.get("bridges") or {})
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
+
+
+def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What each bridge was given and lost, as lines for people."""
+    return [
+        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
+        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
+        for name, status in bridges.items()
+    ]
 
 
 def curvature_text(values: Sequence[float | None] | None) -> str:

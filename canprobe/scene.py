@@ -13,11 +13,16 @@ from canprobe.scene_checks import Direction, Distinct, Only, Pattern, Range, Sce
 
 TaskKind = Literal["scan", "press", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-TactileModeName = Literal["window", "image", "features"]
+Auto = Literal["auto"]  # the plan chooses
+TactileModeName = Literal["window", "image", "features", "auto"]
+CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
-ObjectKind = Literal["plane", "sphere", "cylinder", "saddle", "bowl", "quadric"]
+ObjectKind = Literal["plane", "sphere", "cylinder", "ellipsoid", "saddle", "bowl", "torus", "wave", "fillet", "quadric"]
 ArmModel = Literal["upenn", "unimate"]
-Fidelity = Literal["ideal"]
+Fidelity = Literal["ideal", "dynamic"]
+Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
+TransmitQueue = Literal["priority", "fifo"]
+BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
@@ -28,6 +33,9 @@ NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 TOUCHING = Only("kind", ("scan", "press"))
 SCANNING = Only("kind", ("scan",))
 FREE = Only("kind", ("free",))
+DYNAMIC = Only("fidelity", ("dynamic",))
+TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
+WAVE = Only("kind", ("wave",), required=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +54,12 @@ class BusSettings:
     interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
+    timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
+    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
+    fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
+    cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,6 +67,8 @@ class CycleSettings:
     """`[cycle]`: the rate of SYNC and servo."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
+    realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +82,7 @@ class ArmSettings:
     # selects the branch of the inverse kinematics; an emulated arm stands here in `free`, above the start in others
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
-    grouped_rpdo: bool = False  # two targets in one RPDO through dummy mapping
+    grouped_rpdo: bool | Auto = False  # two targets in one RPDO through dummy mapping
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +92,7 @@ class SensorSettings:
     node_id: NodeId = 16
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
     emulated: bool = True
+    channel: Annotated[str | None, Pattern(r"\S+", "without spaces")] = None  # a bus of its own; "auto" as it fits
     mode: TactileModeName = "window"
     rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
@@ -95,17 +112,26 @@ class ProbeSettings:
 class ObjectSettings:
     """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
 
-    The object frame's origin lies on the surface with z outward. The cylinder's axis runs along x; a saddle is
-    z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); a bowl is the inside of a
-    sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
+    The object frame's origin lies on the surface with z outward. A cylinder, a wave and a fillet are straight along
+    x: a wave is z = amplitude (cos(2π y/wavelength) − 1), a fillet an arc that turns by angle between two planes. A
+    saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); an ellipsoid has
+    three positive semi-axes; a torus lies flat, the origin on its crown, x outward from its axis; a bowl is the inside
+    of a sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
     radius_mm: Annotated[
-        float | None, Range(1, 100_000), Only("kind", ("sphere", "cylinder", "bowl"), required=True)
+        float | None,
+        Range(1, 100_000),
+        Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
     ] = None
-    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
-    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), Only("kind", ("saddle",), required=True)] = None
+    radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
+    ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None  # half of trough to crest
+    wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )
@@ -158,6 +184,21 @@ class LimitSettings:
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
     joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
+    workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
+    workspace_max_mm: Vec3 | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpSettings:
+    """`[bring_up]`: how long its steps may take, and what is done about those that take longer."""
+
+    listen_s: Annotated[float, Range(0, 60)] = 0.25  # for another master
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0  # from the reset to the boot-up message
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5  # for one answer
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0  # from NMT start to the heartbeat that tells it
+    retries: Annotated[int, Range(0, 100)] = 1  # of a reset and of a request without an answer
+    store: bool = False  # 1010h keeps the configuration in the nodes; 1020h tells the next bring-up to leave it out
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,9 +212,20 @@ class ServoSettings:
 
 @dataclass(frozen=True, slots=True)
 class PlantSettings:
-    """`[plant]`: how the emulated arm, contact and array behave."""
+    """`[plant]`: how the emulated arm, contact and array behave.
+
+    Fidelity `ideal`: each drive tracks as a second-order system, whatever it pushes against. `dynamic`: rigid links,
+    friction, drive cascade, and the object pushes back; the keys that say "dynamic" belong to it.
+    """
 
     fidelity: Fidelity = "ideal"
+    arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
+    integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 1250.0  # of the integrator
+    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
     noise: bool = True
@@ -182,6 +234,22 @@ class PlantSettings:
     hysteresis: bool = True
     creep: bool = True
     crosstalk: bool = True
+    saturation: bool = True
+    threshold: bool = True  # of the array itself, before the node's own
+
+
+@dataclass(frozen=True, slots=True)
+class BridgeSettings:
+    """`[bridge]`: the other tools that see this cell, each in a process of its own; `canprobe.planning.bridges`."""
+
+    use: Annotated[tuple[BridgeName, ...], Distinct()] = ()
+    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765  # 0 lets the system choose
+    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_domain: Annotated[int, Range(0, 232)] = 0
+    ros2_loopback: bool = True  # false lets other machines see the topics, and command the cell where that is allowed
+    view_port: Annotated[int, Range(0, 65_535)] = 8080  # 0 lets the system choose; where it is taken, the next free one
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    ros2_commands: bool = False  # start, stop, target force and speed are taken from topics, within the scene's limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +261,7 @@ class Scene:
     bus: BusSettings = BusSettings()
     cycle: CycleSettings = CycleSettings()
     limits: LimitSettings = LimitSettings()
+    bring_up: BringUpSettings = BringUpSettings()
     arm: ArmSettings | None = None
     sensor: SensorSettings | None = None
     probe: ProbeSettings | None = None
@@ -200,6 +269,7 @@ class Scene:
     shape: ShapeSettings | None = None
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
+    bridge: BridgeSettings | None = None
 
     @property
     def name(self) -> str:

@@ -98,6 +98,7 @@ class ScenePath:
     """A packaged file's name, or a path that is looked up beside the scene file first."""
 
 
+_UNIONS = (types.UnionType, typing.Union)
 CONDITIONS = (Only, ScenePath)
 """Annotations that say something about the key and nothing about its value."""
 
@@ -115,8 +116,8 @@ def convert(value: object, annotation: Any) -> Any:
     origin = typing.get_origin(annotation)
     if origin is typing.Annotated:
         return _checked(value, annotation)
-    if origin is types.UnionType:
-        return convert(value, next(part for part in typing.get_args(annotation) if part is not type(None)))
+    if origin in _UNIONS:
+        return _converted_choice(value, annotation)
     if origin is Literal:
         if value not in typing.get_args(annotation):
             raise MismatchError(expected(annotation))
@@ -124,6 +125,20 @@ def convert(value: object, annotation: Any) -> Any:
     if origin is tuple:
         return _converted_list(value, annotation)
     return _converted_scalar(value, annotation)
+
+
+def _members(annotation: Any) -> list[Any]:
+    """The members of a union besides None."""
+    return [part for part in typing.get_args(annotation) if part is not type(None)]
+
+
+def _converted_choice(value: object, annotation: Any) -> Any:
+    for part in _members(annotation):
+        try:
+            return convert(value, part)
+        except MismatchError:
+            continue
+    raise MismatchError(expected(annotation))
 
 
 def _checked(value: object, annotation: Any) -> Any:
@@ -160,6 +175,11 @@ def _converted_scalar(value: object, kind: Any) -> Any:
     return value
 
 
+def _expected_member(annotation: Any) -> str:
+    words = typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
+    return f'"{words[0]}"' if len(words) == 1 else expected(annotation)
+
+
 _NAMES = {float: ("a number", "numbers"), int: ("an integer", "integers"), str: ("text", "texts")}
 
 
@@ -169,8 +189,8 @@ def expected(annotation: Any) -> str:
     if origin is typing.Annotated:
         base, *checks = typing.get_args(annotation)
         return " ".join([expected(base), *(str(check) for check in checks if not isinstance(check, CONDITIONS))])
-    if origin is types.UnionType:
-        return expected(next(part for part in typing.get_args(annotation) if part is not type(None)))
+    if origin in _UNIONS:
+        return " or ".join(map(_expected_member, _members(annotation)))
     if origin is Literal:
         return "one of " + ", ".join(typing.get_args(annotation))
     if origin is tuple:
@@ -189,7 +209,9 @@ def choices_of(annotation: Any) -> tuple[str, ...]:
     origin = typing.get_origin(annotation)
     if origin is Literal:
         return typing.get_args(annotation)
-    if origin in (typing.Annotated, types.UnionType, tuple):
+    if origin in _UNIONS:
+        return tuple(word for part in _members(annotation) for word in choices_of(part))
+    if origin in (typing.Annotated, tuple):
         return choices_of(typing.get_args(annotation)[0])
     return ()
 

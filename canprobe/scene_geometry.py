@@ -46,11 +46,18 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     Raises:
         ValueError: for a matrix that is no surface through the object's origin with z outward.
     """
-    params: dict[str, object] = {
-        name: np.array(settings.matrix) if name == "matrix" else getattr(settings, f"{name}_mm") * 1e-3
-        for name in OBJECT_PARAMETERS[settings.kind]
-    }
+    params = {name: _parameter(settings, name) for name in OBJECT_PARAMETERS[settings.kind]}
     return make_object(settings.kind, T_base_object=T_base_object(settings), **params)
+
+
+def _parameter(settings: ObjectSettings, name: str) -> object:
+    """One parameter of the object in SI units."""
+    if name == "matrix":
+        return np.array(settings.matrix)
+    if name == "angle":
+        return math.radians(settings.angle_deg or 0.0)
+    length: float = getattr(settings, f"{name}_mm")
+    return length * 1e-3
 
 
 def T_flange_probe(probe: ProbeSettings) -> Array:

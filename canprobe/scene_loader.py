@@ -23,7 +23,7 @@ from canprobe.scene_writer import dump_scene, toml_value
 
 __all__ = ["dump_scene", "load_scene", "packaged_scenes", "parse_scene"]
 
-_ALWAYS = ("scene", "task", "bus", "cycle", "limits")
+_ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

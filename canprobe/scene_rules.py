@@ -104,6 +104,18 @@ def _saddle_radii(kind: str | None, x: float | None, y: float | None) -> str | N
     return f"expected the radii of a saddle to have opposite signs and 1 mm or more, got {x:g} and {y:g}"
 
 
+def _ellipsoid_radii(kind: str | None, x: float | None, y: float | None) -> str | None:
+    if kind != "ellipsoid" or x is None or y is None or min(x, y) >= 1:
+        return None
+    return f"expected the radii of an ellipsoid to be 1 mm or more, got {x:g} and {y:g}"
+
+
+def _torus_radii(kind: str | None, ring: float | None, tube: float | None) -> str | None:
+    if kind != "torus" or ring is None or tube is None or ring > tube:
+        return None
+    return f"expected more than object.radius_mm = {tube:g}, got {ring:g}"
+
+
 def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
     if kind not in ("scan", "press") or force is None or limit is None or force < limit:
         return None
@@ -123,6 +135,8 @@ RULES: tuple[Rule, ...] = (
     Rule("shape.also", ("shape.method", "shape.also"), _main_method_repeated),
     Rule("task.heading_deg", ("task.kind", "task.approach_normal", "task.heading_deg"), _heading_along_normal),
     Rule("object.radius_y_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _saddle_radii),
+    Rule("object.radius_x_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _ellipsoid_radii),
+    Rule("object.ring_radius_mm", ("object.kind", "object.ring_radius_mm", "object.radius_mm"), _torus_radii),
     Rule("task.force_n", ("task.kind", "task.force_n", "limits.force_max_n"), _force_target),
     Rule("sensor.rate_hz", ("cycle.rate_hz", "sensor.rate_hz"), _sensor_rate),
 )

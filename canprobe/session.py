@@ -6,9 +6,10 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
@@ -18,22 +19,35 @@ from numpy.typing import NDArray
 
 from canprobe.bus.candump import CandumpWriter, RecordingPort
 from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
+from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
 from canprobe.bus.port import Port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
-from canprobe.protocol.timing import best_case_bits
-from canprobe.scene import Scene
+from canprobe.planning.bridges import check_bridges
+from canprobe.planning.traffic_meter import TrafficMeter
+from canprobe.planning.wire_bits import exact_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
+from canprobe.scene import BridgeSettings, BusSettings, Scene
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
+Say = Callable[[str], None]
+"""Is told each step, in words."""
+
+
+def quiet(_: str) -> None:
+    """Tell nobody."""
 
 
 def resolve_scene(
@@ -44,8 +58,10 @@ def resolve_scene(
     bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
+    sensor_channel: str | None = None,
+    bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them."""
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
     bus = replace(
         scene.bus,
         interface=scene.bus.interface if interface is None else interface,
@@ -54,7 +70,19 @@ def resolve_scene(
     )
     info = scene.scene if seed is None else replace(scene.scene, seed=seed)
     task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    return replace(scene, bus=bus, scene=info, task=task)
+    sensor = scene.sensor
+    if sensor is not None and sensor_channel is not None:
+        sensor = replace(sensor, channel=sensor_channel)
+    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
 def hush_canopen() -> None:
@@ -68,11 +96,17 @@ def hush_canopen() -> None:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts."""
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
 
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
-        self._by_length = [0] * 9
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
 
     @property
     def frames(self) -> int:
@@ -81,8 +115,10 @@ class TrafficCounter:
 
     @property
     def bits(self) -> int:
-        """Bits so far."""
-        return sum(count * best_case_bits(n) for n, count in enumerate(self._by_length))
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Count one frame and pass it on."""
@@ -97,20 +133,37 @@ class Session:
         scene: what to bring up, resolved.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+
+    Attributes:
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None = None, say: Callable[[str], None] = lambda _: None) -> None:
-        self.scene = scene
+    def __init__(
+        self,
+        scene: Scene,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
+    ) -> None:
+        self._rows_kept = rows_kept
         self.plan: Plan = make_plan(scene)
+        self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
         self._bus_start_ns = 0
         self._bus_time_ns = 0
-        self.traffic: TrafficCounter | None = None
+        self.traffic: dict[str, TrafficCounter] = {}
+        self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
+        self._candump: CandumpWriter | None = None
         self.world: World | None = None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._cell: Cell | None = None
@@ -127,12 +180,11 @@ class Session:
         """The nodes were brought up; there is something to report."""
         return self._cell is not None and self._cell.cycle is not None
 
-    @property
-    def bus_load(self) -> float | None:
-        """Measured share of the bit rate, from the first frame to the last."""
-        if self.traffic is None or self._bus_time_ns <= 0:
+    def bus_load(self, channel: str) -> float | None:
+        """Measured share of a bus's bit rate, from the first frame to the last."""
+        if channel not in self.traffic or self._bus_time_ns <= 0:
             return None
-        return self.traffic.bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
+        return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
@@ -141,9 +193,18 @@ class Session:
             port = self._open()
             self._bus_start_ns = port.clock.now_ns()
             self._stack.callback(self._stop_watch, port)
-            self._cell = make_cell(self.plan, port, self._say)
-            self._stack.enter_context(garbage_collection_paused())
+            self._cell = make_cell(
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
+            )
+            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
+            self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
+            self._observe_frames(port)
         except BaseException:
             self._close()
             raise
@@ -167,6 +228,11 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
+            if self._cell is not None and (failure := self._log_failure()) is not None:
+                self._cell.faults.append(f"the log is not whole: {failure}")
+
+    def _log_failure(self) -> str | None:
+        return self._candump.failure if self._candump is not None else None
 
     def _stop_watch(self, port: Port) -> None:
         self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
@@ -176,14 +242,39 @@ class Session:
     def _open(self) -> Port:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _writer(self, t0_ns: int) -> Callable[[int, bytes, int], None]:
+    def _writer(self, channel: str, t0_ns: int) -> Callable[[int, bytes, int], None]:
         write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
-            self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus can be opened nothing is left behind
-            writer = self._stack.enter_context(CandumpWriter(self.out / "bus.log", self.scene.bus.channel, t0_ns=t0_ns))
-            write = writer.write
-        self.traffic = TrafficCounter(write)
-        return self.traffic.write
+            if self._candump is None:
+                self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
+            write = self._candump.on(channel)
+        if self.observers is not None:
+            self.observers.origin_ns = t0_ns
+            write = self.observers.tap(write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is counted afterwards, from the log
+            write = self._metered(channel, write)
+        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        self.traffic[channel] = counter
+        return counter.write
+
+    def _metered(self, channel: str, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
+        meter = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+
+        def both(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.write(can_id, data, t_ns)
+            write(can_id, data, t_ns)
+
+        return both
+
+    def _join(self, ports: dict[str, Port]) -> Port:
+        """One port for the cell, whatever the number of buses."""
+        return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
         from canprobe.emulator.build import make_world
@@ -191,13 +282,19 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
-        bus = self.lockstep = LockstepBus(VirtualClock(), self.scene.bus.channel)
-        bus.recorder = self._writer(0)
+        clock = VirtualClock()
+        buses = {bus.channel: _lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
+        for channel, bus in buses.items():
+            bus.recorder = self._writer(channel, 0)
+        self.lockstep = buses[self.plan.buses[0].channel]
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
-        for participant in self.world.participants:
-            bus.attach(participant)
-        return bus.port()
+        channel_of = {node.node_id: node.channel for node in self.plan.nodes}
+        for node in self.world.nodes:
+            buses[channel_of[node.node_id]].attach(self.joins(node))
+        if self.world.recorder is not None:
+            self.lockstep.attach(self.joins(self.world.recorder))
+        return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
         assert self.world is not None
@@ -217,14 +314,21 @@ class Session:
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
             )
+        if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
+            raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         clock = MonotonicClock()
-        real = open_port(bus.interface, bus.channel, bus.bitrate, clock)
-        self._stack.callback(real.close)
-        port = RecordingPort(real, _Sink(self._writer(clock.now_ns())))
+        t0_ns = clock.now_ns()
+        ports: dict[str, Port] = {}
+        for planned in self.plan.buses:
+            real = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
+            self._stack.callback(real.close)
+            ports[planned.channel] = RecordingPort(real, _Sink(self._writer(planned.channel, t0_ns)))
+        port = self._join(ports)
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
-            child = EmulatorChild(self.scene, self.out)
+            emulated = next(node.channel for node in self.plan.nodes if node.emulated)
+            child = EmulatorChild(self.scene, self.out, emulated, truth=self._rows_kept is None)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
@@ -232,10 +336,42 @@ class Session:
         reserve_memory()
         if child is not None:
             child.await_boot_ups(port)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
         return port
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+
+
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Of CAN FD frames, None where the scene has none."""
+    return bus.data_bitrate if bus.fd is True else None
+
+
+def channel_routes(plan: Plan) -> dict[int, str]:
+    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    for node in plan.nodes:
+        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+            routes[base + node.node_id] = node.channel
+    return routes
+
+
+def _lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import TimedBus
+    from canprobe.bus.wire_errors import BitErrors
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    length = partial(exact_frame_bits, bus=bus)
+    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
+    timed.fd = bus.fd is True
+    return timed
 
 
 class _Sink:

@@ -1,7 +1,8 @@
 """The EDS files of the cell's nodes: the contract from which master and emulator are both configured.
 
-    puma260_joint   nodes 1..6, a CiA 402 drive a joint       vendor CA5Eh, product 0260h, revision 0001_0000h
-    tactile_array   node 16, 16 × 16 taxels                   vendor CA5Eh, product 1616h, revision 0001_0000h
+    puma260_joint      nodes 1..6, a CiA 402 drive a joint    vendor CA5Eh, product 0260h, revision 0001_0000h
+    tactile_array      node 16, 16 × 16 taxels                vendor CA5Eh, product 1616h, revision 0001_0000h
+    tactile_array_fd   the same with PDOs of up to 64 bytes   vendor CA5Eh, product 161Fh, revision 0001_0000h
 
 The vendor number is this project's own choice; CiA has not assigned it. Source of the format: CiA 306-1.
 """
@@ -23,7 +24,10 @@ if TYPE_CHECKING:
 
 MISSED_SYNCS = 0x2000
 """Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
-_MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
+MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
+LONG_PDOS = 0x2007
+"""Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
+LONG_PDOS_NAME = "Long PDOs (CAN FD)"
 _FOLDER = Path(__file__).resolve().parent
 
 
@@ -52,11 +56,20 @@ def eds_path(name: str) -> Path:
 
 def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
     """Whether 2000h is that object here: another maker's drive may mean something else by the same index."""
-    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == _MISSED_SYNCS_NAME
+    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
 
 
-def _resolve(source: str | os.PathLike[str]) -> Path:
-    """A path stays a path; a bare word names a packaged file, unless a file of that name lies here."""
+def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2007h is that object here: the device can send PDOs in CAN FD frames."""
+    return LONG_PDOS in od and od[LONG_PDOS].name == LONG_PDOS_NAME
+
+
+def eds_file(source: str | os.PathLike[str]) -> Path:
+    """The file that a name or path means: a bare word names a packaged one, unless a file of that name lies here.
+
+    Raises:
+        EdsError: no such file.
+    """
     path = Path(source)
     if path.is_file():
         return path
@@ -85,7 +98,7 @@ def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.Obje
             merely untidy is accepted, see `check_eds`.
     """
     _check_node_id(name_or_path, node_id)
-    path = _resolve(name_or_path)
+    path = eds_file(name_or_path)
     return _parse(path, path.stat().st_mtime_ns, node_id)
 
 
@@ -103,7 +116,7 @@ def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) 
         _check_node_id(name_or_path, node_id)
     from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
 
-    return read_eds(_resolve(name_or_path), node_id)
+    return read_eds(eds_file(name_or_path), node_id)
 
 
 @lru_cache(maxsize=64)

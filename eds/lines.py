@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from canprobe.eds.faults import Faults
 
-_LINE_END = re.compile(r"\r\n|\n|\r")
+LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
 _UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 
@@ -63,7 +63,7 @@ def decode(data: bytes, faults: Faults) -> str:
         if data.startswith(_UTF16):
             faults.fault(0, "", "", f"not a text file: {error.reason}")
             return ""
-        line = len(_LINE_END.split(data[: error.start].decode("latin-1")))
+        line = len(LINE_END.split(data[: error.start].decode("latin-1")))
         faults.warn(line, "", "", f"byte {data[error.start]:02X}h is not UTF-8; the file is read as Latin-1")
         text = data.decode("latin-1")
     if "\0" in text:
@@ -77,7 +77,7 @@ def split_sections(text: str, faults: Faults) -> Sections:
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
     current: Section | None = None
-    for number, raw in enumerate(_LINE_END.split(text), start=1):
+    for number, raw in enumerate(LINE_END.split(text), start=1):
         line = raw.strip()
         if not line or line[0] in ";#":
             continue

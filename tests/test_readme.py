@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from canprobe.cell.supervision_text import markdown_table
 from canprobe.cli import COMMANDS
 
 README = Path(__file__).resolve().parent.parent / "README.md"
@@ -32,3 +33,7 @@ def test_commands_in_the_readme_exist():
         re.findall(r"^canprobe (\w+)|-- canprobe (\w+)|&& canprobe (\w+)", README.read_text(encoding="utf-8"), re.M)
     )
     assert {name for names in used for name in names if name} <= set(COMMANDS)
+
+
+def test_the_table_of_conditions_is_the_one_that_supervises():
+    assert markdown_table() in README.read_text(encoding="utf-8"), "print it: canprobe.cell.supervision_text"

@@ -135,6 +135,11 @@ class MonotonicClock:
                 raise OSError(status, os.strerror(status))
 
 
+def epoch_now_ns() -> int:
+    """The time of day in ns since the Unix epoch, for what leaves this machine; nothing is decided by it."""
+    return time.time_ns()
+
+
 def elapsed_ns() -> int:
     """A running count of real nanoseconds, to measure what something costs; never to decide anything.
 

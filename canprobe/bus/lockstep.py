@@ -16,13 +16,14 @@ from heapq import heapify, heappop, heappush
 from typing import Protocol
 
 from canprobe.bus.clock import VirtualClock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import BusError, InterfaceError
+from canprobe.protocol.frame_bits import FD_LENGTHS
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
 
-_MAX_LENGTH = 8
+_CLASSIC_BYTES = 8
 
 
 class Participant(Protocol):
@@ -50,12 +51,12 @@ class Participant(Protocol):
         ...
 
 
-_Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node"]
-_Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "_Node", Container[int] | None]
+Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "BusNode"]
+_Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "BusNode", Container[int] | None]
 """How to call a participant, its queue, and the identifiers it listens to (None: all)."""
 
 
-class _Node:
+class BusNode:
     """The bus's view of one sender: its queue, and where its frames go."""
 
     __slots__ = ("due", "inboxes", "listeners", "order", "outbox", "owner", "receivers")
@@ -66,7 +67,7 @@ class _Node:
         self.outbox: deque[Frame] = deque()
         self.due: int | None = None  # the owner's deadline, as last seen
         self.receivers: tuple[_Receiver, ...] = ()
-        self.listeners: dict[int, tuple[_Listener, ...]] = {}  # of an identifier, found once until somebody reroutes
+        self.listeners: dict[int, tuple[Listener, ...]] = {}  # of an identifier, found once until somebody reroutes
         self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
 
 
@@ -77,17 +78,21 @@ class LockstepBus:
         clock: virtual time, possibly shared with other buses.
         channel: the bus's name in messages and logs.
         max_frames: frames at one instant above which the participants are taken to answer each other for ever.
+        fd: frames of up to 64 bytes are carried too.
     """
 
-    def __init__(self, clock: VirtualClock, channel: str = "can0", *, max_frames: int = 20_000) -> None:
+    def __init__(
+        self, clock: VirtualClock, channel: str = "can0", *, max_frames: int = 20_000, fd: bool = False
+    ) -> None:
+        self.fd = fd
         self.clock = clock
         self.channel = channel
         self.recorder: Recorder | None = None
         self._max_frames = max_frames
         self._count = 0
-        self._nodes: list[_Node] = []
-        self._participants: tuple[tuple[_Node, Participant], ...] = ()
-        self._heads: list[tuple[int, int, _Node]] = []
+        self._nodes: list[BusNode] = []
+        self._participants: tuple[tuple[BusNode, Participant], ...] = ()
+        self._heads: list[tuple[int, int, BusNode]] = []
         self._settling = False
         clock.attach(self)
 
@@ -140,7 +145,7 @@ class LockstepBus:
         finally:
             self._settling = False
 
-    def send(self, node: _Node, frames: Sequence[Frame]) -> None:
+    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
         """Queue the frames of a port and carry everything due."""
         self._queue(node, frames)
         self.settle()
@@ -167,17 +172,14 @@ class LockstepBus:
             outbox = sender.outbox
             can_id, data = outbox.popleft()
             if outbox:
-                heappush(heads, (_arbitration(outbox[0][0]), sender.order, sender))
+                heappush(heads, (arbitration_key(outbox[0][0]), sender.order, sender))
             limit -= 1
             if limit < 0:
-                what = f"{can_id:03X} from {_name(sender.owner)} is frame {self._max_frames + 1} of this instant"
+                what = f"{can_id:03X} from {name_of(sender.owner)} is frame {self._max_frames + 1} of this instant"
                 raise self._endless(t_ns, what)
             if recorder is not None:
                 recorder(can_id, data, t_ns)
-            listeners = sender.listeners.get(can_id)
-            if listeners is None:
-                listeners = sender.listeners[can_id] = _listeners(sender, can_id)
-            for receive, receiver in listeners:
+            for receive, receiver in self._listeners_of(sender, can_id):
                 answers = receive(can_id, data, t_ns)
                 receiver.due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
                 if answers:
@@ -187,22 +189,34 @@ class LockstepBus:
                 put(frame)
         return limit
 
-    def _queue(self, node: _Node, frames: Sequence[Frame]) -> None:
+    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
         if not frames:
             return
-        for can_id, data in frames:
-            if len(data) > _MAX_LENGTH:
-                raise BusError(
-                    f"{self.channel}: {_name(node.owner)} sends {len(data)} bytes with {can_id:03X}; CAN has 8"
-                )
+        for frame in frames:
+            self._check(node, frame)
         if not node.outbox:
-            heappush(self._heads, (_arbitration(frames[0][0]), node.order, node))
+            heappush(self._heads, (arbitration_key(frames[0][0]), node.order, node))
         node.outbox.extend(frames)
 
-    def _add(self, owner: Participant | LockstepPort) -> _Node:
+    def _check(self, node: BusNode, frame: Frame) -> None:
+        can_id, data = frame
+        if len(data) > _CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
+            has = f"CAN FD has {', '.join(map(str, FD_LENGTHS[9:]))} above 8" if self.fd else "CAN has 8"
+            raise BusError(f"{self.channel}: {name_of(node.owner)} sends {len(data)} bytes with {can_id:03X}; {has}")
+
+    @staticmethod
+    def _listeners_of(sender: BusNode, can_id: int) -> tuple[Listener, ...]:
+        listeners = sender.listeners.get(can_id)
+        if listeners is None:
+            listeners = sender.listeners[can_id] = tuple(
+                (receive, node) for receive, node, listens in sender.receivers if listens is None or can_id in listens
+            )
+        return listeners
+
+    def _add(self, owner: Participant | LockstepPort) -> BusNode:
         if any(node.owner is owner for node in self._nodes):
-            raise BusError(f"{self.channel}: {_name(owner)} is on the bus already")
-        node = _Node(owner, self._count)
+            raise BusError(f"{self.channel}: {name_of(owner)} is on the bus already")
+        node = BusNode(owner, self._count)
         self._count += 1
         self._nodes.append(node)
         self._connect()
@@ -233,7 +247,7 @@ class LockstepBus:
 
     def _names_due(self, t_ns: int) -> str:
         return ", ".join(
-            _name(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns
+            name_of(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns
         )
 
     def _endless(self, t_ns: int, what: str) -> BusError:
@@ -243,22 +257,23 @@ class LockstepBus:
         return BusError(f"{self.channel}: no end at {t_ns * 1e-9:.6f} s: {what}")
 
 
-def _listeners(sender: _Node, can_id: int) -> tuple[_Listener, ...]:
-    return tuple((r, node) for r, node, listens in sender.receivers if listens is None or can_id in listens)
-
-
 class LockstepPort:
-    """A master's `Port` on a `LockstepBus`; see there for the order of frames."""
+    """A master's `Port` on a `LockstepBus`; see there for the order of frames.
 
-    __slots__ = ("_bus", "_open", "counters", "inbox", "node")
+    Attributes:
+        state: of a controller that this bus does not have: as it was set, to see what a cell does about it.
+    """
 
-    node: _Node
+    __slots__ = ("_bus", "_open", "counters", "inbox", "node", "state")
+
+    node: BusNode
 
     def __init__(self, bus: LockstepBus) -> None:
         self._bus = bus
         self._open = True
         self.inbox: list[TimedFrame] = []
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
 
     @property
     def clock(self) -> VirtualClock:
@@ -306,7 +321,7 @@ class LockstepPort:
             raise InterfaceError(f"{self.channel}: this port is closed")
 
 
-def _arbitration(can_id: int) -> int:
+def arbitration_key(can_id: int) -> int:
     """Return the bits in the order in which the wire arbitrates them: the lowest value wins (ISO 11898-1)."""
     if can_id <= 0x7FF:
         return can_id << 21
@@ -317,6 +332,6 @@ def _arbitration(can_id: int) -> int:
     return (can_id & 0x7FF) << 21 | remote << 20
 
 
-def _name(owner: object) -> str:
+def name_of(owner: object) -> str:
     """Name a participant in a message: its own `name` if it has one."""
     return str(getattr(owner, "name", type(owner).__name__))

@@ -10,7 +10,13 @@ from canprobe.errors import InterfaceError
 
 
 def open_port(
-    interface: str, channel: str, bitrate: int, clock: Clock, *, filters: Sequence[CanFilter] | None = None
+    interface: str,
+    channel: str,
+    bitrate: int,
+    clock: Clock,
+    *,
+    filters: Sequence[CanFilter] | None = None,
+    data_bitrate: int | None = None,
 ) -> Port:
     """Open `channel` of `interface`.
 
@@ -20,6 +26,7 @@ def open_port(
         bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
         clock: a clock in real time.
         filters: what is let in; everything by default.
+        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
 
     Raises:
         InterfaceError: it is missing, down, or cannot be opened; with what to do.
@@ -27,9 +34,9 @@ def open_port(
     if interface == "socketcan":
         from canprobe.bus.socketcan import SocketCanPort
 
-        return SocketCanPort(channel, clock, filters=filters)
+        return SocketCanPort(channel, clock, filters=filters, fd=data_bitrate is not None)
     if interface == "lockstep":
         raise InterfaceError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
     from canprobe.bus.pythoncan import PythonCanPort
 
-    return PythonCanPort(interface, channel, bitrate, clock, filters=filters)
+    return PythonCanPort(interface, channel, bitrate, clock, filters=filters, data_bitrate=data_bitrate)

@@ -13,7 +13,7 @@ from enum import IntEnum
 from typing import Protocol
 
 from canprobe.bus.clock import Clock
-from canprobe.protocol.frames import RTR_FLAG, Frame
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 __all__ = [
     "EFF_FLAG",
@@ -27,7 +27,6 @@ __all__ = [
     "TimedFrame",
 ]
 
-EFF_FLAG = 0x80000000
 ERR_FLAG = 0x20000000
 
 TimedFrame = tuple[int, bytes, int]
@@ -83,6 +82,11 @@ class Port(Protocol):
     @property
     def counters(self) -> PortCounters:
         """What has passed since the port was opened."""
+        ...
+
+    @property
+    def state(self) -> ControllerState:
+        """The CAN controller's error state, as far as the port can tell."""
         ...
 
     @property

@@ -1,12 +1,18 @@
-"""The processor's favour, where it can be had."""
+"""The processor's favour and the memory's, where they can be had."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+from collections.abc import Callable, Iterator
 
 FAVOURED = -15
 """Nice value asked for."""
+MASTER_PRIORITY = 40
+DEVICE_PRIORITY = 50
+"""SCHED_FIFO priorities. Emulated nodes come first: a real device answers whatever the master is busy with."""
+_MCL_CURRENT, _MCL_FUTURE = 1, 2
 
 
 def ask_for_processor() -> bool:
@@ -19,3 +25,52 @@ def ask_for_processor() -> bool:
         os.setpriority(os.PRIO_PROCESS, 0, FAVOURED)
         return True
     return False
+
+
+@contextlib.contextmanager
+def realtime(priority: int, say: Callable[[str], None], *, processor_from_last: int = 0) -> Iterator[None]:
+    """Within the block this process is scheduled by SCHED_FIFO, on one processor, with its memory locked.
+
+    Each of the three is asked for by itself; what is not permitted is said, with the way to it, and done without.
+    Everything is given back at the end.
+
+    Args:
+        priority: SCHED_FIFO priority, 1–99; interrupt threads of a PREEMPT_RT kernel have 50.
+        say: is told what was not permitted.
+        processor_from_last: 0 for the last processor, 1 for the one before it; no choice where there are not so many.
+    """
+    wishes: tuple[tuple[Callable[[], Callable[[], object]], str, str], ...] = (
+        (lambda: _fifo(priority), f"SCHED_FIFO priority {priority}", "run as root, or allow it: ulimit -r 50"),
+        (lambda: _pinned(processor_from_last), "processor of its own", "see taskset -p"),
+        (_locked, "locked memory", "run as root, or allow it: ulimit -l unlimited"),
+    )
+    with contextlib.ExitStack() as stack:
+        for ask, what, way in wishes:
+            try:
+                stack.callback(ask())
+            except (OSError, AttributeError) as error:
+                say(f"real time: no {what}: {getattr(error, 'strerror', None) or 'not on this system'}; {way}")
+        yield
+
+
+def _fifo(priority: int) -> Callable[[], None]:
+    policy, before = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    return lambda: os.sched_setscheduler(0, policy, before)
+
+
+def _pinned(from_last: int) -> Callable[[], None]:
+    before = os.sched_getaffinity(0)
+    processors = sorted(before)
+    if len(processors) > from_last + 1:
+        os.sched_setaffinity(0, {processors[-1 - from_last]})
+    return lambda: os.sched_setaffinity(0, before)
+
+
+def _locked() -> Callable[[], object]:
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.mlockall(_MCL_CURRENT | _MCL_FUTURE):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+    unlock: Callable[[], object] = libc.munlockall
+    return unlock

@@ -14,11 +14,21 @@ from typing import Any
 import can
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, Frame, PortCounters, TimedFrame
+from canprobe.bus.echoes import Echoes
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
+from canprobe.protocol.frame_bits import FD_LENGTHS
 
 _STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
+CLASSIC_BYTES = 8
+_STATES = {
+    can.BusState.ACTIVE: ControllerState.ACTIVE,
+    can.BusState.PASSIVE: ControllerState.PASSIVE,
+    can.BusState.ERROR: ControllerState.BUS_OFF,
+}
+_HEARS_ITSELF = ("udp_multicast",)
+"""Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
 
 
 class PythonCanPort:
@@ -30,22 +40,34 @@ class PythonCanPort:
         bitrate: in bit/s, for interfaces that set it themselves.
         clock: the clock for waits and stamps.
         filters: what is let in; everything by default.
+        data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
 
     Attributes:
-        counters: what has passed; `ignored` are CAN FD frames.
+        counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
+        state: the controller's state as python-can told it at the last error frame.
 
     Raises:
         InterfaceError: python-can cannot open it, with its reason.
     """
 
     def __init__(
-        self, interface: str, channel: str, bitrate: int, clock: Clock, *, filters: Sequence[CanFilter] | None = None
+        self,
+        interface: str,
+        channel: str,
+        bitrate: int,
+        clock: Clock,
+        *,
+        filters: Sequence[CanFilter] | None = None,
+        data_bitrate: int | None = None,
     ) -> None:
+        self._fd = data_bitrate is not None
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
+        self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
-        self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters)
+        self._echoes = Echoes() if interface in _HEARS_ITSELF else None
+        self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters, data_bitrate)
 
     stamps_arrival = False
 
@@ -53,13 +75,15 @@ class PythonCanPort:
         """Send `frames` in order, one call of python-can each."""
         bus = self._open_bus()
         for can_id, data in frames:
-            message = _message(self.channel, can_id, data)
+            message = _message(self.channel, can_id, data, self._fd)
             try:
                 bus.send(message)
             except can.CanError as error:
                 self.counters.transmit_full += 1
                 raise InterfaceError(f"{self.channel}: sending {can_id:03X} failed: {error}") from error
             self.counters.sent += 1
+            if self._echoes is not None:
+                self._echoes.sent((can_id, data), self.clock.now_ns())
 
     def drain(self) -> list[TimedFrame]:
         """Return everything that has arrived, stamped now."""
@@ -70,6 +94,8 @@ class PythonCanPort:
         t_ns = self.clock.now_ns()
         frames = [frame for message in arrived if (frame := self._frame(message, t_ns)) is not None]
         arrived.clear()
+        if self._echoes is not None:
+            frames = [frame for frame in frames if not self._echoes.is_one(frame[:2], t_ns)]
         self.counters.received += len(frames)
         return frames
 
@@ -101,8 +127,9 @@ class PythonCanPort:
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
             self.counters.error_frames += 1
+            self.state = _STATES.get(self._open_bus().state, self.state)
             return None
-        if message.is_fd:
+        if message.is_fd and not self._fd:
             self.counters.ignored += 1
             return None
         can_id = message.arbitration_id
@@ -113,9 +140,15 @@ class PythonCanPort:
         return can_id, bytes(message.data), t_ns
 
 
-def _open(interface: str, channel: str, bitrate: int, filters: Sequence[CanFilter] | None) -> can.BusABC:
+def _open(
+    interface: str, channel: str, bitrate: int, filters: Sequence[CanFilter] | None, data_bitrate: int | None
+) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
     options: dict[str, Any] = {"interface": interface, "channel": channel, "bitrate": bitrate}
+    if data_bitrate is not None:
+        options |= {"fd": True, "data_bitrate": data_bitrate}
+        if interface == "virtual":
+            options = {**options, "protocol": can.CanProtocol.CAN_FD}
     if filters is not None:
         options["can_filters"] = [_filter(can_id, mask) for can_id, mask in filters]
     try:
@@ -136,16 +169,21 @@ def _filter(can_id: int, mask: int) -> dict[str, Any]:
     }
 
 
-def _message(channel: str, can_id: int, data: bytes) -> can.Message:
+def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:
     extended = bool(can_id & EFF_FLAG)
+    long = len(data) > CLASSIC_BYTES
     try:
+        if long and fd and len(data) not in FD_LENGTHS:
+            raise ValueError(f"CAN FD has {', '.join(map(str, FD_LENGTHS))}")
         return can.Message(
             arbitration_id=can_id & (_EXTENDED_MASK if extended else ~RTR_FLAG),
             data=data,
             is_extended_id=extended,
             is_remote_frame=bool(can_id & RTR_FLAG),
+            is_fd=fd and long,
+            bitrate_switch=fd and long,
             check=True,
         )
     except ValueError as error:
-        what = f"{can_id:X} with {len(data)} bytes is no classic CAN frame"
+        what = f"{can_id:X} with {len(data)} bytes is no {'CAN or CAN FD' if fd else 'classic CAN'} frame"
         raise InterfaceError(f"{channel}: {what}: {error}") from error

@@ -2,7 +2,8 @@
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
 the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
-29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`; CAN FD frames are not received.
+29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With `fd` frames of more than 8 bytes
+are CAN FD frames with bit-rate switch; without it none are received.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
-from canprobe.bus.mmsg import SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
+from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
 from canprobe.errors import InterfaceError
+from canprobe.protocol.frame_bits import FD_LENGTHS
 
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1
 _CAN_RAW_ERR_FILTER = 2
+_CAN_RAW_FD_FRAMES = 5
 _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
 _CAN_ERR_MASK = 0x1FFFFFFF
@@ -32,6 +35,8 @@ _CAN_ERR_CRTL, _CAN_ERR_BUSOFF, _CAN_ERR_RESTARTED = 0x004, 0x040, 0x100
 _CRTL_ACTIVE, _CRTL_PASSIVE, _CRTL_WARNING = 0x40, 0x30, 0x0C
 _SO_RCVBUFFORCE = 33
 _SIOCGIFFLAGS = 0x8913
+_SIOCGIFMTU = 0x8921
+_CANFD_MTU = 72
 _IFF_UP = 0x1
 _RECEIVE_BUFFER = 4 << 20
 _RETRIES = 50
@@ -47,25 +52,36 @@ class SocketCanPort:
         clock: a clock that shows CLOCK_MONOTONIC.
         filters: what the kernel lets in; everything by default.
         batched: use recvmmsg and sendmmsg where they exist.
+        fd: send and receive CAN FD frames too.
 
     Attributes:
         counters: what has passed; `overruns` are frames that the kernel dropped for this socket.
         state: the controller's state as the last error frame told; always ACTIVE on vcan.
 
     Raises:
-        InterfaceError: the interface is missing, down, or no CAN interface; with the line to type.
+        InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
+            type.
     """
 
     def __init__(
-        self, channel: str, clock: Clock, *, filters: Sequence[CanFilter] | None = None, batched: bool = True
+        self,
+        channel: str,
+        clock: Clock,
+        *,
+        filters: Sequence[CanFilter] | None = None,
+        batched: bool = True,
+        fd: bool = False,
     ) -> None:
         check_interface(channel)
+        if fd:
+            check_fd(channel)
+        self._fd = fd
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
-        self._socket = _open(channel, filters)
-        self._frames = frame_socket(self._socket, batched)
+        self._socket = _open(channel, filters, fd=fd)
+        self._frames = frame_socket(self._socket, batched, fd)
         self._batched = batched
         self._filtered = filters is not None
         self._patient: socket.socket | None = None
@@ -84,8 +100,10 @@ class SocketCanPort:
         """
         self._check_open()
         for can_id, data in frames:
-            if len(data) > 8 or (can_id > 0x7FF and can_id < ERR_FLAG):
-                raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no classic CAN frame")
+            long = len(data) > CLASSIC_BYTES and not (self._fd and len(data) in FD_LENGTHS)
+            if long or (can_id > 0x7FF and can_id < ERR_FLAG):
+                kind = "CAN or CAN FD" if self._fd else "classic CAN"
+                raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no {kind} frame")
         sent = tries = 0
         while sent < len(frames):
             try:
@@ -158,8 +176,9 @@ class SocketCanPort:
             self._patient.close()
             self._patient = self._patient_frames = None
         if can_ids:
-            self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], errors=False)
-            self._patient_frames = frame_socket(self._patient, self._batched)
+            filters = [(can_id, mask) for can_id in can_ids]
+            self._patient = _open(self.channel, filters, errors=False, fd=self._fd)
+            self._patient_frames = frame_socket(self._patient, self._batched, self._fd)
         try:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
             others = [(can_id | _CAN_INV_FILTER, mask) for can_id in can_ids] or [(0, 0)]
@@ -241,6 +260,23 @@ def check_interface(channel: str) -> None:
             raise _down(channel)
 
 
+def check_fd(channel: str) -> None:
+    """Return if the interface carries CAN FD frames.
+
+    Raises:
+        InterfaceError: it does not, with the line to type.
+    """
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
+        try:
+            mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
+        except OSError as error:
+            raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
+    if mtu < _CANFD_MTU:
+        real = f"{channel} down && {_sudo()}ip link set {channel} up type can bitrate 1000000 dbitrate 5000000 fd on"
+        how = f"{channel} mtu {_CANFD_MTU}" if channel.startswith("v") else real
+        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {_sudo()}ip link set {how}")
+
+
 def _ifreq(channel: str) -> bytes:
     name = os.fsencode(channel)
     if not 0 < len(name) < 16:
@@ -264,10 +300,12 @@ def _sudo() -> str:
     return "" if os.geteuid() == 0 else "sudo "
 
 
-def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True) -> socket.socket:
+def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True, fd: bool = False) -> socket.socket:
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
         sock.setblocking(False)
+        if fd:
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, struct.pack("=i", 1))
         if filters is not None:
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(filters))
         sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if errors else 0))

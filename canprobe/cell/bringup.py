@@ -1,22 +1,30 @@
 """From a silent bus to operational nodes: listen, reset, boot-up, identity, configuration with read-back, NMT start.
 
-Every step has its own time-out and its own words for what failed where.
+All nodes go through a step side by side; every step has its own time-out and its own words for what failed where.
+
+Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import zlib
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from canopen import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.network import PumpedNetwork, PumpedNode
+from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.sdo_client import download, hold_dialogues, upload
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import NmtCommand, NmtState, pack_nmt
 
+SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
+SAVE = int.from_bytes(b"save", "little")
+HEARTBEAT_CONSUMER = 0x1016
+MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 
 
@@ -47,6 +55,7 @@ class NodeSetup:
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
         writes: its configuration, in order.
+        lacks: objects that the cell would have set and that this make of device does not have.
     """
 
     node_id: int
@@ -55,11 +64,23 @@ class NodeSetup:
     dictionary: ObjectDictionary
     identity: dict[int, int]
     writes: tuple[Write, ...]
+    lacks: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class BringUpTimes:
-    """Time-outs of the steps, s."""
+    """How long the steps may take, s, and what is done about those that take longer.
+
+    Attributes:
+        listen: for another master.
+        boot_up: from the reset to the boot-up message.
+        second_boot_up: in which a second one shows that a node id is in use twice.
+        sdo: for one answer.
+        start: from NMT start to the first heartbeat that tells it.
+        release: for one answer when the nodes are let go.
+        retries: how often a reset or a request without an answer is sent again.
+        store: let the nodes keep their configuration (1010h), and leave it out where 1020h says that it is there.
+    """
 
     listen: float = 0.25
     boot_up: float = 2.0
@@ -67,6 +88,36 @@ class BringUpTimes:
     sdo: float = 0.5
     start: float = 1.0
     release: float = 0.1
+    retries: int = 1
+    store: bool = False
+
+
+@dataclass(slots=True)
+class NodeReport:
+    """How far a node came.
+
+    Attributes:
+        node_id, name: which.
+        software: version as 100Ah tells it; None where it does not.
+        kept: its configuration was there already, as 1020h told.
+        repeated: requests that were sent again.
+        failure: what went wrong; None where nothing did.
+    """
+
+    node_id: int
+    name: str
+    software: str | None = None
+    kept: bool = False
+    repeated: int = 0
+    failure: NodeError | None = None
+
+    def __str__(self) -> str:
+        if self.failure is not None:
+            return str(self.failure)
+        did = "configuration kept" if self.kept else "configured"
+        software = f", software {self.software}" if self.software else ""
+        again = f", {self.repeated} requests repeated" if self.repeated else ""
+        return f"node {self.node_id}: ({self.name}) {did}{software}{again}"
 
 
 class BringUp:
@@ -78,6 +129,9 @@ class BringUp:
         setups: the nodes.
         times: time-outs.
         say: called with each step, for the user.
+
+    Attributes:
+        reports: how far each node came, in the order of the setups.
     """
 
     def __init__(
@@ -93,24 +147,46 @@ class BringUp:
         self._setups = setups
         self._times = times or BringUpTimes()
         self._say = say
-        self._nodes: dict[int, PumpedNode] = {}
+        self._there: set[int] = set()
+        self.reports = tuple(NodeReport(s.node_id, s.name) for s in setups)
 
     def run(self) -> None:
         """All steps up to the NMT start.
 
         Raises:
-            NodeError: a node is missing, is another than the EDS says, or refused a value.
+            NodeError: nodes are missing, are others than the EDS says, or refused a value; it names all of them.
             BusError: somebody else is master on this bus.
         """
         self._listen()
         self._boot()
-        for setup in self._setups:
-            self._identify(setup)
-        for setup in self._setups:
-            self._say(f"configure node {setup.node_id} ({setup.name})")
-            for write in setup.writes:
-                self._write(setup, write)
+        self._say("identify and configure the nodes")
+        self._talk([self._configure(setup, report) for setup, report in self._pairs()], self._times.sdo)
+        self._raise_failures()
+        for setup, report in self._pairs():
+            self._say(str(report))
+            if setup.lacks:
+                objects = ", ".join(f"{index:04X}h" for index in setup.lacks)
+                self._say(f"node {setup.node_id}: ({setup.name}) has no {objects}: left as the device has it")
         self._start()
+
+    def _pairs(self) -> Sequence[tuple[NodeSetup, NodeReport]]:
+        return list(zip(self._setups, self.reports, strict=True))
+
+    def _talk(self, dialogues: Sequence[Generator[bytes | None, bytes, None]], timeout_s: float) -> None:
+        retries = self._times.retries
+        by_node = {setup.node_id: one for setup, one in zip(self._setups, dialogues, strict=True)}
+        repeated = hold_dialogues(self._network, by_node, timeout_s=timeout_s, retries=retries)
+        for report in self.reports:
+            report.repeated += repeated[report.node_id]
+
+    def _raise_failures(self) -> None:
+        failures = [report.failure for report in self.reports if report.failure is not None]
+        if not failures:
+            return
+        first, *others = failures
+        if others:
+            raise NodeError(first.node_id, f"{first.reason}; " + "; ".join(map(str, others))) from first
+        raise first
 
     def _listen(self) -> None:
         self._say("listen for another master")
@@ -121,60 +197,110 @@ class BringUp:
             )
 
     def _boot(self) -> None:
-        self._say(f"reset nodes {', '.join(str(s.node_id) for s in self._setups)}")
+        missing = list(self._setups)
         self._watch.forget()
         before = dict(self._watch.boot_ups)
-        self._network.port.send_batch([pack_nmt(NmtCommand.RESET_NODE, s.node_id) for s in self._setups])
-        booted = self._network.pump_until(
-            lambda: all(self._watch.boot_ups[s.node_id] > before[s.node_id] for s in self._setups), self._times.boot_up
-        )
-        if not booted:
-            missing = [s for s in self._setups if self._watch.boot_ups[s.node_id] == before[s.node_id]]
-            others = ", ".join(f"{s.node_id} ({s.name})" for s in missing[1:])
-            raise NodeError(
-                missing[0].node_id,
-                f"({missing[0].name}) sent no boot-up within {self._times.boot_up:g} s of its reset on"
-                f" {self._network.port.channel}"
-                + (f"; nor did {others}" if others else "")
-                + "; check power, node id, bit rate and termination, or mark it emulated in the scene",
+        resets = dict.fromkeys(before, 0)
+        for _ in range(1 + self._times.retries):
+            self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
+            self._network.port.send_batch([pack_nmt(NmtCommand.RESET_NODE, s.node_id) for s in missing])
+            for setup in missing:
+                resets[setup.node_id] += 1
+            self._network.pump_until(
+                lambda: all(self._watch.boot_ups[s.node_id] > before[s.node_id] for s in self._setups),
+                self._times.boot_up,
             )
+            missing = [s for s in self._setups if self._watch.boot_ups[s.node_id] == before[s.node_id]]
+            if not missing:
+                break
+        if missing:
+            self._raise_missing(missing)
         self._network.pump_until(lambda: False, self._times.second_boot_up)
         for setup in self._setups:
             count = self._watch.boot_ups[setup.node_id] - before[setup.node_id]
-            if count > 1:
+            if count > resets[setup.node_id]:
                 raise NodeError(setup.node_id, f"answered its reset with {count} boot-ups: the node id is in use twice")
-            self._nodes[setup.node_id] = self._network.add_node(setup.node_id, setup.dictionary)
-            self._nodes[setup.node_id].sdo.RESPONSE_TIMEOUT = self._times.sdo
+            self._there.add(setup.node_id)
 
-    def _identify(self, setup: NodeSetup) -> None:
+    def _raise_missing(self, missing: Sequence[NodeSetup]) -> None:
+        others = ", ".join(f"{s.node_id} ({s.name})" for s in missing[1:])
+        raise NodeError(
+            missing[0].node_id,
+            f"({missing[0].name}) sent no boot-up within {self._times.boot_up:g} s of its reset on"
+            f" {self._network.port.channel}"
+            + (f"; nor did {others}" if others else "")
+            + "; check power, node id, bit rate and termination, or mark it emulated in the scene",
+        )
+
+    # what is said to one node
+
+    def _configure(self, setup: NodeSetup, report: NodeReport) -> Generator[bytes | None, bytes, None]:
+        try:
+            yield from self._identify(setup, report)
+            kept = self._times.store and (yield from self._is_kept(setup))
+            report.kept = kept
+            for write in setup.writes:
+                if not (kept and write.read_back):
+                    yield from self._write(setup, write)
+            if self._times.store and not kept:
+                yield from self._keep(setup)
+        except NodeError as error:
+            report.failure = error
+
+    def _identify(self, setup: NodeSetup, report: NodeReport) -> Generator[bytes | None, bytes, None]:
         for subindex, expected in setup.identity.items():
-            got = self._read(setup, 0x1018, subindex)
+            got = yield from self._read(setup, 0x1018, subindex)
             if got != expected:
                 raise NodeError(
                     setup.node_id,
                     f"({setup.name}) is not the device of {setup.eds}: 1018h:{subindex:02X}"
                     f" {IDENTITY_NAMES[subindex]} expected {expected:#x}, got {got:#x}",
                 )
+        if SOFTWARE_VERSION in setup.dictionary:
+            try:
+                version = yield from upload(SOFTWARE_VERSION, 0)
+                report.software = version.decode("latin-1").rstrip("\0")
+            except (SdoAbortedError, SdoCommunicationError):
+                report.software = None
 
-    def _read(self, setup: NodeSetup, index: int, subindex: int) -> int:
+    def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
+        """Whether the node says that it was configured with these very values."""
+        if not _can_verify(setup):
+            return False
+        for subindex, expected in configuration_date(setup).items():
+            if (yield from self._read(setup, VERIFY_CONFIGURATION, subindex)) != expected:
+                return False
+        return True
+
+    def _keep(self, setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
+        if not _can_verify(setup):
+            return
+        for subindex, value in configuration_date(setup).items():
+            yield from self._write(setup, Write(VERIFY_CONFIGURATION, subindex, value))
+        yield from self._write(setup, Write(STORE_PARAMETERS, 1, SAVE, read_back=False))
+
+    def _read(self, setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
         variable = _variable(setup, index, subindex)
         try:
-            return int(variable.decode_raw(self._nodes[setup.node_id].sdo.upload(index, subindex)))
+            return int(variable.decode_raw((yield from upload(index, subindex))))
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise NodeError(
                 setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
             ) from error
 
-    def _write(self, setup: NodeSetup, write: Write) -> None:
+    def _write(self, setup: NodeSetup, write: Write) -> Generator[bytes | None, bytes, None]:
         variable = _variable(setup, write.index, write.subindex)
         where = f"{write.index:04X}h:{write.subindex:02X}"
         try:
-            self._nodes[setup.node_id].sdo.download(write.index, write.subindex, variable.encode_raw(write.value))
+            yield from download(write.index, write.subindex, variable.encode_raw(write.value))
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise NodeError(
                 setup.node_id, f"({setup.name}) write of {where} = {write.value:#x} failed: {error}"
             ) from error
-        if write.read_back and (got := self._read(setup, write.index, write.subindex)) != write.value:
+        if not write.read_back:
+            return
+        got = yield from self._read(setup, write.index, write.subindex)
+        if got != write.value:
             raise NodeError(
                 setup.node_id, f"({setup.name}) {where} reads back {got:#x} after {write.value:#x} was written"
             )
@@ -199,15 +325,31 @@ class BringUp:
         """Take the nodes out of operation: pre-operational, heartbeat consumers off. Every node is tried."""
         self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         failures: list[NodeError] = []
-        for setup in self._setups:
-            if setup.node_id in self._nodes:
-                self._nodes[setup.node_id].sdo.RESPONSE_TIMEOUT = self._times.release
-                try:
-                    self._write(setup, Write(0x1016, 1, 0))
-                except NodeError as error:
-                    failures.append(error)
+
+        def let_go(setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
+            if setup.node_id not in self._there or HEARTBEAT_CONSUMER not in setup.dictionary:
+                return
+            try:
+                yield from self._write(setup, Write(HEARTBEAT_CONSUMER, 1, 0))
+            except NodeError as error:
+                failures.append(error)
+
+        self._talk([let_go(setup) for setup in self._setups], self._times.release)
         if failures:
             raise failures[0]
+
+
+def configuration_date(setup: NodeSetup) -> dict[int, int]:
+    """What 1020h holds where a node has the configuration of ``setup``: days since 1984, milliseconds after midnight.
+
+    They follow from the values, so that any change of them, of the EDS or of the scene, asks for another date.
+    """
+    text = repr((setup.eds, setup.identity, [w for w in setup.writes if w.read_back])).encode()
+    return {1: 1 + zlib.crc32(text) % MOST_DAYS, 2: 1 + zlib.adler32(text) % DAY_MS}
+
+
+def _can_verify(setup: NodeSetup) -> bool:
+    return VERIFY_CONFIGURATION in setup.dictionary and STORE_PARAMETERS in setup.dictionary
 
 
 def _variable(setup: NodeSetup, index: int, subindex: int) -> Any:  # canopen has no types here

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,32 +12,50 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
-from canprobe.cell.measurement import Controller
+from canprobe.cell.limits import limits_of
+from canprobe.cell.measurement import Controller, TactileSample
+from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.planning.model import (
-    HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
     Plan,
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene
+from canprobe.scene import BringUpSettings, Scene
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
-TACTILE_TIMEOUT_PERIODS = 6
 
 
 def make_cell(
-    plan: Plan, port: Port, say: Callable[[str], None] = lambda _: None, times: BringUpTimes | None = None
+    plan: Plan,
+    port: Port,
+    *,
+    say: Callable[[str], None] = lambda _: None,
+    times: BringUpTimes | None = None,
+    log_failure: Callable[[], str | None] = lambda: None,
+    observers: Observers | None = None,
+    rows_kept: int | None = None,
 ) -> Cell:
-    """The cell of a plan on a port; nothing is sent before it is entered."""
+    """The cell of a plan on a port; nothing is sent before it is entered.
+
+    Args:
+        plan: of the scene.
+        port: the bus.
+        say: called with each step of bring-up and stop.
+        times: time-outs of bring-up.
+        log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
+    """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
         sync_overflow=plan.sync.overflow,
         heartbeat_ns=HEARTBEAT_PRODUCED_MS * 1_000_000,
         master_id=MASTER_NODE_ID,
+        looks_ns=plan.traffic.budget.looks_ns,
     )
     return Cell(
         port,
@@ -46,11 +63,37 @@ def make_cell(
         settings,
         drives=make_drives(plan),
         tactile=make_tactile(plan),
-        heartbeat_timeout_ns=HEARTBEAT_CONSUMED_MS * 1_000_000,
-        missed_limit=arm.missed_syncs if (arm := plan.scene.arm) is not None else 0,
+        limits=limits_of(plan),
+        force_of=_force_of(plan.scene),
         say=say,
-        times=times,
+        times=times or _times(plan.scene.bring_up),
+        log_failure=log_failure,
+        observers=observers,
+        rows_kept=rows_kept,
     )
+
+
+def _times(settings: BringUpSettings) -> BringUpTimes:
+    return BringUpTimes(
+        listen=settings.listen_s,
+        boot_up=settings.boot_up_s,
+        sdo=settings.sdo_s,
+        start=settings.start_s,
+        retries=settings.retries,
+        store=settings.store,
+    )
+
+
+def _force_of(scene: Scene) -> Callable[[TactileSample], float] | None:
+    """Force of a tactile sample where an arm can press; None where nothing can."""
+    if scene.arm is None or scene.sensor is None:
+        return None
+    from canprobe.cell.tasks.calibration import array_calibration
+    from canprobe.cell.tasks.sensing import patch_of
+
+    radius = {} if scene.probe is None else {"radius_m": scene.probe.radius_mm * 1e-3}
+    calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, **radius)
+    return lambda sample: patch_of(sample, calibration).force
 
 
 def make_drives(plan: Plan) -> DriveGroup | None:
@@ -71,16 +114,11 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
     sensor = plan.scene.sensor
     if sensor is None:
         return None
-    cob_ids = [pdo.cob_id for pdo in plan.pdos_of(sensor.node_id, "tpdo")]
+    pdos = plan.pdos_of(sensor.node_id, "tpdo")
+    cob_ids = [pdo.cob_id for pdo in pdos]
     deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
-    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline)
+    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline, [pdo.layout.length for pdo in pdos])
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
-
-
-def tactile_timeout(scene: Scene) -> int:
-    """Cycles without a tactile sample after which a task gives up."""
-    assert scene.sensor is not None
-    return math.ceil(TACTILE_TIMEOUT_PERIODS * scene.cycle.rate_hz / scene.sensor.rate_hz)
 
 
 def make_task(plan: Plan) -> Controller:
@@ -97,7 +135,7 @@ def make_task(plan: Plan) -> Controller:
 
         assert plan.scene.sensor is not None
         calibration = array_calibration(plan.scene.sensor.full_scale_kpa * 1e3)
-        return ListenTask(calibration, task.duration_s, period_s, tactile_timeout(plan.scene))
+        return ListenTask(calibration, task.duration_s, period_s, limits_of(plan))
     from canprobe.cell.tasks.build import make_touch_task
 
-    return make_touch_task(plan, period_s, tactile_timeout(plan.scene))
+    return make_touch_task(plan, period_s)

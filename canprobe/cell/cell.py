@@ -7,21 +7,26 @@ from types import TracebackType
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
-from canprobe.cell.bringup import BringUp, BringUpTimes, NodeSetup
+from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.log import RunLog
-from canprobe.cell.measurement import Command, Controller, Measurement
+from canprobe.cell.log import CycleLog, LastRows, RunLog
+from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
+from canprobe.cell.observe import Observers
+from canprobe.cell.supervision import Limits, Reaction, Seen
+from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
+FAULTS_KEPT = 100
+"""Faults that are told; a node that says the same for ever must not fill the memory."""
 
 
 class Cell:
@@ -33,10 +38,18 @@ class Cell:
         settings: times of the cycle.
         drives: the arm, or None.
         tactile: the sensor, or None.
-        heartbeat_timeout_ns: silence after which a node is lost.
-        missed_limit: cycles without a TPDO after which a drive is lost, as many SYNCs as a drive waits for its master.
+        limits: what the supervision must not let pass.
+        force_of: force (N) of a tactile sample; None where nothing can press.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
+        log_failure: says why frames are no longer written down, None while they are.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept; None for all.
+
+    Attributes:
+        log: one row a cycle.
+        faults: what went wrong, a line each.
+        supervisor: the checks, from bring-up on.
     """
 
     def __init__(
@@ -47,24 +60,32 @@ class Cell:
         *,
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
-        heartbeat_timeout_ns: int,
-        missed_limit: int,
+        limits: Limits,
+        force_of: Callable[[TactileSample], float] | None = None,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
+        log_failure: Callable[[], str | None] = lambda: None,
+        observers: Observers | None = None,
+        rows_kept: int | None = None,
     ) -> None:
-        self.log = RunLog()
+        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
         self.faults: list[str] = []
-        self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, heartbeat_timeout_ns)
+        self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, limits.heartbeat_timeout_ns)
         self.cycle: Cycle | None = None
         self._port = port
         self._settings = settings
-        self._missed_limit = missed_limit
         self._say = say
+        self._log_failure = log_failure
+        self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), force_of)
+        self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
         self._alarms = 0
+        self._holding = False
+        self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
@@ -73,6 +94,11 @@ class Cell:
     def counters(self) -> PortCounters:
         """What has passed through the cell's port."""
         return self._port.counters
+
+    @property
+    def bring_up_reports(self) -> tuple[NodeReport, ...]:
+        """How far each node came in bring-up."""
+        return self._bring_up.reports
 
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))
@@ -94,8 +120,10 @@ class Cell:
                 tactile=self.tactile,
                 watch=self.watch,
                 other=self._network.feed,
+                kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
+            self.supervisor.seen.first_alarm = len(self.watch.alarms)
         except BaseException:
             self.close()
             raise
@@ -114,20 +142,27 @@ class Cell:
         """Enable the drives, then run ``controller`` until it says done.
 
         Args:
-            controller: has ``step(measurement) → command``, or is such a function.
+            controller: has ``step(measurement) → command``, or is such a function. Where it has ``retreat(reason)`` the
+                cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
+                the contact to it.
             progress: called after each cycle.
 
         Raises:
             SafetyStop: the controller or the supervision stopped the cell.
             NodeError: a node was lost or failed.
+            InterfaceError: the bus was lost.
         """
         step = controller.step if hasattr(controller, "step") else controller
+        retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
+        self._tracker = getattr(controller, "shape", None)
         self._enable()
         assert self.cycle is not None
         while True:
             measurement = self.cycle.begin()
-            self._supervise(measurement)
-            command = step(measurement)
+            if self._supervise(measurement, retreat):
+                command = Command()
+            else:
+                command = self._guarded(measurement, step(measurement), retreat)
             self.cycle.end(command)
             self._record(measurement, command)
             progress(measurement)
@@ -143,9 +178,9 @@ class Cell:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
-        self._cycle_until(WARM_UP_S)
+        self._cycle_until((), WARM_UP_S)
         self.drives.goal = DriveState.OPERATION_ENABLED
-        if not self._cycle_until(DriveState.OPERATION_ENABLED, ENABLE_TIMEOUT_S):
+        if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
             i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
             raise NodeError(
                 self.drives.axes[i].node_id,
@@ -153,48 +188,76 @@ class Cell:
                 + "".join(f"; {event}" for event in self.watch.alarms[-1:]),
             )
 
-    def _cycle_until(self, *states_and_timeout: DriveState | float) -> bool:
-        """Cycle with held targets until every drive is in one of the states; False after the time-out (s)."""
-        *states, timeout = states_and_timeout
-        assert self.cycle is not None and self.drives is not None and isinstance(timeout, float)
-        for _ in range(int(timeout * 1e9 / self._settings.period_ns)):
+    def _cycle_until(
+        self,
+        states: tuple[DriveState, ...],
+        timeout_s: float,
+        check: Callable[[Measurement], None] = lambda _: None,
+    ) -> bool:
+        """Cycle with held targets until every drive is in one of the states; False after the time-out."""
+        assert self.cycle is not None and self.drives is not None
+        for _ in range(int(timeout_s * 1e9 / self._settings.period_ns)):
             measurement = self.cycle.begin()
-            reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)  # type: ignore[arg-type]
+            self._look(measurement)
+            check(measurement)
+            reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)
             self.cycle.end(None)
             self._record(measurement, None)
             if reached:
                 return True
         return False
 
-    def _supervise(self, measurement: Measurement) -> None:
-        self._check_alarms()
+    def _look(self, measurement: Measurement) -> None:
         assert self.cycle is not None
-        if (node_id := self.watch.silent(self.cycle.sync_ns)) is not None:
-            raise NodeError(node_id, "lost: no heartbeat within its time-out")
-        if (node_id := self.watch.not_in(NmtState.OPERATIONAL)) is not None:
-            raise NodeError(node_id, f"left operation: NMT state {self.watch.states[node_id].name}")
-        if self.watch.foreign:
-            raise SafetyStop(f"another master is on the bus: {self.watch.foreign[0]}")
-        if self.drives is None:
-            return
-        for axis, age in zip(self.drives.axes, measurement.q_age, strict=True):
-            if age > self._missed_limit:
-                raise NodeError(axis.node_id, f"lost: no TPDO for {age} cycles")
-        if not measurement.enabled:
-            self._raise_not_enabled()
+        self._note_alarms()
+        self.supervisor.seen.restarts = getattr(self._tracker, "restarts", 0)
+        self.supervisor.step(
+            measurement,
+            sync_ns=self.cycle.sync_ns,
+            overruns=self.cycle.statistics.overruns,
+            counters=self._port.counters,
+            controller_state=self._port.state,
+            log_failure=self._log_failure(),
+        )
 
-    def _check_alarms(self) -> None:
+    def _supervise_enabling(self, _: Measurement) -> None:
+        finding = self.supervisor.finding(enabling=True)
+        if finding is not None and finding.condition.reaction is not Reaction.HOLD:
+            raise finding.error
+
+    def _supervise(self, measurement: Measurement, retreat: Callable[[str], None] | None) -> bool:
+        """Check the table's conditions; True: hold in this cycle."""
+        self._look(measurement)
+        finding = self.supervisor.finding()
+        if finding is None and retreat is None:
+            finding = self.supervisor.guard_contact(measurement)
+        if finding is None or finding.condition.reaction is not Reaction.HOLD:
+            self._holding = False
+            if finding is not None:
+                self._react(finding, retreat)
+        elif not self._holding:
+            self._holding = True
+            self.faults.append(f"cycle {measurement.cycle}: {finding.error}: hold")
+        return self._holding
+
+    def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
+        """The command that may be sent."""
+        command, finding = self.supervisor.guard_target(command)
+        if finding is not None:
+            self._react(finding, retreat)
+        return command
+
+    def _react(self, finding: Finding, retreat: Callable[[str], None] | None) -> None:
+        if finding.condition.reaction is not Reaction.RETREAT or retreat is None:
+            raise finding.error
+        retreat(str(finding.error))
+
+    def _note_alarms(self) -> None:
         alarms = self.watch.alarms
         while self._alarms < len(alarms):
-            self.faults.append(str(alarms[self._alarms]))
+            if len(self.faults) < FAULTS_KEPT:
+                self.faults.append(str(alarms[self._alarms]))
             self._alarms += 1
-
-    def _raise_not_enabled(self) -> None:
-        assert self.drives is not None
-        i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
-        node_id = self.drives.axes[i].node_id
-        why = "".join(f"; {e}" for e in [e for e in self.watch.alarms if e.node_id == node_id][-1:])
-        raise NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
@@ -207,6 +270,8 @@ class Cell:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
         self.log.add(row)
+        if self._observers is not None and self.cycle is not None:
+            self._observers.cycle(self.cycle.t_first_ns, measurement, command)
 
     # the way out
 
@@ -215,6 +280,7 @@ class Cell:
         for action in (self._stop_drives, self._bring_up.release):
             self._try(action)
         self._try(self._port.close)
+        self.faults += self.supervisor.notes()
 
     def _try(self, action: Callable[[], None]) -> None:
         """Run one step of the way out to its end: an interrupt starts it again once, a failure is noted."""
@@ -233,9 +299,24 @@ class Cell:
         self._say("stop and disable the drives")
         off = tuple(state for state in DriveState if state not in POWERED_STATES)
         self.drives.goal = DriveState.QUICK_STOP_ACTIVE
-        self._cycle_until(*off, STOP_TIMEOUT_S)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
+        self._stop_until(off)  # with 605Ah = 2 a drive at rest leaves quick stop by itself
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
-        if not self._cycle_until(*disabled, STOP_TIMEOUT_S):
+        if not self._stop_until(disabled):
             stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
             self.faults.append(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
+
+    def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
+        """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
+        assert self.cycle is not None
+        end_ns = self._port.clock.now_ns() + int(STOP_TIMEOUT_S * 1e9)
+        failure: CanprobeError | None = None
+        while (left_ns := end_ns - self._port.clock.now_ns()) > 0:
+            try:
+                return self._cycle_until(states, left_ns * 1e-9)
+            except CanprobeError as error:
+                failure = error
+                self.cycle.skip()
+        if failure is not None:
+            self.faults.append(f"while stopping: {failure}")
+        return False

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.eds import MISSED_SYNCS, has_missed_syncs, load_eds
+from canprobe.eds import LONG_PDOS, MISSED_SYNCS, has_long_pdos, has_missed_syncs, load_eds
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -17,6 +17,7 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.planning.wire_bits import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.puma260 import MODELS, Array, PumaModel
@@ -43,20 +44,22 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     dictionary = load_eds(node.eds, node.node_id)
     numbers = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
     specific = _drive_writes(plan, node) if node.kind == "drive" else _sensor_writes(plan)
+    wanted = [*_common_writes(plan), *specific]
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
         eds=node.eds,
         dictionary=dictionary,
         identity={sub: value for sub, value in enumerate(numbers, start=1) if value is not None},
-        writes=(*_pdo_writes(plan, node, dictionary), *_common_writes(plan), *specific),
+        writes=(*_pdo_writes(plan, node, dictionary), *(w for w in wanted if w.index in dictionary)),
+        lacks=tuple(sorted({w.index for w in wanted if w.index not in dictionary})),
     )
 
 
 def _common_writes(plan: Plan) -> list[Write]:
+    counter = [Write(0x1006, 0, 0), Write(0x1019, 0, plan.sync.overflow)] if plan.sync.overflow else []
     return [
-        Write(0x1006, 0, 0),  # 1019h may only change while 1006h is 0
-        Write(0x1019, 0, plan.sync.overflow),
+        *counter,  # 1019h may only change while 1006h is 0
         Write(0x1006, 0, plan.sync.period_us),
         Write(0x1015, 0, EMCY_INHIBIT_100US),
         Write(0x1017, 0, HEARTBEAT_PRODUCED_MS),
@@ -66,6 +69,10 @@ def _common_writes(plan: Plan) -> list[Write]:
 
 def _pdo_writes(plan: Plan, node: PlannedNode, dictionary: Any) -> list[Write]:
     writes = []
+    if any(pdo.layout.length > CLASSIC_BYTES for pdo in plan.pdos_of(node.node_id, "tpdo")):
+        writes.append(Write(LONG_PDOS, 0, 1))
+    elif has_long_pdos(dictionary):
+        writes.append(Write(LONG_PDOS, 0, 0))
     for direction, number in node.switched_off:
         index = COMMUNICATION[direction] + number - 1
         writes.append(Write(index, 1, (dictionary[index][1].default or 0) | INVALID))

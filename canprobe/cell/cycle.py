@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, MutableSequence
 from dataclasses import dataclass, field
 
 from canprobe.bus.clock import elapsed_ns
 from canprobe.bus.port import Port, TimedFrame
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.intake import Intake
+from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.frames import NmtState, pack_heartbeat
 from canprobe.protocol.sync import SyncCounter, pack_sync
 
-LOOKS = (0.25, 0.35, 0.6)
-"""Shares of the period after SYNC at which TPDOs are looked for, until all are in; what comes after the last is late.
-
-Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender, so that
-many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway."""
 TIMED_CYCLES = 4
 """The computing time of every fourth cycle is taken: in a virtual machine reading a clock costs as much as sending."""
 
@@ -33,12 +29,16 @@ class CycleSettings:
         sync_overflow: of the SYNC counter (1019h).
         heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
+        looks_ns: times after SYNC went out at which TPDOs are looked for, until all are in; then they are late.
+            Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender,
+            so that many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway.
     """
 
     period_ns: int
     sync_overflow: int
     heartbeat_ns: int
     master_id: int
+    looks_ns: tuple[int, ...]
 
 
 @dataclass(slots=True)
@@ -46,8 +46,15 @@ class CycleStatistics:
     """What the cycle counted and timed: an entry a cycle, and a computing time every ``TIMED_CYCLES``."""
 
     overruns: int = 0
-    period_error_ns: list[int] = field(default_factory=list)
-    compute_ns: list[int] = field(default_factory=list)
+    period_error_ns: MutableSequence[int] = field(default_factory=list)
+    compute_ns: MutableSequence[int] = field(default_factory=list)
+
+    @classmethod
+    def of_last(cls, cycles: int | None) -> CycleStatistics:
+        """With the times of the last cycles only; None for all."""
+        if cycles is None:
+            return cls()
+        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles))
 
 
 class Cycle:
@@ -60,6 +67,7 @@ class Cycle:
         tactile: the sensor's receiver; None in a scene without a sensor.
         watch: sees heartbeats and EMCYs.
         other: takes what nobody here expects (SDO answers).
+        kept: cycles whose times are kept; None for all.
     """
 
     def __init__(
@@ -71,9 +79,10 @@ class Cycle:
         tactile: TactileReceiver | None,
         watch: NodeWatch,
         other: Callable[[list[TimedFrame]], None],
+        kept: int | None = None,
     ) -> None:
         self.number = -1
-        self.statistics = CycleStatistics()
+        self.statistics = CycleStatistics.of_last(kept)
         self.t_first_ns = port.clock.now_ns() + settings.period_ns
         self.t_ns = 0
         self.sync_ns = 0
@@ -81,12 +90,11 @@ class Cycle:
         self._port = port
         self._s = settings
         self._drives = drives
-        self._intake = Intake(drives, tactile, settings.sync_overflow)
+        self._intake = Intake(drives, tactile, settings.sync_overflow or SYNCS_REMEMBERED)
         self._watch = watch
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)
         self._deadline = self.t_first_ns
-        self._looks = tuple(int(settings.period_ns * share) for share in LOOKS)
         self._started_ns = 0
 
     def begin(self) -> Measurement:
@@ -115,8 +123,8 @@ class Cycle:
 
     def _collect(self) -> None:
         port, clock, intake = self._port, self._port.clock, self._intake
-        for look_ns in self._looks:
-            clock.sleep_until_ns(self._deadline + look_ns)
+        for look_ns in self._s.looks_ns:
+            clock.sleep_until_ns(self.sync_ns + look_ns)
             self._route(port.drain())
             if intake.complete:
                 break
@@ -127,6 +135,11 @@ class Cycle:
         rest = [frame for frame in self._intake.route(frames) if not watch.push(*frame)]
         if rest:
             self._other(rest)
+
+    def skip(self) -> None:
+        """Let this cycle be: wait for the end of its period."""
+        self._deadline += self._s.period_ns
+        self._port.clock.sleep_until_ns(self._deadline)
 
     def end(self, command: Command | None) -> None:
         """Send the commands of this cycle and set the next deadline."""

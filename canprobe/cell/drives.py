@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.errors import ProtocolError
 from canprobe.protocol.cia402 import DriveState, controlword_toward, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
@@ -72,6 +73,10 @@ class DriveGroup:
         axes: the drives, joint 1 first.
         model: the arm, for counts ↔ joint angles.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
+
+    Attributes:
+        late, missed, malformed: TPDOs that were not used, or not there.
+        answer_ns: from the SYNC to the last TPDO that was used.
     """
 
     def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
@@ -81,6 +86,8 @@ class DriveGroup:
         self.torque_permille = [0] * len(axes)
         self.late = 0
         self.missed = 0
+        self.malformed = 0
+        self.answer_ns = 0
         self._model = model
         self._axis_of = {axis.feedback.cob_id: i for i, axis in enumerate(axes)}
         self._counts = [0] * len(axes)
@@ -116,15 +123,22 @@ class DriveGroup:
     def push(self, can_id: int, data: bytes, t_ns: int = 0) -> None:
         """Take one TPDO that arrived at ``t_ns``.
 
-        One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used.
+        One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used; nor
+        is one of another length.
         """
         i = self._axis_of[can_id]
         if not self._open or t_ns < self._sync_ns or self._heard[i] == self._cycle:
             self.late += 1
             return
-        self.statuswords[i], self._counts[i], self.torque_permille[i] = self.axes[i].feedback.unpack(data)
+        try:
+            values = self.axes[i].feedback.unpack(data)
+        except ProtocolError:
+            self.malformed += 1  # and missed, unless another one comes
+            return
+        self.statuswords[i], self._counts[i], self.torque_permille[i] = values
         self._heard[i] = self._cycle
         self._pending -= 1
+        self.answer_ns = t_ns - self._sync_ns
 
     def end_collect(self) -> None:
         """The collection window of this cycle is over: what is not in is missed."""

@@ -10,6 +10,9 @@ from canprobe.cell.measurement import Measurement
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.protocol.cia402 import DriveState
 
+SYNCS_REMEMBERED = 240
+"""Where the SYNC has no counter."""
+
 
 class Intake:
     """Routes the PDOs of one cycle to the drives and the sensor, and says what they know together.

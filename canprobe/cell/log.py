@@ -1,9 +1,50 @@
-"""The run's log: one row a cycle in memory, columns with units as arrays."""
+"""The run's log: one row a cycle in memory, columns with units as arrays; all of them, or the last ones."""
 
 from __future__ import annotations
 
+from collections import deque
+from typing import Protocol
+
 import numpy as np
 from numpy.typing import NDArray
+
+
+class CycleLog(Protocol):
+    """What a cell writes its rows to."""
+
+    def __len__(self) -> int:
+        """Rows that are there."""
+
+    def add(self, row: dict[str, object]) -> None:
+        """Append one row."""
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Every column, (n,) or (n, k)."""
+
+
+class LastRows:
+    """Keeps the last rows only: a cell that is left running for days must not grow.
+
+    Args:
+        rows: how many.
+    """
+
+    def __init__(self, rows: int) -> None:
+        self._rows: deque[dict[str, object]] = deque(maxlen=rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, row: dict[str, object]) -> None:
+        """Append one row; the oldest goes."""
+        self._rows.append(row)
+
+    def arrays(self) -> dict[str, NDArray[np.float64]]:
+        """Every column that the kept rows have, (n,) or (n, k)."""
+        log = RunLog()
+        for row in self._rows:
+            log.add(row)
+        return log.arrays()
 
 
 class RunLog:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
 from canprobe.cell.build import make_drives, make_tactile
-from canprobe.cell.cycle import LOOKS
 from canprobe.cell.deadlines import find_deadlines
 from canprobe.cell.drives import CommandFrame, command_frames
-from canprobe.cell.intake import Intake
+from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.recording import Recording
 from canprobe.planning.model import Plan
@@ -63,7 +62,7 @@ class LogCycles:
     def __init__(
         self, plan: Plan, recording: Recording, *, as_taken: bool, on_deadlines: bool = True, drifts: bool = False
     ) -> None:
-        overflow = recording.sync_overflow or plan.sync.overflow
+        overflow = recording.sync_overflow or plan.sync.overflow or SYNCS_REMEMBERED
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan, overflow)
         self.sync_times_s: list[float] = []
@@ -76,8 +75,9 @@ class LogCycles:
         stamps = recording.sync_stamps
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
-        looks = LOOKS if on_deadlines else (math.inf,)
-        self._looks = _looks(recording, deadlines, [share * plan.sync.period_ns for share in looks])
+        looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
+        on_time = stamps - deadlines <= (plan.traffic.budget.sync_ns or 0)  # it may have waited for the bus
+        self._looks = _looks(recording, np.where(on_time, deadlines, stamps), looks)
         axes = self.drives.axes if self.drives is not None else ()
         self._commands = {frame.cob_id: frame for frame in command_frames(axes)}
         self._targets: list[int | None] = [None] * len(axes)
@@ -152,8 +152,8 @@ class LogCycles:
         return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
 
 
-def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: list[float]) -> list[list[int]]:
-    """Where each look of each cycle ends among the frames; a late SYNC's looks come at once."""
+def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:
+    """Where each look of each cycle ends among the frames; the delays count from when its SYNC was sent."""
     stamps, syncs = recording.sync_stamps, recording.syncs
     following = np.append(syncs[1:], len(recording.frames))
     ends = []
@@ -161,7 +161,7 @@ def _looks(recording: Recording, deadlines: NDArray[np.int64], delays_ns: list[f
         if math.isinf(delay):
             ends.append(following)
         else:
-            instants = np.maximum(deadlines + int(delay), stamps)
+            instants = np.maximum(sent_ns + int(delay), stamps)
             ends.append(np.searchsorted(recording.times, instants, side="right"))
     clipped = np.clip(np.stack(ends, axis=1), syncs[:, None] + 1, following[:, None])
     return [[int(end) for end in row] for row in clipped]

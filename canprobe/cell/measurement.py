@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.protocol.tactile import TactileFrame
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
 
@@ -65,12 +68,14 @@ class Command:
         done: the controller has finished; the cell is stopped in an orderly way.
         stop_reason: set to stop the cell for safety, with the reason.
         columns: named numbers for the log; a controller uses the same names in every cycle.
+        estimate: a new answer of its surface estimator, for observers; None in cycles without one.
     """
 
     q_target: Vector | None = None
     done: bool = False
     stop_reason: str | None = None
     columns: dict[str, float | Vector] = field(default_factory=dict)
+    estimate: SurfaceEstimate | None = None
 
 
 class Controller(Protocol):

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.candump import read_candump
+from canprobe.bus.logfile import read_log
 from canprobe.bus.port import ERR_FLAG, TimedFrame
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
@@ -70,7 +70,7 @@ class _Channel:
 
 
 def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
-    """Read the frames of a plan's nodes from a candump log.
+    """Read the frames of a plan's nodes from a log.
 
     Args:
         path: the log; it may hold other nodes, other channels and error frames.
@@ -100,7 +100,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
     channels: dict[str, _Channel] = {}
     error_frames = 0
-    for t_ns, name, can_id, data in read_candump(path):
+    for t_ns, name, can_id, data in read_log(path):
         channel = channels.get(name)
         if channel is None:
             channel = channels[name] = _Channel()

@@ -7,6 +7,11 @@ from collections.abc import Sequence
 from canprobe.cell.measurement import TactileSample
 from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 
+JITTER_NS = 300_000
+"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
+LATEST_CYCLES = 4
+"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
+
 
 class TactileReceiver:
     """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
@@ -15,6 +20,10 @@ class TactileReceiver:
         assembler: puts the frames together.
         cob_ids: of its PDOs.
         sync_overflow: at which the SYNC counter starts again.
+
+    Attributes:
+        newest_cycle: trigger of the newest sample.
+        stale: frames dropped because they name no SYNC that they can have followed.
     """
 
     def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
@@ -23,13 +32,13 @@ class TactileReceiver:
         self.newest_cycle: int | None = None
         self.stale = 0
         self._overflow = sync_overflow
-        self._complete: TactileFrame | None = None
+        self._complete: list[TactileFrame] = []
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Take one tactile PDO."""
         frame = self.assembler.push(can_id, data, t_ns)
         if frame is not None:
-            self._complete = frame
+            self._complete.append(frame)
 
     def take(
         self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
@@ -43,20 +52,30 @@ class TactileReceiver:
             sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
                 SYNC before its header.
         """
-        frame, self._complete = self._complete, None
-        if frame is None:
+        if not self._complete:
             return None
-        cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
-        if cycles_ago == 0:
-            self._complete = frame
-            return None
-        trigger = cycle - cycles_ago
-        if cycles_ago >= len(sync_times):
-            self.stale += 1
-            return None
-        self.newest_cycle = trigger
-        t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
-        return TactileSample(frame, t_sample, trigger)
+        sample, early = None, []
+        for frame in self._complete:
+            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
+            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
+                early.append(frame)
+            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
+                self.stale += 1
+            else:
+                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
+                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
+                self.newest_cycle = sample.cycle
+        self._complete = early
+        return sample
+
+    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
+        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
+        if not sync_stamps:
+            return False
+        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
+            return True
+        later = cycles_ago - LATEST_CYCLES
+        return later > 0 and sync_stamps[-later] <= frame.t_ns
 
     def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
         if sync_counter and frame.header.sync_counter:

@@ -16,7 +16,7 @@ from canprobe.cli.interrupts import Terminated
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import CanprobeError
 
-COMMANDS = ("scenes", "plan", "run", "up", "emulate", "scan", "replay", "study", "vcan", "eds")
+COMMANDS = ("scenes", "plan", "run", "up", "emulate", "scan", "replay", "log", "view", "study", "vcan", "eds")
 
 _EXAMPLE = """\
 exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure

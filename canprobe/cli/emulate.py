@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_ids, whole
-from canprobe.cli.target import target_of
+from canprobe.cli.target import add_realtime, real_target, target_of, with_realtime
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,8 +28,10 @@ examples:
   canprobe emulate cylinder --channel vcan0 --store nodes/
   canprobe emulate --eds drive.eds --node-id 5 --channel vcan0
   canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
+  canprobe emulate --bus-yml config/bus.yml --channel vcan0
 """
 _BITRATE = 1_000_000
+_NO_CHANNEL = "emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0"
 
 
 def add_parser(commands: Commands[Parser]) -> None:
@@ -37,6 +39,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("emulate", help="serve emulated nodes on a bus", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser, optional=True)
     add_bus(parser)
+    add_realtime(parser)
     parser.add_argument(
         "--eds", metavar="FILE", action="append", default=[], help="an EDS or DCF file to serve; may be repeated"
     )
@@ -48,6 +51,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         type=whole(1, 127),
         help="node id of the --eds of the same rank",
     )
+    parser.add_argument("--bus-yml", metavar="FILE", type=Path, help="serve the slaves of a ros2_canopen bus.yml")
     parser.add_argument("--nodes", metavar="IDS", type=node_ids, help="such as 1-6,16 [those the scene marks emulated]")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
@@ -57,14 +61,14 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--store", metavar="DIR", type=Path, help="keep there what a master stores by 1010h [forgotten at the end]"
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
-    parser.set_defaults(run=run, bus="socketcan")
+    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Serve until an interrupt, which is the normal way to leave."""
-    if (args.scene is None) is not bool(args.eds):
-        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N")
-    serve = _eds_server(args) if args.eds else _scene_server(args)
+    if [args.scene is not None, bool(args.eds), args.bus_yml is not None].count(True) != 1:
+        raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
+    serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
     from canprobe.child import end_with_parent
 
@@ -80,8 +84,8 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
 
     if args.node_id:
         raise UsageError("emulate: --node-id belongs to --eds; of a scene's nodes, choose with --nodes")
-    scene = load_scene(args.scene)
-    _check_channel(args)
+    scene = with_realtime(load_scene(args.scene), args.realtime)
+    _name_bus(args, scene.bus.channel)
     target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
 
@@ -101,31 +105,52 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
 
 
 def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
-    if len(args.eds) != len(args.node_id):
-        raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+    source = "--bus-yml" if args.bus_yml is not None else "--eds"
     for option in ("nodes", "seed", "truth"):
         if getattr(args, option) is not None:
-            raise UsageError(f"emulate: --{option} belongs to a scene, not to --eds")
-    _check_channel(args)
-    channels = [channel for _, channel in args.channel]
-    if len(channels) > 1 or args.channel[0][0] is not None:
-        raise UsageError("emulate: with --eds there is one channel, without a name: --channel CH")
+            raise UsageError(f"emulate: --{option} belongs to a scene, not to {source}")
+    files = _eds_files(args)
+    channels = [channel for _, channel in args.channel or [(None, None)]]
+    if len(channels) > 1 or (args.channel and args.channel[0][0] is not None):
+        raise UsageError(f"emulate: with {source} there is one channel, without a name: --channel CH")
+    interface, channel, bitrate = real_target(args.bus, channels[0], args.bitrate)
+    if channel is None:
+        raise UsageError(_NO_CHANNEL)
 
     from canprobe import api
 
     return lambda: api.emulate_eds(
-        list(zip(args.eds, args.node_id, strict=True)),
-        interface=args.bus,
-        channel=channels[0],
-        bitrate=args.bitrate or _BITRATE,
+        files,
+        interface=interface,
+        channel=channel,
+        bitrate=bitrate or _BITRATE,
         store_folder=args.store,
+        in_realtime=args.realtime,
         say=say,
     )
 
 
-def _check_channel(args: argparse.Namespace) -> None:
-    if args.channel is None:
-        raise UsageError("emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0")
+def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
+    """(file, node id) of each node without a scene."""
+    if args.bus_yml is not None:
+        from canprobe.bridge.bus_yml import read_bus_yml
+
+        if args.node_id:
+            raise UsageError("emulate: --node-id belongs to --eds; a bus.yml has its own")
+        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml).nodes]
+    if len(args.eds) != len(args.node_id):
+        raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+    return list(zip(args.eds, args.node_id, strict=True))
+
+
+def _name_bus(args: argparse.Namespace, of_scene: str) -> None:
+    """Put what python-can's configuration says where the command line is silent: emulated nodes need a real bus."""
+    given = args.channel[0][1] if args.channel else None
+    args.bus, found, bitrate = real_target(args.bus, given, args.bitrate)
+    if found is None:
+        raise UsageError(_NO_CHANNEL)
+    args.bitrate = args.bitrate or bitrate
+    args.channel = args.channel or [(of_scene, found)]
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

@@ -43,7 +43,11 @@ def add_scene(parser: argparse.ArgumentParser, optional: bool = False) -> None:
 
 def add_bus(parser: argparse.ArgumentParser) -> None:
     """Where the nodes are, in place of what the scene says."""
-    parser.add_argument("--bus", metavar="B", help="lockstep, socketcan, or any python-can interface")
+    parser.add_argument(
+        "--bus",
+        metavar="B",
+        help="lockstep, socketcan, any python-can interface, or config: what CAN_INTERFACE or python-can's files name",
+    )
     parser.add_argument(
         "--channel",
         metavar="[NAME=]CH",
@@ -52,6 +56,16 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
         help="the channel, or the channel that stands for the scene's channel NAME; may be repeated",
     )
     parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate of the bus")
+
+
+def add_bridge(parser: argparse.ArgumentParser) -> None:
+    """Other tools to feed, besides those of the scene."""
+    parser.add_argument(
+        "--bridge",
+        metavar="NAME",
+        action="append",
+        help="feed a tool: mcap, foxglove, ros2, view; may be repeated",
+    )
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

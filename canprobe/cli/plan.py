@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.planning import Plan
 
 _EXAMPLE = """\
-example:
+The files: dcf, one device configuration file a node; dbc and kcd, every frame with its signals (extra `can`); bus.yml,
+for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
+
+examples:
   canprobe plan cylinder
+  canprobe plan mine.toml --auto
+  canprobe plan cylinder --measured runs/cylinder-20260101-120000
+  canprobe plan cylinder --export dbc --export dcf --out config/
+  canprobe plan cylinder --figure plan.png
 """
+EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
 def add_parser(commands: Commands[Parser]) -> None:
@@ -19,18 +33,67 @@ def add_parser(commands: Commands[Parser]) -> None:
         "plan", help="show what a scene needs and leaves out", description=__doc__, epilog=_EXAMPLE
     )
     add_scene(parser)
+    parser.add_argument(
+        "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
+    )
+    parser.add_argument(
+        "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
+    )
+    parser.add_argument(
+        "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
+    )
+    parser.add_argument(
+        "--figure", metavar="FILE.png", type=Path, help="draw cycles and response times (extra `study`)"
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
     add_json(parser)
     parser.set_defaults(run=run)
 
 
+def _draw(plan: Plan, path: Path) -> Path:
+    try:
+        from canprobe.studies.plan_figure import draw_plan
+    except ImportError as error:
+        raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
+    try:
+        draw_plan(plan, path)
+    except ValueError as error:  # matplotlib knows no such form
+        raise UsageError(f"--figure {path}: {error}") from error
+    return path
+
+
 def run(args: argparse.Namespace) -> int:
-    """Print the plan; a scene that does not fit raises PlanError with every reason."""
+    """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.planning import make_plan, plan_text
+    from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
-    plan = make_plan(load_scene(args.scene))
+    scene = load_scene(args.scene)
+    plan = make_plan(opened(scene) if args.auto else scene)
+    if args.measured is not None:
+        return _compare(plan, args.measured, args.json)
+    files = [] if args.figure is None else [_draw(plan, args.figure)]
+    if args.export:
+        from canprobe.bridge.export import export_plan
+
+        files += export_plan(plan, args.out, args.export)
     if args.json:
-        print_json(plan.as_dict())
+        print_json(plan.as_dict() | ({"files": [str(file) for file in files]} if files else {}))
+    elif files:
+        print("\n".join(str(file) for file in files))
     else:
         print(plan_text(plan), end="")
     return 0
+
+
+def _compare(plan: Plan, log: Path, as_json: bool) -> int:
+    """Print what was measured on each bus; 3 where it is not what was planned."""
+    from canprobe.traffic_log import measure_traffic
+
+    several = len(plan.buses) > 1
+    measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
+    if as_json:
+        print_json({channel: one.as_dict() for channel, one in measured.items()})
+    else:
+        print("\n".join(one.text() for one in measured.values()), end="")
+    return 0 if all(one.as_planned for one in measured.values()) else 3

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_json
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import print_json, say
+from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
 
 _EXAMPLE = """\
 The log of a run gives its online result once more. In any other candump of the same nodes every contact is used.
@@ -15,6 +16,7 @@ examples:
   canprobe replay runs/cylinder-20260101-120000
   canprobe replay runs/cylinder-20260101-120000 --method ml --method chen1996 --out estimates.npz
   canprobe replay candump.log --scene cylinder --json
+  canprobe replay runs/cylinder-20260101-120000 --bridge mcap
 """
 
 
@@ -31,6 +33,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--method", metavar="M", action="append", help="estimator; may be repeated [those of the scene]"
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="write every estimate into this npz file")
+    add_bridge(parser)
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -39,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """Replay the log and print what the estimators say."""
     from canprobe import recorded
 
+    if args.bridge:
+        return _run_into(args)
     result = recorded.replay(args.log, scene=args.scene, method=args.method)
     if args.out is not None:
         result.save(args.out)
@@ -46,4 +51,23 @@ def run(args: argparse.Namespace) -> int:
         print_json(result.summary)
     else:
         print(result.text())
+    return 0
+
+
+def _run_into(args: argparse.Namespace) -> int:
+    """Feed the log to bridges, and print what the estimators and the bridges say."""
+    from canprobe.recorded_bridges import replay_into
+    from canprobe.results import bridge_lines
+
+    with termination_interrupts():
+        replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=say)
+    if replayed.result is not None and args.out is not None:
+        replayed.result.save(args.out)
+    if args.json:
+        summary = replayed.result.summary if replayed.result is not None else {}
+        print_json({**summary, "bridges": replayed.bridges})
+        return 0
+    if replayed.result is not None:
+        print(replayed.result.text())
+    print("\n".join(bridge_lines(replayed.bridges)))
     return 0

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, whole
-from canprobe.cli.target import target_of
+from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_json, add_scene, seconds, whole
+from canprobe.cli.target import add_realtime, target_of, with_realtime
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
@@ -26,11 +26,14 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("run", help="carry out a scene", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
     add_bus(parser)
+    add_realtime(parser)
+    add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the results [runs/<scene>-<time>]")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="length of the scene's phase, seconds [the scene's]"
     )
+    parser.add_argument("--blf", action="store_true", help="write the bus as bus.blf too, when the run is over")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -39,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     from canprobe.scene_loader import load_scene
 
-    scene = load_scene(args.scene)
+    scene = with_realtime(load_scene(args.scene), args.realtime)
     target = target_of(args, scene)
 
     from canprobe import api
@@ -51,12 +54,14 @@ def run(args: argparse.Namespace) -> int:
                 scene,
                 interface=target.interface,
                 channel=target.channel,
+                sensor_channel=target.sensor_channel,
                 bitrate=target.bitrate,
                 out=folder,
                 seed=args.seed,
                 duration_s=args.duration,
                 progress=progress_bar(),
                 say=say_on_terminal,
+                bridge=args.bridge or (),
             )
     except CanprobeError as error:
         if args.json and error.summary is not None:
@@ -66,6 +71,11 @@ def run(args: argparse.Namespace) -> int:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
         raise
+    finally:
+        if args.blf and (folder / "bus.log").is_file():
+            from canprobe.bus.logfile import convert_log
+
+            convert_log(folder / "bus.log", folder / "bus.blf")
     if args.json:
         print_json(result.summary)
     else:

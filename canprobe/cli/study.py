@@ -1,4 +1,4 @@
-"""`canprobe study`: measure the estimators against truth, and draw it."""
+"""`canprobe study`: measure estimators and supervision against truth, and draw it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,22 @@ examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
+  canprobe study faults --seed 4711
 """
 
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "study", help="measure the estimators against truth", description=__doc__, epilog=_EXAMPLE
+        "study", help="measure estimators and supervision against truth", description=__doc__, epilog=_EXAMPLE
     )
     parser.add_argument("name", metavar="NAME", nargs="?", help="which study; see --list")
     parser.add_argument("--list", action="store_true", help="list the studies and leave")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the files; runs/study-NAME by default")
     parser.add_argument("--quick", action="store_true", help="fewer repeats: a first look")
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="faults: only this run, told step by step"
+    )
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler instead")
     parser.add_argument("--fresh", action="store_true", help="compute everything, whatever is kept in DIR")
@@ -50,6 +54,8 @@ def run(args: argparse.Namespace) -> int:
         known = ", ".join(STUDIES)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
+    if args.seed is not None:
+        return _replay(args)
     from canprobe.studies.study_files import as_document, text_of, write_study
     from canprobe.studies.sweep import open_sweep
 
@@ -71,3 +77,15 @@ def run(args: argparse.Namespace) -> int:
         print(text_of(result), end="")
     say("wrote " + ", ".join(map(str, paths)))
     return 0
+
+
+def _replay(args: argparse.Namespace) -> int:
+    """Carry out one numbered run of a study again; status 1 where it fails."""
+    if args.name != "faults":
+        args.complain(f"--seed: the runs of study {args.name} are not numbered; those of faults are")
+    from canprobe.studies.faults import replay
+
+    outcome = replay(args.seed, say)
+    if args.json:
+        print_json(outcome)
+    return 1 if outcome["failures"] else 0

@@ -10,19 +10,21 @@ import numpy as np
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.plant.config import DynamicSettings, PlantConfig, PressMotion
 from canprobe.emulator.plant.taxels import TaxelConfig
-from canprobe.emulator.plant.world import Plant, PlantConfig, PressMotion
+from canprobe.emulator.plant.world import Plant
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.planning import Plan
-from canprobe.robot.puma260 import MODELS, Array
+from canprobe.robot.kinematics import forward
+from canprobe.robot.puma260 import MODELS, Array, PumaModel
 from canprobe.robot.touching import start_posture
 from canprobe.scene import PlantSettings, ProbeSettings, Scene
 from canprobe.scene_geometry import T_flange_probe, approach_normal, true_object
 
 PARKED_ABOVE_MM = 5.0
 """How far above the approach's first point an emulated arm stands at power on."""
-EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk")
+EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,25 +34,26 @@ class World:
     Attributes:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
-        recorder: notes the truth at every SYNC.
+        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
     """
 
     nodes: tuple[SlaveNode, ...]
     plant: Plant
-    recorder: TruthRecorder
+    recorder: TruthRecorder | None
 
     @property
     def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
         """Everything that lives on the bus; the recorder listens only."""
-        return (*self.nodes, self.recorder)
+        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
 
 
-def make_world(plan: Plan, node_ids: Collection[int]) -> World:
+def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True) -> World:
     """The emulated nodes of a plan, behind one plant.
 
     Args:
         plan: of the scene.
         node_ids: which of its nodes to emulate.
+        truth: whether what is true is recorded.
     """
     scene = plan.scene
     plant = Plant(_plant_config(scene))
@@ -65,7 +68,7 @@ def make_world(plan: Plan, node_ids: Collection[int]) -> World:
             nodes.append(make_drive_node(dictionary, node.node_id, axis, plant))
         else:
             nodes.append(make_tactile_node(dictionary, node.node_id, plant))
-    return World(tuple(nodes), plant, TruthRecorder(plant))
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
 
 
 def _plant_config(scene: Scene) -> PlantConfig:
@@ -82,7 +85,41 @@ def _plant_config(scene: Scene) -> PlantConfig:
         press=PressMotion(force_n=scene.task.force_n),
         seed=scene.seed,
     )
-    return config if arm is None else replace(config, q0=_first_posture(scene))
+    if arm is None:
+        return config
+    real = MODELS[settings.arm_model or arm.model]
+    return replace(
+        config,
+        model=real,
+        q0=_first_posture(scene),
+        fidelity=settings.fidelity,
+        dynamics=_dynamics(settings, probe),
+        base_offset_m=_base_offset(scene, real),
+    )
+
+
+def _dynamics(settings: PlantSettings, probe: ProbeSettings) -> DynamicSettings:
+    return DynamicSettings(
+        payload_kg=probe.mass_kg,
+        friction=settings.friction,
+        integral_s=settings.integral_ms * 1e-3,
+        velocity_feed_forward=settings.velocity_feed_forward,
+        torque_limit_permille=settings.torque_limit_permille,
+        method=settings.integrator,
+        step_ns=round(settings.step_us * 1000),
+    )
+
+
+def _base_offset(scene: Scene, real: PumaModel) -> Array:
+    """Where the real arm's base stands in the controller's base frame, (3,), m.
+
+    An experimenter moves the arm to the object and takes that place for what the encoders say: both arms hold the
+    probe at one place in the first posture.
+    """
+    assert scene.arm is not None
+    q, tool = _first_posture(scene), T_flange_probe(scene.probe or ProbeSettings())
+    offset: Array = ((forward(MODELS[scene.arm.model], q) - forward(real, q)) @ tool)[:3, 3]
+    return offset
 
 
 def _first_posture(scene: Scene) -> Array:

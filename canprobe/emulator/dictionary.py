@@ -24,6 +24,7 @@ class Dictionary:
         entries: by key (index << 8 | subindex).
         values: present values by key; cyclic code reads and writes here directly.
         written: called with the key after a value was stored over SDO, or over an RPDO that needs checks or hooks.
+        configured: called with the index after a value was stored over SDO.
     """
 
     def __init__(self, od: ObjectDictionary) -> None:
@@ -34,6 +35,7 @@ class Dictionary:
         self._hooks: dict[int, list[Hook]] = {}
         self._refreshers: dict[int, Callable[[int], None]] = {}
         self.written: Callable[[int], None] = _nothing
+        self.configured: Callable[[int], None] = _nothing
         self.restore(self.entries)
 
     def restore(self, keys: Iterable[int]) -> None:

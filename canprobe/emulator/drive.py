@@ -10,11 +10,11 @@ from __future__ import annotations
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.eds import has_missed_syncs
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.drive_faults import DriveFaults
 from canprobe.emulator.drive_feedback import DriveFeedback
+from canprobe.emulator.drive_loop import DriveLoop
 from canprobe.emulator.drive_mode import DriveParts
 from canprobe.emulator.drive_mode_selection import ModeSelection
 from canprobe.emulator.drive_motion import STEP_NS, AxisPlant, Motion
@@ -38,15 +38,13 @@ _ENABLED = DriveState.OPERATION_ENABLED
 class DriveApplication(Application):
     """The drive function of one node."""
 
-    def __init__(self, axis: int, plant: AxisPlant, has_misses: bool = False) -> None:
+    def __init__(self, axis: int, plant: AxisPlant) -> None:
         """Make the drive of one axis.
 
         Args:
             axis: of the plant, 0-based.
             plant: shared with the other nodes.
-            has_misses: see `DriveParameters`.
         """
-        self._has_misses = has_misses
         self._axis, self._plant = axis, plant
         self._standstill = False
 
@@ -54,12 +52,14 @@ class DriveApplication(Application):
         """Hang the drive's objects on the node."""
         self._node, self._core = node, node.core
         self._values, dictionary, timers = node.dictionary.values, node.dictionary, node.core.timers
-        self._parameters = DriveParameters(dictionary, self._has_misses)
+        self._parameters = DriveParameters(dictionary)
         self._motion = Motion(self._axis, self._plant, timers)
         self._feedback = DriveFeedback(node, self._axis, self._plant, self._motion, self._parameters.units)
         self._faults = DriveFaults(node, lambda t_ns: self._states.event(Event.FAULT_DETECTED, t_ns))
         self._states = DriveStates(self._entered_state, lambda: self._parameters.quick_stop in STAYS_STOPPED)
         self._supervision = Supervision(node, self._parameters, self._abort_connection)
+        self._loop = DriveLoop(self._axis, self._plant, self._parameters, self._values)
+        dictionary.on_write(0x6072, lambda _sub, _value: self._loop.limit())
         self._modes = ModeSelection(self._parts(), lambda: self._states.state is _ENABLED)
         self._pass_on = timers.new(self._states.pass_on)
         node.store.volatile |= _VOLATILE
@@ -76,6 +76,7 @@ class DriveApplication(Application):
             motion=self._motion,
             feedback=self._feedback,
             supervision=self._supervision,
+            loop=self._loop,
             show=self._show,
             fault=self._faults.find,
         )
@@ -96,6 +97,7 @@ class DriveApplication(Application):
         self._faults.reset()
         self._standstill = False
         self._parameters.read()
+        self._loop.release()
         self._feedback.reset(t_ns)
         self._motion.hold(t_ns)
         self._modes.reset()
@@ -226,4 +228,4 @@ def make_drive_node(od: ObjectDictionary, node_id: int, axis: int, plant: AxisPl
         axis: of the plant, 0-based.
         plant: shared by all nodes.
     """
-    return SlaveNode(od, node_id, DriveApplication(axis, plant, has_missed_syncs(od)))
+    return SlaveNode(od, node_id, DriveApplication(axis, plant))

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from canprobe.emulator.drive_feedback import DriveFeedback
+from canprobe.emulator.drive_loop import DriveLoop
 from canprobe.emulator.drive_motion import AxisPlant, Motion
 from canprobe.emulator.drive_parameters import PEAK_PERMILLE, DriveParameters
 from canprobe.emulator.drive_supervision import Supervision
@@ -37,6 +38,7 @@ class DriveParts:
     motion: Motion
     feedback: DriveFeedback
     supervision: Supervision
+    loop: DriveLoop
     show: Callable[[], None]
     fault: Callable[[int, int], None]
 
@@ -73,6 +75,7 @@ class DriveMode:
 
     def leave(self, t_ns: int) -> None:
         """Another mode takes over, or operation is disabled."""
+        self.parts.loop.release()
 
     def sync(self, t_ns: int, counts: float) -> None:
         """A SYNC; the motor is at `counts`."""
@@ -113,9 +116,15 @@ class DriveMode:
             self.parts.show()
 
     def _strains(self) -> bool:
-        """Whether the motion takes more torque than 6072h, which an ideal plant gives all the same."""
+        """Whether the motion takes all of 6072h, or more, which an ideal plant gives all the same."""
         limit = self._parameters.max_torque
-        return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) > limit
+        return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
+
+    def _look(self) -> tuple[int, float] | None:
+        """For a mode's timer: now, and where the motor is; None when the following error has become a fault."""
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        return None if self._lags(t_ns, counts) else (t_ns, counts)
 
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""

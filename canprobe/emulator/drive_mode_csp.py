@@ -1,7 +1,7 @@
 """Cyclic synchronous position: a target latched at a SYNC is reached by a straight ramp after 60C2h.
 
-Offsets of velocity and torque (60B1h, 60B2h) are feed-forwards; the ideal plant needs none and they do nothing here.
-Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 60B0h, 60C2h.
+Offsets of velocity and torque (60B1h, 60B2h) are feed-forwards of a dynamic plant; the ideal one needs none.
+Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 60B0h–60B2h, 60C2h.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ class CyclicPosition(DriveMode):
         values, parameters, units = self._values, self._parameters, self._units
         target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
         allowed = parameters.clamp(target)
+        self.parts.loop.feed_forward()
         self._motion.reach(allowed * units.scale + units.origin, t_ns, parameters.interpolation_ns)
         limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
         if limited is not self.limited:

@@ -2,7 +2,7 @@
 
 The velocity is cut to 607Fh and 6080h and the motor waits at a software limit; both set bit 11. The reference is
 the integral of the velocity: the plant follows it as it follows positions.
-Source: CiA 402-2, "Cyclic synchronous velocity mode", objects 60FFh, 60B1h, 607Dh, 607Fh, 6080h.
+Source: CiA 402-2, "Cyclic synchronous velocity mode", objects 60FFh, 60B1h, 60B2h, 607Dh, 607Fh, 6080h.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ class CyclicVelocity(CyclicMode):
         values, parameters = self._values, self._parameters
         wanted = (int(values[_TARGET]) + int(values.get(_OFFSET, 0))) * self._units.speed_scale
         velocity = min(max(wanted, -parameters.max_speed), parameters.max_speed)
+        self.parts.loop.feed_torque()
         here, (low, high) = self._motion.demand(t_ns), parameters.fence
         self._motion.follow(Fenced(ConstantVelocity(here, velocity), low, high), t_ns)
         fenced = (here >= high and velocity > 0.0) or (here <= low and velocity < 0.0)

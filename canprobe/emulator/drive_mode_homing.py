@@ -133,10 +133,9 @@ class Homing(DriveMode):
         return min(wanted, self._parameters.max_speed)
 
     def _watch(self, due_ns: int) -> None:
-        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
-        counts = self.parts.feedback.measure(t_ns)
-        if self._lags(t_ns, counts):
+        if (look := self._look()) is None:
             return
+        t_ns, counts = look
         self._timer.arm_next(due_ns, STEP_NS)
         if self._phase is Phase.SEARCHING:
             pulse = next_pulse(self._was, self._direction, self._units.turn)

@@ -123,10 +123,9 @@ class ProfilePosition(DriveMode):
         self._motion.follow(trapezoid(here, speed, point.counts, **rates), t_ns)
 
     def _watch(self, due_ns: int) -> None:
-        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
-        counts = self.parts.feedback.measure(t_ns)
-        if self._lags(t_ns, counts):
+        if (look := self._look()) is None:
             return
+        t_ns, counts = look
         self._timer.arm_next(due_ns, STEP_NS)
         point = self._active
         if point is not None and not self._reached and not self.halted:

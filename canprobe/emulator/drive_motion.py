@@ -34,6 +34,16 @@ class AxisPlant(Protocol):
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How the motor answers to torque."""
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """What the position loop may do: called when a drive's limit or feed-forward changes.
+
+        Args:
+            axis: 0-based.
+            limit_permille: largest torque, 1/1000 of the rated torque.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
 

@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from math import inf
 
-from canprobe.eds import MISSED_SYNCS
+from canprobe.eds import MISSED_SYNCS, MISSED_SYNCS_NAME
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.drive_units import FACTORS, Units
-from canprobe.emulator.entries import Value
+from canprobe.emulator.entries import Value, key_of
 
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
@@ -47,10 +47,10 @@ class DriveParameters:
         max_torque: 6072h, permille.
     """
 
-    def __init__(self, dictionary: Dictionary, has_misses: bool = False) -> None:
-        """`has_misses` where 2000h is what it is in our own EDS."""
+    def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._has_misses = has_misses
+        missed_syncs = dictionary.entries.get(key_of(MISSED_SYNCS))
+        self._has_misses = missed_syncs is not None and missed_syncs.name == MISSED_SYNCS_NAME
         self.units = Units()
         self.read()
         for index in _INDICES:

@@ -34,6 +34,9 @@ class IdealAxis:
         """Of a motor of its own: from rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
         return MotorDynamics(gain=1000.0, coulomb=0.0, damping=1.0)
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: there is no loop and no torque."""
+
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
         self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns

@@ -7,11 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from canprobe.eds import LONG_PDOS, LONG_PDOS_NAME
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.entries import Entry, Value, key_of
 from canprobe.protocol.frames import is_restricted
-from canprobe.protocol.pdo import MAX_BITS, PdoEntry
+from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry
 
 INVALID = 1 << 31
 COB_ID, TYPE, INHIBIT, EVENT, START = 1, 2, 3, 5, 6
@@ -40,6 +41,12 @@ class PdoRules:
     def valid(self) -> bool:
         """Whether the PDO exists now (bit 31 of its COB-ID is 0)."""
         return not self.dictionary.number(self.communication, COB_ID, INVALID) & INVALID
+
+    @property
+    def long(self) -> bool:
+        """Whether PDOs of up to 64 bytes were switched on, in a device that has them."""
+        entry = self.dictionary.entries.get(key_of(LONG_PDOS, 0)) if self.transmits else None
+        return entry is not None and entry.name == LONG_PDOS_NAME and bool(self.dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
         """Raises SdoAbort for a value that the standard forbids now."""
@@ -79,7 +86,7 @@ class PdoRules:
         if total and key_of(self.mapping, total) not in self.dictionary:
             raise SdoAbort(Abort.MAPPING_LENGTH)
         found = tuple(self.entry(self.dictionary.number(self.mapping, sub)) for sub in range(1, total + 1))
-        if sum(entry.bits for entry in found) > MAX_BITS:
+        if sum(entry.bits for entry in found) > (FD_MAX_BITS if self.long else MAX_BITS):
             raise SdoAbort(Abort.MAPPING_LENGTH)
         return found
 

@@ -112,6 +112,7 @@ class SdoServer:
         if command & 2:
             size = 4 - (command >> 2 & 3) if command & 1 else min(entry.bits // 8 or 4, 4)
             dictionary.write_value(entry, entry.from_bytes(data[4 : 4 + size]))
+            dictionary.configured(index)
         else:
             announced = int.from_bytes(data[4:8], "little") if command & 1 else None
             self._transfer = SegmentedDownload(entry, announced, self._write)
@@ -143,6 +144,7 @@ class SdoServer:
 
     def _write(self, data: bytes) -> None:
         self._core.dictionary.write(*self._multiplexer, data)
+        self._core.dictionary.configured(self._multiplexer[0])
 
     def _abort(self, code: Abort) -> None:
         self._drop()

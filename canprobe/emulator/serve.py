@@ -229,8 +229,8 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
             if exchange.rerouted and defer is not None:
                 # Being woken for each RPDO, in the middle of its sender's burst, costs both sides more than all else.
                 exchange.rerouted = False
-                if exchange.patient != deferred:
-                    defer(deferred := exchange.patient)
+                if (patient := exchange.patient) != deferred:
+                    defer(deferred := patient)
             received = receive(exchange.next_deadline_ns, now_ns)
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
             now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()

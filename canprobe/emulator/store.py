@@ -1,6 +1,6 @@
 """Store and restore parameters (1010h, 1011h) in a memory that survives the resets of the node.
 
-Source: CiA 301, objects 1010h and 1011h.
+Source: CiA 301, objects 1010h, 1011h and 1020h.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ _COMMUNICATION = range(0x1000, 0x2000)
 _APPLICATION = range(0x2000, 0x10000)
 _COMMUNICATION_ONLY = 2
 _GROUPS = {1: _ALL, 2: _COMMUNICATION, 3: _APPLICATION}
+_VERIFY = 0x1020
 _NEVER = frozenset({0x1003, 0x1010, 0x1011})
 
 
@@ -38,6 +39,7 @@ class Store:
         self.kept = b""
         self.changed: Callable[[], None] = _nothing
         self.volatile: set[int] = set()
+        core.dictionary.configured = self._unverify
         core.dictionary.on_check(0x1010, self._save)
         core.dictionary.on_check(0x1011, self._load)
         core.dictionary.on_write(0x1010, self._show)
@@ -86,6 +88,13 @@ class Store:
         except SdoAbort:
             self.saved, self.kept = before
             raise
+
+    def _unverify(self, index: int) -> None:
+        """Another value came over SDO: what 1020h says of the configuration is no longer true."""
+        if index == _VERIFY or index in _NEVER or index in self.volatile:
+            return
+        for subindex in (1, 2):
+            self._core.dictionary.put(_VERIFY, subindex, 0)
 
     def _show(self, subindex: int, value: Value) -> None:
         for index in (0x1010, 0x1011):

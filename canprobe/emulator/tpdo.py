@@ -94,7 +94,7 @@ class Tpdo:
         self._inhibit_ns = number(index, INHIBIT) * 100_000
         self._event_ns = number(index, EVENT) * 1_000_000
         if self.active:
-            self._pack, self._fetch = PdoLayout(self._cob_id, entries, self.type).pack, _fetcher(self.keys)
+            self._pack, self._fetch = PdoLayout(self._cob_id, entries, self.type, fd=True).pack, _fetcher(self.keys)
 
     @property
     def by_event(self) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from canprobe.eds import load_eds
+from canprobe.eds import has_long_pdos, load_eds
 from canprobe.planning.model import Direction, Identity
 from canprobe.protocol.pdo import PdoEntry
 
@@ -40,6 +40,11 @@ class Abilities:
     def identity(self) -> Identity:
         """Vendor, product and revision of 1018h."""
         return Identity(*(self._default(0x1018, subindex) for subindex in (1, 2, 3)))
+
+    @property
+    def has_long_pdos(self) -> bool:
+        """Whether it can send PDOs of up to 64 bytes."""
+        return has_long_pdos(self.od)
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object exists."""

@@ -9,11 +9,14 @@ from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
+    CycleBudget,
     Demand,
     Plan,
+    PlannedBus,
     PlannedNode,
     PlannedPdo,
 )
+from canprobe.planning.timeline import Slot, timeline
 
 SCHEMA = 1
 
@@ -25,7 +28,13 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "schema": SCHEMA,
         "scene": plan.scene.name,
         "title": plan.scene.title,
-        "bus": {"interface": bus.interface, "channel": bus.channel, "bitrate": bus.bitrate},
+        "bus": {
+            "interface": bus.interface,
+            "channel": bus.channel,
+            "bitrate": bus.bitrate,
+            "fd": bus.fd,
+            "data_bitrate": bus.data_bitrate if bus.fd else None,
+        },
         "sync": asdict(plan.sync),
         "heartbeat": {
             "master_node_id": MASTER_NODE_ID,
@@ -34,22 +43,29 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         },
         "nodes": [_node(node) for node in plan.nodes],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
-        "bus_load": {
-            bus.channel: {
-                "planned_worst": plan.traffic.load,
-                "parts": dict(plan.traffic.parts),
-                "demands": [_demand(demand) for demand in plan.traffic.demands],
-                "sync_response_us": _us(plan.traffic.sync_response_ns),
-            }
-        },
+        "bus_load": {one.channel: _bus(one) for one in plan.buses},
+        "choices": [{"key": choice.key, "value": choice.value, "why": choice.why} for choice in plan.choices],
+        "timeline": [_slot(slot) for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
         "estimator": plan.estimator,
         "offline_estimators": list(plan.offline_estimators),
         "strategy": plan.strategy,
         "fidelity": plan.fidelity,
+        "bridges": list(plan.scene.bridge.use) if plan.scene.bridge is not None else [],
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
+    }
+
+
+def _bus(bus: PlannedBus) -> dict[str, Any]:
+    return {
+        "node_ids": list(bus.node_ids),
+        "planned_worst": bus.traffic.load,
+        "parts": dict(bus.traffic.parts),
+        "demands": [_demand(demand) for demand in bus.traffic.demands],
+        "sync_response_us": _us(bus.traffic.sync_response_ns),
+        "budget": _budget(bus.traffic.budget),
     }
 
 
@@ -61,6 +77,7 @@ def _node(node: PlannedNode) -> dict[str, Any]:
 def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
     return {
         "node_id": pdo.node_id,
+        "channel": pdo.channel,
         "direction": pdo.direction,
         "number": pdo.number,
         "cob_id": pdo.cob_id,
@@ -74,7 +91,19 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
         "bits_worst": pdo.bits_worst,
         "deadline_us": _us(pdo.deadline_ns),
         "response_us": _us(pdo.response_ns),
+        "slack_us": _us(pdo.slack_ns),
         "event_timer_ms": pdo.event_timer_ms or None,
+    }
+
+
+def _slot(slot: Slot) -> dict[str, Any]:
+    return {
+        "part": slot.part,
+        "channel": slot.channel or None,
+        "cob_id": slot.cob_id,
+        "cycle": slot.cycle,
+        "start_us": _us(slot.start_ns),
+        "end_us": _us(slot.end_ns),
     }
 
 
@@ -84,6 +113,15 @@ def _demand(demand: Demand) -> dict[str, Any]:
         "cycles": demand.cycles,
         "used_us": _us(demand.used_ns),
         "available_us": _us(demand.available_ns),
+    }
+
+
+def _budget(budget: CycleBudget) -> dict[str, Any]:
+    """The cycle's budget in µs."""
+    times = asdict(budget) | {"bus_ns": budget.bus_ns}
+    looks = times.pop("looks_ns")
+    return {name.removesuffix("_ns") + "_us": _us(t_ns) for name, t_ns in times.items()} | {
+        "looks_us": [_us(look) for look in looks]
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable
 
+from canprobe.planning.bridges import bridge_outputs
 from canprobe.scene import Scene
 
 _Reason = Callable[[Scene], str | None]
@@ -73,7 +74,8 @@ def _no_truth(scene: Scene) -> str | None:
 
 
 def _no_dynamics(scene: Scene) -> str | None:
-    emulated_arm = scene.arm is not None and scene.arm.emulated
+    ideal = scene.plant is not None and scene.plant.fidelity == "ideal"
+    emulated_arm = scene.arm is not None and scene.arm.emulated and ideal
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 
@@ -81,6 +83,18 @@ def _no_figure(_: Scene) -> str | None:
     if importlib.util.find_spec("matplotlib") is not None:
         return None
     return "the study extra is not installed: pip install 'canprobe[study]'"
+
+
+def _no_page(scene: Scene) -> str | None:
+    if scene.task.kind == "listen":
+        return 'task.kind = "listen": nothing moves'
+    if importlib.util.find_spec("viser") is not None:
+        return None
+    return "the view extra is not installed: pip install 'canprobe[view]'"
+
+
+def _no_bridge(scene: Scene) -> str | None:
+    return None if scene.bridge is not None and scene.bridge.use else "no [bridge]: no other tool is fed"
 
 
 def _switch(name: str) -> _Reason:
@@ -110,7 +124,11 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
     ("taxel hysteresis", _switch("hysteresis")),
     ("taxel creep", _switch("creep")),
     ("taxel crosstalk", _switch("crosstalk")),
+    ("taxel saturation", _switch("saturation")),
+    ("the array's own threshold", _switch("threshold")),
     ("figure", _no_figure),
+    ("replay to share (report.html)", _no_page),
+    ("bridges to other tools", _no_bridge),
 )
 
 
@@ -130,4 +148,6 @@ def outputs(scene: Scene) -> tuple[str, ...]:
         files.append("surface.npz")
     if _no_figure(scene) is None:
         files += ["report.png", "surface.png"] if mapped else ["report.png"]
-    return tuple(files)
+    if _no_page(scene) is None:
+        files.append("report.html")
+    return (*files, *bridge_outputs(scene))

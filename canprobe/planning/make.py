@@ -3,51 +3,65 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from canprobe.errors import EdsError, PlanError
 from canprobe.planning.abilities import Abilities
+from canprobe.planning.bridges import unavailable_bridges
 from canprobe.planning.cycle import plan_ratio, plan_sync
+from canprobe.planning.identifiers import identifier_problems, order_by_deadline
 from canprobe.planning.left_out import left_out, outputs
-from canprobe.planning.model import Direction, NodeKind, Plan, PlannedNode, PlannedPdo, SyncPlan, Traffic
+from canprobe.planning.model import (
+    Choice,
+    Direction,
+    NodeKind,
+    Plan,
+    PlannedBus,
+    PlannedNode,
+    PlannedPdo,
+    SyncPlan,
+    Traffic,
+)
 from canprobe.planning.needs import missing_objects
-from canprobe.planning.pdos import PdoPlanning, identifier_problems, plan_drive_pdos, plan_tactile_pdos
+from canprobe.planning.open_keys import candidates
+from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.reach import check_motion
 from canprobe.planning.traffic import plan_traffic
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
 
+SYNC_COUNTER = 0x1019
+
 
 def make_plan(scene: Scene) -> Plan:
-    """Derive the plan of a scene.
+    """Derive the plan of a scene; what the scene leaves open ("auto") is chosen so that it fits.
 
     Args:
         scene: as `load_scene` gave it.
 
     Returns:
-        Nodes, PDOs, bus load, what is left out and why.
+        Nodes, PDOs, bus load, what is left out and why. Its scene has nothing open any more.
 
     Raises:
         PlanError: with every reason why the scene does not fit, its numbers and the ways out.
     """
     devices, problems = _devices(scene)
-    bus = _plan_bus(scene, devices) if not problems else None
-    if bus is not None:
-        problems += bus.problems
-        if bus.overload:
-            known = frozenset(bus.problems)
-            ways = ways_out(scene, lambda changed: _fits(changed, devices, known))
-            problems += [*bus.overload[:-1], f"{bus.overload[-1]}; ways out: {ways}"]
+    found = _choose(scene, devices) if not problems else None
+    if found is not None:
+        problems += found.reasons()
+        scene = found.scene
     joint_speeds, unreachable = check_motion(scene)
     problems += unreachable
-    if problems or bus is None:
+    if problems or found is None:
         raise PlanError(problems)
+    bus = found.bus
     return Plan(
         scene=scene,
         nodes=_nodes(scene, devices, bus.pdos),
         pdos=bus.pdos,
         sync=bus.sync,
-        traffic=bus.traffic,
+        buses=bus.buses,
+        choices=found.choices,
         joint_speeds=joint_speeds,
         estimator=scene.shape.method if scene.shape is not None else None,
         offline_estimators=scene.shape.also if scene.shape is not None else (),
@@ -55,7 +69,7 @@ def make_plan(scene: Scene) -> Plan:
         fidelity=scene.plant.fidelity if scene.plant is not None and scene.emulated_node_ids else None,
         outputs=outputs(scene),
         left_out=left_out(scene),
-        not_available=bus.not_available,
+        not_available=(*bus.not_available, *unavailable_bridges(scene)),
     )
 
 
@@ -65,34 +79,105 @@ class _BusPlan:
 
     sync: SyncPlan
     pdos: tuple[PlannedPdo, ...]
-    traffic: Traffic
+    buses: tuple[PlannedBus, ...]
     problems: list[str]
     overload: list[str]
     not_available: tuple[tuple[str, str], ...]
+
+    @property
+    def peak(self) -> float:
+        """The largest share of a bus, or of the time that a trigger's frames have, that is asked for."""
+        demands = (demand for bus in self.buses for demand in bus.traffic.demands)
+        return max(
+            *(bus.traffic.load for bus in self.buses), *(demand.used_ns / demand.available_ns for demand in demands)
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """The first candidate that fits, or else the nearest to it."""
+
+    scene: Scene
+    choices: tuple[Choice, ...]
+    bus: _BusPlan
+    tried: int
+
+    def reasons(self) -> list[str]:
+        """Why it does not fit; empty where it does."""
+        problems = list(self.bus.problems)
+        if self.bus.overload:
+            known = frozenset(self.bus.problems)
+            ways = ways_out(self.scene, lambda changed: _fits(changed, known))
+            problems += [*self.bus.overload[:-1], f"{self.bus.overload[-1]}; ways out: {ways}"]
+        if problems and self.tried > 1:
+            chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in self.choices)
+            problems.insert(0, f"none of {self.tried} ways to fill what is left open fits; the nearest: {chosen}")
+        return problems
+
+
+def _choose(scene: Scene, devices: Mapping[int, Abilities]) -> _Found:
+    nearest: _Found | None = None
+    for tried, (candidate, choices) in enumerate(candidates(scene), start=1):
+        found = _Found(candidate, choices, _plan_bus(candidate, devices), tried)
+        if not found.bus.overload and not found.bus.problems:
+            return found
+        if nearest is None or _distance(found.bus) < _distance(nearest.bus):
+            nearest = found
+    assert nearest is not None
+    return replace(nearest, tried=tried)
+
+
+def _distance(bus: _BusPlan) -> tuple[int, float]:
+    return len(bus.problems), bus.peak
 
 
 def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
     sync, problems = plan_sync(scene)
     ratio, found = plan_ratio(scene)
     planning = PdoPlanning(problems=[*problems, *found])
+    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if SYNC_COUNTER not in device.od]:
+        sync = replace(sync, overflow=0)
+        planning.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
     plan_drive_pdos(planning, scene, sync, devices)
     if scene.sensor is not None:
         plan_tactile_pdos(planning, scene, sync, ratio, devices[scene.sensor.node_id])
-    planning.problems += identifier_problems(planning.pdos)
-    traffic, pdos, overload = plan_traffic(planning.pdos, sync, _node_ids(scene), scene.bus)
-    return _BusPlan(sync, tuple(pdos), traffic, planning.problems, overload, tuple(planning.not_available))
+    planned = order_by_deadline(planning.pdos) if scene.bus.cob_ids == "by_deadline" else planning.pdos
+    planning.problems += identifier_problems(planned)
+    buses: list[PlannedBus] = []
+    pdos: list[PlannedPdo] = []
+    overload: list[str] = []
+    for channel, node_ids in _channels(scene).items():
+        mine = [replace(pdo, channel=channel) for pdo in planned if pdo.node_id in node_ids]
+        settings = replace(scene.bus, channel=channel)
+        traffic, timed, late = plan_traffic(mine, sync, node_ids, settings, round(scene.cycle.compute_us * 1000))
+        buses.append(PlannedBus(channel, node_ids, traffic))
+        pdos += timed
+        overload += late
+    return _BusPlan(
+        sync, tuple(pdos), tuple(buses), planning.problems, overload, tuple(dict.fromkeys(planning.not_available))
+    )
 
 
-def _fits(scene: Scene, devices: Mapping[int, Abilities], known: frozenset[str]) -> Traffic | None:
-    """The traffic of a changed scene if it fits and brings no problem that is not known already."""
+def _channels(scene: Scene) -> dict[str, tuple[int, ...]]:
+    """Which nodes are on which bus, the arm's first."""
+    channels: dict[str, tuple[int, ...]] = {}
+    if scene.arm is not None:
+        channels[scene.bus.channel] = tuple(sorted(scene.arm.node_ids))
+    if scene.sensor is not None:
+        channel = scene.sensor.channel or scene.bus.channel
+        channels[channel] = tuple(sorted((*channels.get(channel, ()), scene.sensor.node_id)))
+    return channels
+
+
+def _fits(scene: Scene, known: frozenset[str]) -> Traffic | None:
+    """The fullest bus of a changed scene if it fits and brings no problem that is not known already."""
+    devices, problems = _devices(scene)
+    if problems:
+        return None
     bus = _plan_bus(scene, devices)
-    return None if bus.overload or not known.issuperset(bus.problems) else bus.traffic
-
-
-def _node_ids(scene: Scene) -> tuple[int, ...]:
-    arm = scene.arm.node_ids if scene.arm is not None else ()
-    sensor = (scene.sensor.node_id,) if scene.sensor is not None else ()
-    return tuple(sorted((*arm, *sensor)))
+    if bus.overload or not known.issuperset(bus.problems):
+        return None
+    return max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
 
 
 def _devices(scene: Scene) -> tuple[dict[int, Abilities], list[str]]:
@@ -122,6 +207,7 @@ def _nodes(scene: Scene, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
         roles += [(node_id, "drive", f"joint {axis}", scene.arm.emulated) for axis, node_id in joints]
     if scene.sensor is not None:
         roles.append((scene.sensor.node_id, "tactile", "tactile array", scene.sensor.emulated))
+    channel_of = {node_id: channel for channel, node_ids in _channels(scene).items() for node_id in node_ids}
     return tuple(
         PlannedNode(
             node_id=node_id,
@@ -130,6 +216,7 @@ def _nodes(scene: Scene, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
             eds=devices[node_id].eds,
             identity=devices[node_id].identity,
             emulated=emulated,
+            channel=channel_of[node_id],
             switched_off=_switched_off(node_id, devices[node_id], pdos),
         )
         for node_id, kind, role, emulated in sorted(roles)

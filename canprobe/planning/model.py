@@ -38,6 +38,7 @@ class PlannedNode:
         eds: name or path of its EDS.
         identity: what 1018h must answer.
         emulated: served by the emulator.
+        channel: of the bus that it is on.
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
     """
 
@@ -47,6 +48,7 @@ class PlannedNode:
     eds: str
     identity: Identity
     emulated: bool
+    channel: str
     switched_off: tuple[tuple[Direction, int], ...]
 
 
@@ -62,8 +64,11 @@ class PlannedPdo:
         rate_hz: how often it is on the bus; for an event-driven one the slowest rate.
         bits_worst: length on the wire with worst-case stuffing.
         deadline_ns: after the SYNC, or after its own queueing where event-driven.
-        response_ns: worst-case response time; None where the bus is overloaded.
+        response_ns: worst case of its end after the SYNC, or after its own queueing where event-driven; None where
+            the bus is overloaded.
         event_timer_ms: 14xxh:05, 0 without.
+        kind: of the node.
+        channel: of the bus that it is on; empty until that is planned.
     """
 
     node_id: int
@@ -75,11 +80,18 @@ class PlannedPdo:
     deadline_ns: int
     response_ns: int | None = None
     event_timer_ms: int = 0
+    kind: NodeKind = "drive"
+    channel: str = ""
 
     @property
     def cob_id(self) -> int:
         """11-bit identifier."""
         return self.layout.cob_id
+
+    @property
+    def slack_ns(self) -> int | None:
+        """What its deadline leaves after the worst case; None where that has no bound."""
+        return None if self.response_ns is None else self.deadline_ns - self.response_ns
 
     @property
     def entries(self) -> tuple[PdoEntry, ...]:
@@ -129,6 +141,40 @@ class Demand:
 
 
 @dataclass(frozen=True, slots=True)
+class CycleBudget:
+    """The worst course of one cycle, ns after its SYNC is due; None without such a part, or without a bound.
+
+    Attributes:
+        period_ns: of SYNC.
+        looks_ns: when the cell looks for TPDOs.
+        sync_ns: the SYNC is through.
+        feedback_ns: the last TPDO of a drive is in.
+        start_ns: the controller starts, at the first look that finds them all.
+        compute_ns: what it takes at most, as the scene says.
+        commands_ns: the last RPDO is through.
+        tactile_ns: the last PDO of a tactile frame is in.
+        slack_ns: what is left of the period; negative: the next SYNC comes too early.
+    """
+
+    period_ns: int
+    looks_ns: tuple[int, ...]
+    sync_ns: int | None
+    feedback_ns: int | None
+    start_ns: int | None
+    compute_ns: int
+    commands_ns: int | None
+    tactile_ns: int | None
+    slack_ns: int | None
+
+    @property
+    def bus_ns(self) -> int | None:
+        """The period's share of the bus: until the controller starts, and from its end to the last RPDO."""
+        if self.start_ns is None or self.slack_ns is None:
+            return None
+        return self.period_ns - self.compute_ns - self.slack_ns
+
+
+@dataclass(frozen=True, slots=True)
 class Traffic:
     """The bus, worst case.
 
@@ -137,12 +183,44 @@ class Traffic:
         parts: the same by (what, share).
         demands: peaks behind one SYNC.
         sync_response_ns: worst-case response time of SYNC.
+        budget: of one cycle.
     """
 
     load: float
     parts: tuple[tuple[str, float], ...]
     demands: tuple[Demand, ...]
     sync_response_ns: int | None
+    budget: CycleBudget
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedBus:
+    """One bus of the cell.
+
+    Attributes:
+        channel: its name in the scene.
+        node_ids: who is on it.
+        traffic: whether it fits, with numbers.
+    """
+
+    channel: str
+    node_ids: tuple[int, ...]
+    traffic: Traffic
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Something that the scene left to the plan.
+
+    Attributes:
+        key: of the scene file.
+        value: what was chosen, as the scene file writes it.
+        why: for people.
+    """
+
+    key: str
+    value: str
+    why: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +240,8 @@ class Plan:
         nodes: ascending node ids.
         pdos: by priority on the bus.
         sync: the cycle.
-        traffic: whether it fits, with numbers.
+        buses: that of the arm first, then one of the sensor's own where it has one.
+        choices: what the scene left open; `scene` has the values.
         joint_speeds: None without an arm.
         estimator: in the loop; None where no shape is estimated.
         offline_estimators: on the same data after the run.
@@ -177,7 +256,8 @@ class Plan:
     nodes: tuple[PlannedNode, ...]
     pdos: tuple[PlannedPdo, ...]
     sync: SyncPlan
-    traffic: Traffic
+    buses: tuple[PlannedBus, ...]
+    choices: tuple[Choice, ...]
     joint_speeds: JointSpeeds | None
     estimator: str | None
     offline_estimators: tuple[str, ...]
@@ -186,6 +266,11 @@ class Plan:
     outputs: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
+
+    @property
+    def traffic(self) -> Traffic:
+        """Traffic of the bus that sets the pace: the arm's, or the only one."""
+        return self.buses[0].traffic
 
     @property
     def node_ids(self) -> tuple[int, ...]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.model import Direction, PlannedPdo, SyncPlan
-from canprobe.protocol.frames import is_restricted
-from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.planning.wire_bits import frame_bits
+from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry, PdoLayout
 from canprobe.protocol.timing import worst_case_bits
 from canprobe.scene import Scene, TactileModeName
 
@@ -136,15 +136,35 @@ def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio
     if sensor is None:
         return
     cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
-    for number, found in enumerate(TACTILE_OBJECTS[sensor.mode], start=1):
-        entries = planning.entries(device, sensor.node_id, "tpdo", (found,))
+    long = scene.bus.fd and device.has_long_pdos
+    if scene.bus.fd and not long:
+        why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
+        planning.not_available.append(("CAN FD frames from the sensor", why))
+    for number, found in enumerate(_parcels(TACTILE_OBJECTS[sensor.mode], long), start=1):
+        entries = planning.entries(device, sensor.node_id, "tpdo", found)
         if entries:
-            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio)
-            planning.add(device, _synchronous(sensor.node_id, "tpdo", number, layout, sync, cycles=cycles))
+            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
+            bits = frame_bits(layout.length, scene.bus)
+            pdo = _synchronous(sensor.node_id, "tpdo", number, layout, sync, cycles=cycles, bits=bits)
+            planning.add(device, replace(pdo, kind="tactile"))
+
+
+def _parcels(objects: Sequence[tuple[int, int]], long: bool) -> list[Sequence[tuple[int, int]]]:
+    """Which objects go together into a PDO: the header alone, then one each, or as many as 64 bytes hold."""
+    header, *rest = objects
+    size = FD_MAX_BITS // MAX_BITS if long else 1
+    return [(header,), *(rest[i : i + size] for i in range(0, len(rest), size))]
 
 
 def _synchronous(
-    node_id: int, direction: Direction, number: int, layout: PdoLayout, sync: SyncPlan, *, cycles: int = 1
+    node_id: int,
+    direction: Direction,
+    number: int,
+    layout: PdoLayout,
+    sync: SyncPlan,
+    *,
+    cycles: int = 1,
+    bits: int | None = None,
 ) -> PlannedPdo:
     """A PDO on every n-th SYNC, n its transmission type, that has `cycles` cycles to get through."""
     return PlannedPdo(
@@ -153,25 +173,6 @@ def _synchronous(
         number=number,
         layout=layout,
         rate_hz=sync.rate_hz / layout.transmission_type,
-        bits_worst=worst_case_bits(layout.length),
+        bits_worst=worst_case_bits(layout.length) if bits is None else bits,
         deadline_ns=cycles * sync.period_ns,
     )
-
-
-def identifier_problems(pdos: Iterable[PlannedPdo]) -> list[str]:
-    """Restricted identifiers, and identifiers that two producers would send. Source: CiA 301.
-
-    An RPDO's producer is the master, so several drives may read one; a TPDO's identifier belongs to its node alone.
-    """
-    problems, owners = [], dict[int, PlannedPdo]()
-    for pdo in pdos:
-        name = f"node {pdo.node_id} {pdo.direction.upper()}{pdo.number}"
-        if is_restricted(pdo.cob_id):
-            problems.append(f"{name}: COB-ID {pdo.cob_id:03X}h is restricted (CiA 301); choose another node id")
-        other = owners.setdefault(pdo.cob_id, pdo)
-        if other is not pdo and "tpdo" in (pdo.direction, other.direction):
-            problems.append(
-                f"{name}: COB-ID {pdo.cob_id:03X}h is used by node {other.node_id} "
-                f"{other.direction.upper()}{other.number} too; choose other node ids"
-            )
-    return problems

@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
+    CycleBudget,
     Plan,
     PlannedNode,
     PlannedPdo,
+    Traffic,
 )
+from canprobe.planning.timeline import timeline_rows
+from canprobe.protocol.pdo import PdoEntry
+
+TIMELINE_WIDTH = 100
+"""Characters of a cycle."""
 
 
 def plan_text(plan: Plan) -> str:
@@ -21,7 +29,8 @@ def plan_text(plan: Plan) -> str:
 def _lines(plan: Plan) -> Iterator[str]:
     bus, sync = plan.scene.bus, plan.sync
     yield f"{plan.scene.name}: {plan.scene.title}" if plan.scene.title else plan.scene.name
-    yield f"bus {bus.channel} ({bus.interface}), {bus.bitrate} bit/s"
+    fd = f", CAN FD above 8 bytes, its data at {bus.data_bitrate} bit/s" if bus.fd else ""
+    yield f"bus {bus.channel} ({bus.interface}), {bus.bitrate} bit/s{fd}"
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "
@@ -29,7 +38,13 @@ def _lines(plan: Plan) -> Iterator[str]:
     )
     yield from _titled("nodes", _node_rows(plan.nodes))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
-    yield from _titled("bus, worst case", list(_bus_rows(plan)))
+    for one in plan.buses:
+        yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
+    yield from _titled(f"one cycle of {_us(sync.period_ns)} µs, worst case", list(_budget_rows(plan.traffic.budget)))
+    yield from _titled(_timeline_title(plan), timeline_rows(plan, TIMELINE_WIDTH))
+    if plan.choices:
+        rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
+        yield from _titled("chosen by the plan", rows)
     if plan.joint_speeds is not None:
         rows = [["joint", "needed", "allowed (deg/s)"]]
         speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
@@ -41,6 +56,13 @@ def _lines(plan: Plan) -> Iterator[str]:
         yield from _titled("could not have", [list(row) for row in plan.not_available])
 
 
+def _timeline_title(plan: Plan) -> str:
+    return (
+        f"as it goes, worst-case lengths, one character {_us(plan.sync.period_ns // TIMELINE_WIDTH)} µs "
+        "(S SYNC, f feedback, C controller, r commands, t tactile)"
+    )
+
+
 def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield ""
     yield f"{title}:"
@@ -50,20 +72,19 @@ def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
 
 
 def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
-    rows = [["id", "role", "identity (vendor product revision)", "EDS", ""]]
+    several = len({node.channel for node in nodes}) > 1
+    rows = [["id", "role", "identity (vendor product revision)", "EDS", "", *(["bus"] if several else [])]]
     for node in nodes:
         identity = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in identity)
-        rows.append([str(node.node_id), node.role, numbers, node.eds, "emulated" if node.emulated else "real"])
+        kind = "emulated" if node.emulated else "real"
+        rows.append([str(node.node_id), node.role, numbers, node.eds, kind, *([node.channel] if several else [])])
     return rows
 
 
 def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
-    rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline µs", "content"]]
+    rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline", "slack µs", "content"]]
     for pdo in pdos:
-        content = ", ".join(
-            "dummy" if entry.is_dummy else f"{entry.index:04X}h:{entry.subindex:02X}" for entry in pdo.entries
-        )
         rows.append(
             [
                 f"{pdo.cob_id:03X}h",
@@ -75,22 +96,51 @@ def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
                 str(pdo.bits_worst),
                 _us(pdo.response_ns),
                 _us(pdo.deadline_ns),
-                content,
+                _us(pdo.slack_ns),
+                _content(pdo.entries),
             ]
         )
     return rows
 
 
-def _bus_rows(plan: Plan) -> Iterator[list[str]]:
-    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in plan.traffic.parts)
-    yield ["load", f"{100 * plan.traffic.load:.1f} %", parts]
-    for demand in plan.traffic.demands:
+def _content(entries: Sequence[PdoEntry]) -> str:
+    """The objects of a mapping, a row of neighbours as its first and last."""
+    rows: list[list[PdoEntry]] = []
+    for entry in entries:
+        last = rows[-1][-1] if rows else None
+        follows = last is not None and (entry.index, entry.subindex) == (last.index, last.subindex + 1)
+        rows[-1].append(entry) if follows and not entry.is_dummy else rows.append([entry])
+    return ", ".join(
+        "dummy"
+        if row[0].is_dummy
+        else f"{row[0].index:04X}h:{row[0].subindex:02X}" + (f"–{row[-1].subindex:02X}" * (len(row) > 1))
+        for row in rows
+    )
+
+
+def _bus_rows(traffic: Traffic) -> Iterator[list[str]]:
+    parts = ", ".join(f"{what} {100 * share:.1f} %" for what, share in traffic.parts)
+    yield ["load", f"{100 * traffic.load:.1f} %", parts]
+    for demand in traffic.demands:
         cycles = f"{demand.cycles} cycle" + ("s" if demand.cycles > 1 else "")
         yield [
             f"in {cycles}",
             f"{100 * demand.used_ns / demand.available_ns:.1f} %",
             f"{demand.what}: {_us(demand.used_ns)} of {_us(demand.available_ns)} µs",
         ]
+
+
+def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
+    """When what is done after the SYNC, and what each part takes."""
+    yield ["SYNC through", _us(budget.sync_ns), ""]
+    if budget.feedback_ns is not None:
+        yield ["last TPDO of the drives in", _us(budget.feedback_ns), ""]
+    yield ["controller starts", _us(budget.start_ns), f"and takes {_us(budget.compute_ns)} (cycle.compute_us)"]
+    if budget.commands_ns is not None:
+        yield ["last RPDO through", _us(budget.commands_ns), ""]
+    if budget.tactile_ns is not None:
+        yield ["tactile frame in", _us(budget.tactile_ns), "after the SYNC that triggered it"]
+    yield ["left before the next SYNC", _us(budget.slack_ns), f"bus {_us(budget.bus_ns)} µs"]
 
 
 def _use_rows(plan: Plan) -> Iterator[list[str]]:
@@ -103,6 +153,8 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     if plan.fidelity is not None:
         emulated = ", ".join(map(str, plan.scene.emulated_node_ids))
         yield ["emulator", f"nodes {emulated}; arm {plan.fidelity}" if plan.scene.arm else f"nodes {emulated}"]
+    for name in plan.scene.bridge.use if plan.scene.bridge is not None else ():
+        yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
 
 

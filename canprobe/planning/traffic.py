@@ -5,18 +5,19 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 
+from canprobe.planning.budget import CycleMessages, analyse_cycle
 from canprobe.planning.model import (
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
     SYNC_OVERFLOW,
+    CycleBudget,
     Demand,
     PlannedPdo,
     SyncPlan,
     Traffic,
 )
-from canprobe.planning.pdos import TACTILE_TPDO1
 from canprobe.protocol.frames import HEARTBEAT_BASE, SYNC_ID
-from canprobe.protocol.timing import Message, Response, worst_case_bits, worst_case_response
+from canprobe.protocol.timing import Message, Response, best_case_bits, worst_case_bits
 from canprobe.scene import BusSettings
 
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
@@ -30,7 +31,7 @@ def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
 
 
 def plan_traffic(
-    pdos: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings
+    pdos: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings, compute_ns: int = 0
 ) -> tuple[Traffic, list[PlannedPdo], list[str]]:
     """Traffic of a set of PDOs, the PDOs with their response times, and what does not fit.
 
@@ -39,32 +40,49 @@ def plan_traffic(
         sync: the cycle.
         node_ids: everything that produces a heartbeat, besides the master.
         bus: its bit rate.
+        compute_ns: what the controller takes of a cycle at most.
     """
     wire = on_the_wire(pdos)
-    analysis = worst_case_response(_messages(wire, sync, node_ids), bus.bitrate)
+    analysis, budget = analyse_cycle(_messages(wire, sync, node_ids, bus.bitrate), compute_ns, bus.bitrate)
     responses = {response.message.cob_id: response for response in analysis.responses}
     traffic = Traffic(
         load=analysis.load,
         parts=_parts(wire, sync, node_ids, bus.bitrate),
         demands=_demands(wire, sync, bus.bitrate),
         sync_response_ns=responses[SYNC_ID].response_ns,
+        budget=budget,
     )
     timed = [dataclasses.replace(pdo, response_ns=responses[pdo.cob_id].response_ns) for pdo in pdos]
     timed.sort(key=lambda pdo: (pdo.cob_id, pdo.node_id))
     return traffic, timed, _problems(traffic, analysis.responses, bus)
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int]) -> list[Message]:
-    pdos = [
-        Message(f"{pdo.direction.upper()} {pdo.cob_id:03X}h", pdo.cob_id, pdo.layout.length, _period_ns(pdo, sync), 0,
-                pdo.deadline_ns)
-        for pdo in wire
-    ]  # fmt: skip
+def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int) -> CycleMessages:
+    """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
+    cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
+    feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.kind == "drive"]
     heartbeats = [
         Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
         for node in (*node_ids, MASTER_NODE_ID)
     ]
-    return [Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns), *pdos, *heartbeats]
+    best_sync = best_case_bits(_SYNC_BYTES)
+    return CycleMessages(
+        sync=Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns),
+        feedback=tuple(_message(pdo, sync, bitrate) for pdo in feedback),
+        commands=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "rpdo"),
+        other=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "tpdo" and pdo not in feedback),
+        strangers=(*(_message(pdo, sync, bitrate) for pdo in wire if pdo not in cyclic), *heartbeats),
+        best_sync_ns=best_sync * 1_000_000_000 // bitrate,
+        best_feedback_ns=(best_sync + sum(best_case_bits(pdo.layout.length) for pdo in feedback))
+        * 1_000_000_000
+        // bitrate,
+    )
+
+
+def _message(pdo: PlannedPdo, sync: SyncPlan, bitrate: int) -> Message:
+    name = f"{pdo.direction.upper()} {pdo.cob_id:03X}h"
+    frame_ns, period_ns = _ns(pdo.bits_worst, bitrate), _period_ns(pdo, sync)
+    return Message(name, pdo.cob_id, pdo.layout.length, period_ns, deadline_ns=pdo.deadline_ns, frame_ns=frame_ns)
 
 
 def _period_ns(pdo: PlannedPdo, sync: SyncPlan) -> int:
@@ -79,8 +97,8 @@ def _parts(
     heartbeats = worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1)
     bits = {
         "SYNC": _SYNC_BITS * sync.rate_hz,
-        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.cob_id < TACTILE_TPDO1),
-        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.cob_id >= TACTILE_TPDO1),
+        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
+        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
         "heartbeats": heartbeats,
     }
     return tuple((what, rate / bitrate) for what, rate in bits.items() if rate > 0)
@@ -89,8 +107,8 @@ def _parts(
 def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> tuple[Demand, ...]:
     """What one SYNC releases, and what a tactile frame waits for until its last PDO is through."""
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= _SYNCHRONOUS]
-    drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.cob_id < TACTILE_TPDO1)
-    tactile = [pdo for pdo in cyclic if pdo.cob_id >= TACTILE_TPDO1]
+    drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
+    tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
     what = "SYNC and drive PDOs" if drives > _SYNC_BITS else "SYNC"
     demands = [Demand(what, 1, _ns(drives, bitrate), sync.period_ns)]
     if tactile:
@@ -116,10 +134,25 @@ def _problems(traffic: Traffic, responses: Sequence[Response], bus: BusSettings)
         for demand in traffic.demands
         if demand.used_ns > demand.available_ns
     ]
+    if not problems and (short := _short(traffic.budget)):
+        problems.append(f"{where}: {short}")
     late = [response for response in responses if not response.fits]
     if late and not problems:
         problems.append(f"{where}: {_late(late)}")
     return problems
+
+
+def _short(budget: CycleBudget) -> str | None:
+    """What is wrong with one cycle: the last RPDO is not through before the next SYNC."""
+    if budget.slack_ns is None or budget.start_ns is None or budget.slack_ns >= 0:
+        return None
+    out = budget.period_ns - budget.slack_ns
+    last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
+    return (
+        f"one cycle: the controller can start after {budget.start_ns / 1000:.0f} µs, takes "
+        f"{budget.compute_ns / 1000:.0f} µs (cycle.compute_us), and {last} after {out / 1000:.0f} µs, "
+        f"{-budget.slack_ns / 1000:.0f} µs behind the next SYNC"
+    )
 
 
 def _late(late: Sequence[Response]) -> str:

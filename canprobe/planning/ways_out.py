@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 
 from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.model import Traffic
+from canprobe.planning.open_keys import second_channel
 from canprobe.scene import Scene, TactileModeName
 
+FD_ARRAY = "tactile_array_fd.eds"
 Fit = Callable[[Scene], Traffic | None]
 """Traffic of a changed scene, or None where that does not fit either."""
 
@@ -42,7 +44,15 @@ def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
     for mode in smaller.get(scene.sensor.mode, ()):
         yield f'sensor.mode = "{mode}"', dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode=mode))
     if scene.arm is not None:
-        yield "a bus of its own for the sensor", dataclasses.replace(scene, arm=None)
+        own = second_channel(scene.bus.channel)
+        if scene.sensor.channel in (None, scene.bus.channel):
+            text = f'a bus of its own for the sensor (sensor.channel = "{own}")'
+            yield text, dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, channel=own))
+    if not scene.bus.fd and scene.sensor.emulated:
+        fd = dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, fd=True))
+        yield "bus.fd = true", fd
+        sensor = dataclasses.replace(scene.sensor, eds=FD_ARRAY)
+        yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', dataclasses.replace(fd, sensor=sensor)
 
 
 def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:

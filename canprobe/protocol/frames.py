@@ -9,6 +9,9 @@ from canprobe.errors import ProtocolError
 Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
+EFF_FLAG = 0x80000000
+"""On a 29-bit identifier, as in Linux's `struct can_frame`."""
+
 RTR_FLAG = 0x40000000
 """On the identifier of a remote request (which has no data), as in Linux's `struct can_frame`."""
 

@@ -7,8 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from canprobe.errors import ProtocolError
+from canprobe.protocol.frame_bits import FD_LENGTHS
 
 MAX_BITS = 64
+FD_MAX_BITS = 512
+"""Of a PDO in a CAN FD frame. Source: CiA 1301."""
 _STRUCT_CODES = {8: "b", 16: "h", 32: "i", 64: "q"}
 
 
@@ -78,8 +81,8 @@ class _BitCodec:
         return tuple(((word >> shift & mask) ^ sign) - sign for shift, mask, sign, _ in self._fields)
 
 
-def _struct_format(entries: tuple[PdoEntry, ...]) -> str | None:
-    """The struct format of a byte-aligned mapping, or None where bits have to be moved."""
+def _struct_format(entries: tuple[PdoEntry, ...], length: int) -> str | None:
+    """The struct format of a byte-aligned mapping, filled up to `length`, or None where bits have to be moved."""
     codes = ["<"]
     for entry in entries:
         if entry.is_dummy and entry.bits % 8 == 0:
@@ -89,7 +92,8 @@ def _struct_format(entries: tuple[PdoEntry, ...]) -> str | None:
             codes.append(code if entry.signed else code.upper())
         else:
             return None
-    return "".join(codes)
+    filler = length - struct.calcsize("".join(codes))
+    return "".join(codes) + (f"{filler}x" if filler else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,14 +107,18 @@ class PdoLayout:
         cob_id: 11-bit identifier.
         entries: mapped objects, in the order of the wire.
         transmission_type: 0..240 synchronous, 252/253 by RTR, 254/255 by event (CiA 301).
+        fd: the mapping may have up to 512 bits; above 64 the frame is one of CAN FD, filled up with zeros to a length
+            that FD has.
+        length: data bytes of the frame.
 
     Raises:
-        ProtocolError: an entry without length, or more than 64 bits in all.
+        ProtocolError: an entry without length, or more bits in all than a frame has.
     """
 
     cob_id: int
     entries: tuple[PdoEntry, ...]
     transmission_type: int = 1
+    fd: bool = False
     length: int = field(init=False)
     _pack: Callable[..., bytes] = field(init=False, repr=False, compare=False)
     _unpack: Callable[[bytes], tuple[int, ...]] = field(init=False, repr=False, compare=False)
@@ -118,10 +126,11 @@ class PdoLayout:
     def __post_init__(self) -> None:
         entries = tuple(self.entries)
         bits = sum(entry.bits for entry in entries)
-        if any(not 1 <= entry.bits <= MAX_BITS for entry in entries) or bits > MAX_BITS:
-            raise ProtocolError(f"PDO {self.cob_id:#05x}: mapping of {bits} bits, at most {MAX_BITS}, none empty")
-        length = (bits + 7) // 8
-        form = _struct_format(entries)
+        most = FD_MAX_BITS if self.fd else MAX_BITS
+        if any(not 1 <= entry.bits <= MAX_BITS for entry in entries) or bits > most:
+            raise ProtocolError(f"PDO {self.cob_id:#05x}: mapping of {bits} bits, at most {most}, none empty")
+        length = next(size for size in FD_LENGTHS if 8 * size >= bits)
+        form = _struct_format(entries, length)
         codec = _BitCodec(entries, length) if form is None else struct.Struct(form)
         object.__setattr__(self, "entries", entries)
         object.__setattr__(self, "length", length)

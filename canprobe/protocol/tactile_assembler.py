@@ -44,28 +44,36 @@ class FrameAssembler:
         duplicates: taxel PDOs that came twice, and complete frames with the counter of the frame before.
         lost: frames of the sensor that were not published, from gaps of the frame counter (mod 256).
         orphans: taxel PDOs without an open frame.
-        malformed: PDOs that are not 8 bytes, headers that mean nothing, frames of another mode.
+        malformed: PDOs of a wrong length, headers that mean nothing, frames of another mode.
     """
 
     __slots__ = (
-        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_slots",
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots",
         "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
     )  # fmt: skip
 
-    def __init__(self, cob_ids: Sequence[int], mode: TactileMode, deadline_ns: int) -> None:
+    def __init__(
+        self, cob_ids: Sequence[int], mode: TactileMode, deadline_ns: int, sizes: Sequence[int] | None = None
+    ) -> None:
         """Expect the given identifiers.
 
         Args:
             cob_ids: header first, then the payloads in PDO order.
             mode: what the sensor is set to.
             deadline_ns: longest time from header to last PDO; two cycles as a rule.
+            sizes: bytes of each PDO; 8 by default, up to 64 on CAN FD.
 
         Raises:
-            ProtocolError: the number of identifiers does not belong to the mode, or one is there twice.
+            ProtocolError: the PDOs do not add up to a frame of the mode, or an identifier is there twice.
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
-        if len(cob_ids) != PDO_COUNT[mode] or len(self._slots) != len(cob_ids):
-            raise ProtocolError(f"{mode.name.lower()} frames need {PDO_COUNT[mode]} different COB-IDs, got {cob_ids}")
+        self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
+        needed = 8 * PDO_COUNT[mode]
+        if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
+            raise ProtocolError(
+                f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "
+                f"got {cob_ids} with {self._sizes} bytes"
+            )
         self._mode = mode
         self._deadline_ns = deadline_ns
         self._parts: list[bytes | None] = []
@@ -80,7 +88,7 @@ class FrameAssembler:
         if slot is None:
             return None
         self.expire(t_ns)
-        if len(data) != 8:
+        if len(data) != self._sizes[slot]:
             self.malformed += 1
             self._tear()
         elif slot == 0:

@@ -1,45 +1,36 @@
-"""How long CAN frames take, and how late each message can be in the worst case.
+"""How late each message on a CAN bus can be in the worst case.
 
-Holds for a bus whose nodes send their highest-priority message first, without errors on the wire. Periods are
-treated as independent: phases fixed by SYNC can only be better than this.
+Holds for a bus whose nodes send their highest-priority message first. Messages are independent of each other, or part
+of one transaction: released at fixed offsets after an event that they share, such as SYNC. Errors may be allowed for.
 
 Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
-revised", Real-Time Systems 35 (2007): equation numbers below are theirs.
+revised", Real-Time Systems 35 (2007): equation numbers are theirs. Offsets: Palencia and González Harbour, RTSS 1998.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
+from canprobe.protocol.busy_period import Arrivals, Level
+from canprobe.protocol.frame_bits import WORST_ERROR_BITS, best_case_bits, worst_case_bits
 
-_STUFFED_OVERHEAD = 34  # bits of a standard data frame, besides data, that stuffing can lengthen
-_FIXED_OVERHEAD = 13  # bits it cannot: CRC delimiter, ACK, end of frame, 3 bits interframe space
+__all__ = [
+    "NO_ERRORS",
+    "BusAnalysis",
+    "Errors",
+    "Message",
+    "Response",
+    "best_case_bits",
+    "frame_time_ns",
+    "worst_case_bits",
+    "worst_case_response",
+]
+
 _NS = 1_000_000_000
-
-
-def best_case_bits(n_data: int) -> int:
-    """Bits of a standard (11-bit) data frame without one stuff bit, interframe space included: 47 + 8 n.
-
-    Raises:
-        ProtocolError: not 0..8 data bytes.
-    """
-    if not 0 <= n_data <= 8:
-        raise ProtocolError(f"a CAN frame carries 0..8 data bytes, not {n_data}")
-    return _STUFFED_OVERHEAD + 8 * n_data + _FIXED_OVERHEAD
-
-
-def worst_case_bits(n_data: int) -> int:
-    """Bits of a standard (11-bit) data frame with every stuff bit there can be: 55 + 10 n.
-
-    Raises:
-        ProtocolError: not 0..8 data bytes.
-
-    Source: equation (1).
-    """
-    return best_case_bits(n_data) + (_STUFFED_OVERHEAD + 8 * n_data - 1) // 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,12 +39,14 @@ class Message:
 
     Attributes:
         name: for people.
-        cob_id: 11-bit identifier, which is its priority: lower wins.
+        cob_id: identifier, which is its priority: lower wins.
         n_data: data bytes, 0..8.
-        period_ns: shortest time between two of its releases.
-        jitter_ns: largest delay from the event to the frame being queued.
+        period_ns: shortest time between two of its events.
+        jitter_ns: largest delay from its earliest to its latest queueing.
         deadline_ns: latest end of its transmission after the event; None: the period. May exceed the period.
-        frame_ns: time of one frame, where it is not the worst case at the bit rate.
+        frame_ns: time of one frame, where it is not the worst case of a classical frame at the bit rate.
+        offset_ns: earliest queueing after the event that all messages with an offset share, up to multiples of their
+            periods; None for a message of its own time, queued at its event at the earliest.
     """
 
     name: str
@@ -63,11 +56,34 @@ class Message:
     jitter_ns: int = 0
     deadline_ns: int | None = None
     frame_ns: int | None = None
+    offset_ns: int | None = None
 
     @property
     def due_ns(self) -> int:
         """The deadline, or the period where none is set."""
         return self.period_ns if self.deadline_ns is None else self.deadline_ns
+
+
+@dataclass(frozen=True, slots=True)
+class Errors:
+    """Errors on the wire that are allowed for: in any time t at most burst + ⌈t / interval⌉.
+
+    Each costs the error frame and the longest frame that it can hit, of this priority or a higher one.
+
+    Attributes:
+        burst: errors that can come together.
+        interval_ns: between further errors; None: there are none.
+        overhead_bits: of one error besides the frame that has to be sent again.
+
+    Source: Tindell and Burns 1994; Davis et al. 2007, section 6.
+    """
+
+    burst: int = 0
+    interval_ns: int | None = None
+    overhead_bits: int = WORST_ERROR_BITS
+
+
+NO_ERRORS = Errors()
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,69 +146,112 @@ def frame_time_ns(n_data: int, bitrate: int) -> int:
     return _ceil_div(worst_case_bits(n_data) * _NS, bitrate)
 
 
-def _busy_period(blocking: int, level: Sequence[tuple[Message, int]]) -> int:
-    """Length of the longest busy period of a priority level, ns; `level` has that message and all above. (6), (7)."""
-    length = blocking + level[-1][1]
-    while True:
-        longer = blocking + sum(_ceil_div(length + m.jitter_ns, m.period_ns) * c for m, c in level)
-        if longer == length:
-            return length
-        length = longer
-
-
-def _queueing_delay(start: int, fixed: int, above: Sequence[tuple[Message, int]], bit_ns: int) -> int:
-    """Smallest w with w = fixed + interference of everything above, searched upward from `start`. (9)."""
-    delay = start
-    while True:
-        longer = fixed + sum(_ceil_div(delay + m.jitter_ns + bit_ns, m.period_ns) * c for m, c in above)
-        if longer <= delay:
-            return delay
-        delay = longer
-
-
-def _overloaded(level: Sequence[tuple[Message, int]]) -> bool:
-    """Whether a level asks for the whole bus or more; exact, in integers."""
-    product = 1
-    for message, _ in level:
-        product *= message.period_ns
-    return sum(product // m.period_ns * c for m, c in level) >= product
-
-
-def _respond(blocking: int, level: Sequence[tuple[Message, int]], bit_ns: int) -> Response:
-    *above, (message, frame_ns) = level
-    if _overloaded(level):
-        return Response(message, frame_ns, None, 0)
-    busy = _busy_period(blocking, level)
-    instances = _ceil_div(busy + message.jitter_ns, message.period_ns)  # (8)
-    worst = delay = 0
-    for instance in range(instances):
-        fixed = blocking + instance * frame_ns
-        delay = _queueing_delay(max(delay, fixed), fixed, above, bit_ns)
-        worst = max(worst, message.jitter_ns + delay - instance * message.period_ns + frame_ns)  # (10), (11)
-    return Response(message, frame_ns, worst, instances)
-
-
-def worst_case_response(messages: Sequence[Message], bitrate: int = 1_000_000) -> BusAnalysis:
+def worst_case_response(
+    messages: Sequence[Message], bitrate: int = 1_000_000, *, errors: Errors = NO_ERRORS
+) -> BusAnalysis:
     """Worst-case response time of every message on one bus.
 
     Args:
         messages: everything that is sent on this bus, in any order; identifiers are unique.
         bitrate: bit/s.
+        errors: what the bus has to bear besides.
 
     Raises:
-        ProtocolError: an identifier twice, or a message with no period, a bad identifier, length or jitter.
+        ProtocolError: an identifier twice, or a message with no period, a bad identifier, length, offset or jitter.
     """
     ordered = sorted(messages, key=lambda message: message.cob_id)
+    _check(ordered, errors)
+    timed = [(m, frame_time_ns(m.n_data, bitrate) if m.frame_ns is None else m.frame_ns) for m in ordered]
+    responses = _respond_all(timed, [None] * len(timed), bitrate, errors)
+    if any(m.offset_ns is not None for m in ordered):  # now it is known who can be on the bus when
+        responses = _respond_all(timed, [response.response_ns for response in responses], bitrate, errors)
+    return BusAnalysis(tuple(responses), sum(c / m.period_ns for m, c in timed))
+
+
+def _check(ordered: Sequence[Message], errors: Errors) -> None:
     for first, second in itertools.pairwise(ordered):
         if first.cob_id == second.cob_id:
             raise ProtocolError(f"{first.name} and {second.name} both use COB-ID {first.cob_id:03X}h")
     for message in ordered:
         if message.period_ns <= 0 or message.jitter_ns < 0 or not 0 <= message.cob_id <= 0x7FF:
             raise ProtocolError(f"{message.name}: needs a period > 0, a jitter >= 0 and an 11-bit COB-ID: {message}")
-    timed = [(m, frame_time_ns(m.n_data, bitrate) if m.frame_ns is None else m.frame_ns) for m in ordered]
-    bit_ns = _ceil_div(_NS, bitrate)
-    responses = []
-    for rank in range(len(timed)):
-        blocking = max((c for _, c in timed[rank + 1 :]), default=0)
-        responses.append(_respond(blocking, timed[: rank + 1], bit_ns))
-    return BusAnalysis(tuple(responses), sum(c / m.period_ns for m, c in timed))
+        if message.offset_ns is not None and message.offset_ns < 0:
+            raise ProtocolError(f"{message.name}: needs an offset >= 0: {message}")
+    if errors.burst < 0 or (errors.interval_ns is not None and errors.interval_ns <= 0):
+        raise ProtocolError(f"errors need a burst >= 0 and an interval > 0: {errors}")
+
+
+_Timed = tuple[Message, int]
+
+
+def _respond_all(timed: Sequence[_Timed], bounds: Sequence[int | None], bitrate: int, errors: Errors) -> list[Response]:
+    """Every response; `bounds` are upper bounds of them, where known."""
+    known = list(zip(timed, bounds, strict=True))
+    return [_respond(timed[: rank + 1], known[rank + 1 :], bitrate, errors) for rank in range(len(timed))]
+
+
+def _respond(
+    level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]], bitrate: int, errors: Errors
+) -> Response:
+    message, frame_ns = level[-1]
+    error_cost = _ceil_div(errors.overhead_bits * _NS, bitrate) + max(c for _, c in level)
+    if _overloaded(level, errors.interval_ns, error_cost):
+        return Response(message, frame_ns, None, 0)
+    worst = instances = 0
+    for start, blocking in _starts(level, below).items():
+        *above, own = (_align(m, c, start) for m, c in level)
+        bit = _ceil_div(_NS, bitrate)
+        at = Level(own, above, blocking, bit, errors.burst, errors.interval_ns, error_cost).finished()
+        instances = max(instances, len(at))
+        worst = max([worst, *((message.offset_ns or 0) + finished - release for release, finished in at)])
+    return Response(message, frame_ns, worst, instances)
+
+
+def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> dict[int, int]:
+    """Where a busy period has to begin in the transaction, and how long a frame from below can block it there.
+
+    It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
+    really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
+    """
+    longest = max((c for (_, c), _ in below), default=0)
+    members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
+    if not members:
+        return {0: longest}
+    cycle = math.lcm(
+        *(m.period_ns for m, _ in members), *(m.period_ns for (m, _), _ in below if m.offset_ns is not None)
+    )
+    unknown = len(members) < len(level) or any(end is None for _, end in below)
+    found: dict[int, int] = {}
+    for message, offset in members:
+        for first in range(offset, offset + cycle, message.period_ns):
+            blocking = longest if unknown else _blocking(below, first, message.jitter_ns)
+            start = (first + message.jitter_ns) % cycle
+            found[start] = max(found.get(start, 0), blocking)
+    return found
+
+
+def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter_ns: int) -> int:
+    return max((c for (m, c), end in below if _on_the_bus(m, end, first, jitter_ns)), default=0)
+
+
+def _on_the_bus(message: Message, end_ns: int | None, first: int, jitter_ns: int) -> bool:
+    """Whether a message, through `end_ns` after its event at the latest, can be on the bus at `first` or in jitter."""
+    if message.offset_ns is None or end_ns is None:
+        return True
+    into = (first - message.offset_ns) % message.period_ns  # since it was last released
+    return into < end_ns - message.offset_ns or into + jitter_ns >= message.period_ns
+
+
+def _align(message: Message, frame_ns: int, start: int) -> Arrivals:
+    """The message in a busy period that begins at phase `start` of the transaction."""
+    phase = -message.jitter_ns if message.offset_ns is None else message.offset_ns - start
+    return Arrivals.behind(frame_ns, message.period_ns, message.jitter_ns, phase)
+
+
+def _overloaded(level: Sequence[_Timed], error_interval: int | None, error_cost: int) -> bool:
+    """Whether a level asks for the whole bus or more; exact, in integers."""
+    demands = [(m.period_ns, c) for m, c in level]
+    if error_interval is not None:
+        demands.append((error_interval, error_cost))
+    cycle = math.lcm(*(period for period, _ in demands))
+    return sum(cycle // period * c for period, c in demands) >= cycle

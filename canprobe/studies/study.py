@@ -21,6 +21,11 @@ STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
+        "workprec": "error of the dynamic plant against its run time, over integrators, steps and stiffness",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
+        "faults": "what the cell does about thousands of random faults of its nodes and their links",
+        "bridges": "what each bridge to another tool adds to a cycle at 400 Hz, what it drops, and its size on disk",
     }
 )
 """Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""

@@ -1,177 +1,60 @@
-"""True object geometry: closest point, outward normal and principal curvatures of the touched surfaces.
+"""True object geometry: the touchable surfaces by name (``make_object``), and those of first and second degree.
 
-Every shape has a frame of its own: the origin lies ON the surface at its reference (top-most) point, z is the outward
-normal there. A scene thus places a surface by one of its points. Bodies are solid below the origin; curvature is
-positive for convex. Distances are exact or by a safeguarded Newton iteration to 1e-12 m.
+What they share, frames and signs included, is told in ``placed``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
 from types import MappingProxyType
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-Array = npt.NDArray[np.float64]
+from canprobe.touch.bowl import Bowl
+from canprobe.touch.placed import (
+    Array,
+    ClosestPoint,
+    Foot,
+    ObjectShape,
+    PlacedShape,
+    Touches,
+    osculating_matrix,
+    require_positive,
+    tangent_of,
+)
+from canprobe.touch.profiles import Fillet, Wave
+from canprobe.touch.torus import Torus
 
-_Foot = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
-"""Local closest point: point xyz, outward normal xyz, signed distance, kappa1, kappa2, direction1 xyz."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ClosestPoint:
-    """The surface point nearest to a query point, in the base frame.
-
-    Attributes:
-        point: (3,) m.
-        normal: (3,) outward unit normal of the body.
-        distance: signed distance of the query point, m, positive outside.
-        kappa: (2,) principal curvatures, 1/m, larger first, positive for convex.
-        directions: (2, 3) unit rows d1, d2 with d1 x d2 = normal. They are axes: the common sign is arbitrary, and at
-            an umbilic any such pair may stand.
-    """
-
-    point: Array
-    normal: Array
-    distance: float
-    kappa: Array
-    directions: Array
-
-
-class ObjectShape(Protocol):
-    """What the plant, the plan and the studies ask of an object."""
-
-    @property
-    def T_base_object(self) -> Array:
-        """(4, 4) frame of the object in the base frame, m."""
-
-    def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
-        """Closest surface point to a (3,) point of the base frame, m."""
-
-    def tightest_concave_radius(self, region: npt.ArrayLike | None = None) -> float:
-        """Smallest radius of a hollow, m; inf where there is none (see ``PlacedShape``)."""
-
-    def surface_matrix(self) -> Array:
-        """(4, 4) quadric of the surface in the base frame, f < 0 inside, gradient of length 1 at the origin."""
-
-
-class PlacedShape:
-    """A shape at a pose: carries queries into the object's frame and answers back.
-
-    Args:
-        T_base_object: (4, 4) pose of the object's frame, m.
-
-    Raises:
-        ValueError: for a pose that is not a rotation and a translation.
-    """
-
-    def __init__(self, T_base_object: npt.ArrayLike) -> None:
-        pose = np.array(T_base_object, dtype=float)
-        if pose.shape != (4, 4) or not np.all(np.isfinite(pose)):
-            raise ValueError(f"T_base_object must be a finite 4x4 pose, got {pose!r}")
-        R = pose[:3, :3]
-        if np.abs(R @ R.T - np.eye(3)).max() > 1e-9 or np.linalg.det(R) < 0.0:
-            raise ValueError(f"T_base_object must hold a rotation, got {R!r}")
-        pose.setflags(write=False)
-        self._pose = pose
-        self._rotation_t = np.ascontiguousarray(R.T)
-        self._columns = tuple(R.T.ravel().tolist())
-        self._origin = tuple(pose[:3, 3].tolist())
-
-    @property
-    def T_base_object(self) -> Array:
-        """(4, 4) frame of the object in the base frame, m."""
-        return self._pose
-
-    def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
-        """Closest surface point, its normal and curvatures.
-
-        Args:
-            point_base: (3,) query point in the base frame, m.
-
-        Returns:
-            Everything in the base frame.
-        """
-        bx, by, bz = np.asarray(point_base, dtype=float).tolist()
-        ox, oy, oz = self._origin
-        x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
-        bx, by, bz = bx - ox, by - oy, bz - oz
-        px, py, pz, nx, ny, nz, distance, k1, k2, dx, dy, dz = self._foot(
-            bx * x0 + by * x1 + bz * x2, bx * y0 + by * y1 + bz * y2, bx * z0 + by * z1 + bz * z2
-        )
-        second = (ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx)
-        rows = np.array(((px, py, pz), (nx, ny, nz), (dx, dy, dz), second)) @ self._rotation_t
-        rows[0] += self._origin
-        return ClosestPoint(rows[0], rows[1], distance, np.array((k1, k2)), rows[2:])
-
-    def tightest_concave_radius(self, region: npt.ArrayLike | None = None) -> float:
-        """Smallest radius of a hollow of the surface; a probe must be smaller to touch in one point.
-
-        Args:
-            region: (n, 3) base points; answers for their closest surface points. None: the whole surface
-                (for a general quadric: the surface within 50 mm of the object's origin, sampled).
-
-        Returns:
-            Radius, m; inf where nothing is concave.
-        """
-        if region is None:
-            return self._tightest_anywhere()
-        k2 = min(float(self.closest(p).kappa[1]) for p in np.atleast_2d(np.asarray(region, dtype=float)))
-        return -1.0 / k2 if k2 < -1e-12 else inf
-
-    def surface_matrix(self) -> Array:
-        """(4, 4) quadric S of the surface in the base frame: f = X'SX, X = (x, y, z, 1), f < 0 inside.
-
-        Scaled so that the gradient has length 1 at the object's origin.
-        """
-        T_object_base = np.linalg.inv(self._pose)
-        S: Array = T_object_base.T @ self._matrix() @ T_object_base
-        return (S + S.T) / 2
-
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
-        raise NotImplementedError
-
-    def _matrix(self) -> Array:
-        raise NotImplementedError
-
-    def _tightest_anywhere(self) -> float:
-        return inf
-
-
-def _matrix_of(diagonal: tuple[float, float, float]) -> Array:
-    """Quadric x'Dx + z = 0, through the origin with unit outward gradient along z."""
-    S = np.diag((*diagonal, 0.0))
-    S[2, 3] = S[3, 2] = 0.5
-    return S
-
-
-def _require_positive(**lengths: float) -> None:
-    for name, value in lengths.items():
-        if not 0.0 < value < inf:
-            raise ValueError(f"{name} must be a positive length in m, got {value!r}")
+__all__ = [
+    "OBJECT_PARAMETERS",
+    "Bowl",
+    "ClosestPoint",
+    "Cylinder",
+    "Ellipsoid",
+    "Fillet",
+    "ObjectShape",
+    "PlacedShape",
+    "Plane",
+    "Quadric",
+    "Saddle",
+    "Sphere",
+    "Torus",
+    "Touches",
+    "Wave",
+    "make_object",
+]
 
 
 class Plane(PlacedShape):
     """The plane z = 0 of the object's frame, solid below."""
 
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
+    def _foot(self, x: float, y: float, z: float) -> Foot:
         return x, y, 0.0, 0.0, 0.0, 1.0, z, 0.0, 0.0, 1.0, 0.0, 0.0
 
     def _matrix(self) -> Array:
-        return _matrix_of((0.0, 0.0, 0.0))
-
-
-def _tangent(nx: float, ny: float, nz: float) -> tuple[float, float, float]:
-    """Unit tangent: the object's x axis (or z axis, where the normal is near x) freed of its normal part."""
-    if abs(nx) < 0.9:
-        size = sqrt(ny * ny + nz * nz)
-        return size, -nx * ny / size, -nx * nz / size
-    size = sqrt(nx * nx + ny * ny)
-    return -nz * nx / size, -nz * ny / size, size
+        return osculating_matrix((0.0, 0.0, 0.0))
 
 
 class Sphere(PlacedShape):
@@ -184,19 +67,19 @@ class Sphere(PlacedShape):
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
         super().__init__(T_base_object)
-        _require_positive(radius=radius)
+        require_positive(radius=radius)
         self.radius = radius
 
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
+    def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
         zc = z + radius
         rho = sqrt(x * x + y * y + zc * zc)
         nx, ny, nz = (x / rho, y / rho, zc / rho) if rho > 0.0 else (0.0, 0.0, 1.0)
         k = 1.0 / radius
-        return (radius * nx, radius * ny, radius * (nz - 1.0), nx, ny, nz, rho - radius, k, k, *_tangent(nx, ny, nz))
+        return (radius * nx, radius * ny, radius * (nz - 1.0), nx, ny, nz, rho - radius, k, k, *tangent_of(nx, ny, nz))
 
     def _matrix(self) -> Array:
-        return _matrix_of((0.5 / self.radius,) * 3)
+        return osculating_matrix((0.5 / self.radius,) * 3)
 
 
 class Cylinder(PlacedShape):
@@ -209,10 +92,10 @@ class Cylinder(PlacedShape):
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
         super().__init__(T_base_object)
-        _require_positive(radius=radius)
+        require_positive(radius=radius)
         self.radius = radius
 
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
+    def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
         zc = z + radius
         rho = hypot(y, zc)
@@ -221,45 +104,7 @@ class Cylinder(PlacedShape):
         return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
 
     def _matrix(self) -> Array:
-        return _matrix_of((0.0, 0.5 / self.radius, 0.5 / self.radius))
-
-
-class Bowl(PlacedShape):
-    """Hollow half sphere in a solid block, centre at z = +radius, origin at its bottom.
-
-    Query points above the rim's plane get the nearest point of the rim (an edge: the curvatures reported there are the
-    hollow's, the normal points at the query point).
-
-    Args:
-        T_base_object: (4, 4) pose, m.
-        radius: m.
-    """
-
-    def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
-        super().__init__(T_base_object)
-        _require_positive(radius=radius)
-        self.radius = radius
-
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
-        radius = self.radius
-        zc = z - radius
-        k = -1.0 / radius
-        if zc > 0.0:
-            rho = hypot(x, y)
-            ex, ey = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
-            nx, ny, nz = x - radius * ex, y - radius * ey, zc
-            gap = sqrt(nx * nx + ny * ny + nz * nz)
-            nx, ny, nz = nx / gap, ny / gap, nz / gap
-            return (radius * ex, radius * ey, radius, nx, ny, nz, gap, k, k, *_tangent(nx, ny, nz))
-        rho = sqrt(x * x + y * y + zc * zc)
-        nx, ny, nz = (-x / rho, -y / rho, -zc / rho) if rho > 0.0 else (0.0, 0.0, 1.0)
-        return (-radius * nx, -radius * ny, radius * (1.0 - nz), nx, ny, nz, radius - rho, k, k, *_tangent(nx, ny, nz))
-
-    def _matrix(self) -> Array:
-        return _matrix_of((-0.5 / self.radius,) * 3)
-
-    def _tightest_anywhere(self) -> float:
-        return self.radius
+        return osculating_matrix((0.0, 0.5 / self.radius, 0.5 / self.radius))
 
 
 class Quadric(PlacedShape):
@@ -295,7 +140,7 @@ class Quadric(PlacedShape):
         low, high = float(w[0]), float(w[2])
         self._span = (-1.0 / high if high > 0.0 else -inf, -1.0 / low if low < 0.0 else inf)
 
-    def _foot(self, x: float, y: float, z: float) -> _Foot:
+    def _foot(self, x: float, y: float, z: float) -> Foot:
         v0, v1, v2, v3, v4, v5, v6, v7, v8 = self._v
         (w0, w1, w2), (b0, b1, b2) = self._w, self._b
         p = (v0 * x + v3 * y + v6 * z, v1 * x + v4 * y + v7 * z, v2 * x + v5 * y + v8 * z)
@@ -325,7 +170,7 @@ class Quadric(PlacedShape):
     ) -> tuple[float, float, tuple[float, float, float]]:
         """Principal curvatures of K = P' S3 P / |half gradient| and the first direction, eigenbasis."""
         w0, w1, w2 = self._w
-        t0, t1, t2 = _tangent(*n)
+        t0, t1, t2 = tangent_of(*n)
         s0, s1, s2 = n[1] * t2 - n[2] * t1, n[2] * t0 - n[0] * t2, n[0] * t1 - n[1] * t0
         k_tt = (w0 * t0 * t0 + w1 * t1 * t1 + w2 * t2 * t2) / half_gradient
         k_ss = (w0 * s0 * s0 + w1 * s1 * s1 + w2 * s2 * s2) / half_gradient
@@ -404,11 +249,30 @@ class Saddle(Quadric):
                 f"a saddle needs radius_x and radius_y of opposite sign (positive: convex), in m; "
                 f"got {radius_x!r} and {radius_y!r}"
             )
-        super().__init__(T_base_object, _matrix_of((0.5 / radius_x, 0.5 / radius_y, 0.0)))
+        super().__init__(T_base_object, osculating_matrix((0.5 / radius_x, 0.5 / radius_y, 0.0)))
         self.radius_x, self.radius_y = radius_x, radius_y
 
     def _tightest_anywhere(self) -> float:
         return -min(self.radius_x, self.radius_y)
+
+
+class Ellipsoid(Quadric):
+    """Ellipsoid with its axes along the object's, centre at z = -radius_z.
+
+    Args:
+        T_base_object: (4, 4) pose, m.
+        radius_x: semi-axis along x, m.
+        radius_y: along y, m.
+        radius_z: along z, m.
+    """
+
+    def __init__(self, T_base_object: npt.ArrayLike, radius_x: float, radius_y: float, radius_z: float) -> None:
+        require_positive(radius_x=radius_x, radius_y=radius_y, radius_z=radius_z)
+        half = 0.5 * radius_z
+        super().__init__(T_base_object, osculating_matrix((half / radius_x**2, half / radius_y**2, half / radius_z**2)))
+
+    def _tightest_anywhere(self) -> float:
+        return inf
 
 
 _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyType(
@@ -418,12 +282,16 @@ _KINDS: Mapping[str, tuple[type[PlacedShape], tuple[str, ...]]] = MappingProxyTy
         "cylinder": (Cylinder, ("radius",)),
         "saddle": (Saddle, ("radius_x", "radius_y")),
         "bowl": (Bowl, ("radius",)),
+        "ellipsoid": (Ellipsoid, ("radius_x", "radius_y", "radius_z")),
+        "torus": (Torus, ("ring_radius", "radius")),
+        "wave": (Wave, ("amplitude", "wavelength")),
+        "fillet": (Fillet, ("radius", "angle")),
         "quadric": (Quadric, ("matrix",)),
     }
 )
 
 OBJECT_PARAMETERS: Mapping[str, tuple[str, ...]] = MappingProxyType({k: names for k, (_, names) in _KINDS.items()})
-"""Kind of object -> names of its parameters (lengths in m), for loaders and messages."""
+"""Kind of object -> names of its parameters (lengths in m, angles in rad), for loaders and messages."""
 
 
 def make_object(kind: str, *, T_base_object: npt.ArrayLike, **params: object) -> PlacedShape:
@@ -432,7 +300,7 @@ def make_object(kind: str, *, T_base_object: npt.ArrayLike, **params: object) ->
     Args:
         kind: a key of ``OBJECT_PARAMETERS``.
         T_base_object: (4, 4) pose of the object's frame (origin on the surface, z outward), m.
-        **params: exactly the parameters of this kind, lengths in m.
+        **params: exactly the parameters of this kind, m and rad.
 
     Returns:
         The placed shape.

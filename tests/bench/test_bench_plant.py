@@ -1,15 +1,18 @@
 """Costs of the plant's inner calls. Run with --benchmark-only; skipped by default.
 
-Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150.
+Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, dynamic cycle 300, truth 40, image 150.
 """
 
 import numpy as np
 import pytest
 
+from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.emulator.plant.world import Plant
 from canprobe.robot.damped import damped_step
+from canprobe.robot.dynamics import RigidBody
+from canprobe.robot.inertia import puma260_inertia
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.puma260 import ELBOW_FORM, UPENN
@@ -22,10 +25,15 @@ POSE[:3, 3] = POINT
 SHAPES = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y": -0.08}}
 
 
+def plant_of(fidelity):
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
+    shape = make_object("cylinder", T_base_object=POSE, radius=0.036)
+    return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity))
+
+
 @pytest.fixture
 def plant():
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
-    return Plant(PlantConfig(UPENN, q0, object=make_object("cylinder", T_base_object=POSE, radius=0.036)))
+    return plant_of("ideal")
 
 
 def test_bench_forward(benchmark):
@@ -53,6 +61,25 @@ def test_bench_closest(benchmark, kind):
 def test_bench_advance_one_cycle(benchmark, plant):
     def cycle():
         plant.advance(plant.t_ns + 2_500_000)
+        return plant.motor_counts(0)
+
+    benchmark(cycle)
+
+
+def test_bench_rigid_body(benchmark):
+    benchmark(RigidBody(UPENN, puma260_inertia(UPENN)).terms, ELBOW_FORM, np.ones(6))
+
+
+def test_bench_dynamic_cycle_in_contact(benchmark):
+    """One 2.5 ms step of the dynamic plant: six new ramps, the arm, and what the drives report."""
+    plant = plant_of("dynamic")
+
+    def cycle():
+        t = plant.t_ns
+        for axis in range(6):
+            here = plant.motor_counts(axis)
+            plant.set_ramp(axis, here, here + 2.0, t, t + 2_500_000)
+        plant.advance(t + 2_500_000)
         return plant.motor_counts(0)
 
     benchmark(cycle)

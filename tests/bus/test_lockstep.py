@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from timed_buses import Scripted
 
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
@@ -14,31 +15,6 @@ from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame
 from canprobe.errors import BusError, InterfaceError
 
 MS = 1_000_000
-
-
-class Scripted:
-    """Says fixed frames at fixed times and fixed answers to fixed identifiers; remembers what it heard."""
-
-    def __init__(
-        self, timed: dict[int, Sequence[Frame]] | None = None, answers: dict[int, Sequence[Frame]] | None = None
-    ) -> None:
-        self.timed = dict(timed or {})
-        self.answers = answers or {}
-        self.heard: list[tuple[int, bytes, int]] = []
-
-    @property
-    def next_deadline_ns(self) -> int | None:
-        return min(self.timed, default=None)
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        self.heard.append((can_id, data, t_ns))
-        return self.answers.get(can_id, ())
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        return self.timed.pop(min(self.timed))
 
 
 def make_bus(*participants: Scripted, **options: int) -> tuple[LockstepBus, list[tuple[int, bytes, int]]]:

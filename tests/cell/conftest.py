@@ -49,7 +49,7 @@ class DelayedPort:
     def __init__(self, port, rng):
         self._port, self._rng, self._under_way, self._last = port, rng, [], 0
         self.clock = SleepyClock(port.clock, rng)
-        self.channel, self.counters = port.channel, port.counters
+        self.channel, self.counters, self.state = port.channel, port.counters, port.state
 
     def send_batch(self, frames, t_ns=None):
         self._port.send_batch(frames)

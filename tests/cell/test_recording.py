@@ -3,22 +3,10 @@
 from __future__ import annotations
 
 import pytest
+from candump_lines import can_id_of, restamped, stamp_us
 
 import canprobe
 from canprobe.errors import UsageError
-
-
-def can_id_of(line):
-    return line.split()[2].split("#")[0]
-
-
-def stamp_us(line):
-    seconds, us = line[1 : line.index(")")].split(".")
-    return int(seconds) * 1_000_000 + int(us)
-
-
-def restamped(line, us):
-    return f"({us // 1_000_000:010d}.{us % 1_000_000:06d}){line[line.index(')') + 1 :]}"
 
 
 def test_a_node_that_is_not_in_the_log_is_named(lockstep_run, copy_of):

@@ -8,25 +8,13 @@ import re
 
 import numpy as np
 import pytest
+from candump_lines import can_id_of, restamped, stamp_us
 
 import canprobe
 from canprobe.cli import main
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
 TRUE_KAPPA = np.array([1 / 0.036, 0.0])
-
-
-def can_id_of(line):
-    return line.split()[2].split("#")[0]
-
-
-def stamp_us(line):
-    seconds, us = line[1 : line.index(")")].split(".")
-    return int(seconds) * 1_000_000 + int(us)
-
-
-def restamped(line, us):
-    return f"({us // 1_000_000:010d}.{us % 1_000_000:06d}){line[line.index(')') + 1 :]}"
 
 
 def assert_same(records, online):

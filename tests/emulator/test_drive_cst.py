@@ -10,8 +10,9 @@ import pytest
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.drive_trajectories import TorqueRun
+from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.emulator.plant.world import Plant
 from canprobe.robot.puma260 import UPENN
 
 GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers

@@ -114,6 +114,6 @@ def test_cia402_58_bit_11_when_the_motion_takes_more_than_6072h(csv, plant):
     assert csv.bits(11) == (0,)
     csv.put(_6072=300).cycles(1, rpdo=order(100))
     assert csv.bits(11) == (1,)
-    plant.torque = 300
+    plant.torque = 299
     csv.cycles(1, rpdo=order(100))
     assert csv.bits(11) == (0,)

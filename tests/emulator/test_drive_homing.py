@@ -6,7 +6,8 @@ import pytest
 
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.world import Plant
 from canprobe.robot.puma260 import UPENN
 
 START, HALT = 0x1F, 0x10F

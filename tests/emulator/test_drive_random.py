@@ -8,7 +8,8 @@ import pytest
 
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.plant.world import Plant, PlantConfig
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.world import Plant
 from canprobe.protocol.cia402 import state_of
 from canprobe.robot.puma260 import UPENN
 

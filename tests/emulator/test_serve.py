@@ -10,11 +10,14 @@ import pytest
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.eds import load_eds
+from canprobe.emulator import build
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.errors import BusError
+from canprobe.planning import make_plan
+from canprobe.scene_loader import load_scene
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -254,3 +257,10 @@ def test_speed_of_seven_nodes(benchmark, plant):
         run_cycle(exchange, k, word)
     counter = itertools.count(4)
     benchmark(lambda: run_cycle(exchange, next(counter)))
+
+
+def test_nobody_records_what_nobody_wants_to_know():
+    plan = make_plan(load_scene("press"))
+    world = build.make_world(plan, plan.node_ids, truth=False)
+    assert world.recorder is None
+    assert world.participants == world.nodes

@@ -69,7 +69,7 @@ def test_same_seed_same_log_other_seed_other_log(tmp_path):
         logs.append((tmp_path / str(i) / "bus.log").read_bytes())
     assert logs[0] == logs[1]
     assert logs[0] != logs[2]
-    assert logs[0].startswith(b"(0000000000.000000) can0 ")
+    assert logs[0].startswith(b"(0000000000.000056) can0 701#00")
 
 
 def test_press_reaches_and_holds_the_force(tmp_path):

@@ -19,6 +19,7 @@ def run_until_stopped(session, at_cycle=None, action=None):
             action(session)
         return controller.step(measurement)
 
+    step.retreat = controller.retreat
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(step)
     return stopped.value.reason, session.truth
@@ -88,6 +89,7 @@ def test_joint_at_its_stop():
             motion._low = motion.q - 1e-6
         return command
 
+    step.retreat = controller.retreat
     with pytest.raises(SafetyStop, match=r"joint \d at .* deg, its stop"), session:
         session.run(step)
 

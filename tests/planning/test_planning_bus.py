@@ -10,8 +10,8 @@ import pytest
 from canprobe.errors import PlanError
 from canprobe.planning import make_plan
 from canprobe.planning.abilities import Abilities
+from canprobe.planning.identifiers import identifier_problems
 from canprobe.planning.model import PlannedPdo
-from canprobe.planning.pdos import identifier_problems
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene_loader import load_scene
 
@@ -84,7 +84,11 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     problems = reasons(change(cylinder, sensor={"mode": "image"}))
     assert any("worst-case load 152 %" in problem for problem in problems)
     (peak,) = [problem for problem in problems if "7585 µs of the 5000 µs in 2 cycles" in problem]
-    for way in ('sensor.mode = "window" (87 %, 4345 of 5000 µs)', "a bus of its own for the sensor (92 %", "250"):
+    for way in (
+        'sensor.mode = "window" (87 %, 4345 of 5000 µs)',
+        'a bus of its own for the sensor (sensor.channel = "can1") (92 %',
+        "250",
+    ):
         assert way in peak
     assert "grouped" not in peak, "grouping alone does not make it fit and must not be named"
 
@@ -108,11 +112,11 @@ def test_slower_bus_is_refused_and_the_faster_one_named(cylinder):
 
 
 def test_six_drives_alone_end_at_500_hz():
-    """At 625 Hz 1565 of 1600 µs would do, but a heartbeat that was first (65 µs) makes the last RPDO late."""
+    """At 625 Hz 1565 of 1600 µs would do for the bus, but the controller needs its time between TPDOs and RPDOs."""
     free = load_scene("free")
     assert make_plan(change(free, cycle={"rate_hz": 500.0})).traffic.load < 0.8
     (problem,) = reasons(change(free, cycle={"rate_hz": 625.0}))
-    assert "RPDO 206h is 1630 µs, its deadline 1600 µs" in problem
+    assert "takes 200 µs (cycle.compute_us)" in problem and "behind the next SYNC" in problem
     assert "cycle.rate_hz = 500" in problem
     assert any("worst-case load" in problem for problem in reasons(change(free, cycle={"rate_hz": 1000.0})))
 
@@ -196,7 +200,7 @@ def test_every_message_meets_its_deadline_and_tactile_waits_for_all_drives(cylin
     tactile = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id == 16]
     drives = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id != 16]
     assert min(tactile) > max(drives)
-    assert max(pdo.response_ns for pdo in cylinder_plan.pdos) == (4345 + 65) * 1000  # and one heartbeat that was first
+    assert max(pdo.response_ns for pdo in cylinder_plan.pdos) == (4345 + 200) * 1000  # from the end of a late SYNC
 
 
 def test_nodes_with_identity_and_what_is_switched_off(cylinder_plan):
@@ -315,3 +319,45 @@ def test_plan_is_finite_everywhere(cylinder_plan):
             check(item)
 
     check(cylinder_plan.as_dict())
+
+
+# --- the budget of one cycle, added up by hand: what each part waits for, in the order of the bus ------------------
+
+HEARTBEAT = 65
+
+
+@pytest.mark.parametrize(
+    ("name", "sections", "sync_blocked", "sneaks_in", "compute"),
+    [
+        ("free", {"cycle": {"rate_hz": 500.0}}, HEARTBEAT, HEARTBEAT, 200),
+        ("free", {"cycle": {"compute_us": 0.0}}, HEARTBEAT, HEARTBEAT, 0),
+        ("cylinder", {}, FULL, FULL, 200),  # a tactile PDO of the cycle before
+    ],
+)
+def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
+    plan = make_plan(change(load_scene(name), **sections))
+    budget = plan.traffic.budget
+    sync = sync_blocked + SYNC
+    feedback = sync + sneaks_in + 6 * DRIVE_TPDO
+    commands = feedback + compute + sneaks_in + 6 * DRIVE_RPDO
+    assert (budget.sync_ns, budget.feedback_ns, budget.commands_ns) == (sync * 1000, feedback * 1000, commands * 1000)
+    assert (budget.start_ns, budget.compute_ns) == (feedback * 1000, compute * 1000)
+    assert budget.slack_ns == plan.sync.period_ns - commands * 1000
+    assert budget.bus_ns + budget.compute_ns + budget.slack_ns == plan.sync.period_ns
+    assert budget.feedback_ns in budget.looks_ns
+
+
+def test_a_controller_that_takes_too_long_is_refused(cylinder):
+    budget = make_plan(cylinder).traffic.budget
+    longest = (budget.slack_ns + budget.compute_ns) / 1000
+    assert make_plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
+    problems = reasons(change(cylinder, cycle={"compute_us": longest + 1}))
+    assert "1 µs behind the next SYNC" in problems[0]
+
+
+def test_a_sensor_alone_has_a_budget_too():
+    budget = make_plan(load_scene("listen")).traffic.budget
+    assert (budget.feedback_ns, budget.commands_ns) == (None, None)
+    assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
+    assert budget.looks_ns == (625_000, 1_500_000)
+    assert budget.slack_ns == 2_500_000 - 625_000 - 200_000

@@ -123,3 +123,20 @@ def test_any_bytes_unpack_or_raise_the_own_error(data):
         assert len(data) != 8
     else:
         assert TPDO1.pack(*values) == data
+
+
+def test_a_long_pdo_is_filled_up_to_a_length_that_fd_has():
+    entries = tuple(PdoEntry(0x2100, i, 64) for i in range(1, 9))
+    with pytest.raises(ProtocolError, match="at most 64"):
+        PdoLayout(0x512, entries)
+    layout = PdoLayout(0x512, entries, fd=True)
+    values = tuple(range(8))
+    assert layout.length == 64 and layout.unpack(layout.pack(*values)) == values
+    assert layout.pack(*values) == b"".join(value.to_bytes(8, "little") for value in values)
+    uneven = PdoLayout(0x512, (*entries[:1], PdoEntry(0x2005, 0, 8)), fd=True)
+    assert uneven.pack(1, 2) == b"\x01" + bytes(7) + b"\x02" + bytes(3)
+    assert uneven.unpack(uneven.pack(1, 2)) == (1, 2)
+    bits = PdoLayout(0x512, (*entries, PdoEntry(0x2005, 0, 1))[1:], fd=True)
+    assert bits.length == 64 and bits.unpack(bits.pack(*range(7), 1)) == (*range(7), 1)
+    with pytest.raises(ProtocolError, match="at most 512"):
+        PdoLayout(0x512, (*entries, PdoEntry(0x2005, 0, 1)), fd=True)

@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.cell.limits import limits_of, workspace_of
+from canprobe.cell.supervision import Limits
 from canprobe.cell.tasks.calibration import array_calibration
-from canprobe.cell.tasks.probe_motion import ProbeMotion
+from canprobe.cell.tasks.probe_motion import MotionBounds, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchSettings, TouchTask
@@ -31,16 +33,21 @@ WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes; the others stay what they are in the literature."""
 
 
-def make_touch_task(plan: Plan, period_s: float, tactile_timeout: int) -> TouchTask:
+def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
     """The task of a ``scan`` or ``press`` scene."""
     scene = plan.scene
     sensing = make_sensing(scene)
     model, flange_probe = sensing.model, sensing.flange_probe
-    margin = math.radians(scene.limits.joint_margin_deg)
+    bounds = MotionBounds(
+        margin=math.radians(scene.limits.joint_margin_deg),
+        speed_share=scene.limits.joint_speed_share,
+        workspace=workspace_of(scene.limits),
+        radius=sensing.radius,
+    )
     return TouchTask(
-        _settings(scene, period_s, tactile_timeout),
+        _settings(scene, period_s, limits_of(plan)),
         sensing,
-        lambda q: ProbeMotion(model, flange_probe, q, period_s, margin),
+        lambda q: ProbeMotion(model, flange_probe, q, period_s, bounds),
         _strategy(scene.task),
         make_shape_tracker(scene),
     )
@@ -60,13 +67,13 @@ def make_sensing(scene: Scene) -> ContactSensing:
     )
 
 
-def _settings(scene: Scene, period_s: float, tactile_timeout: int) -> TouchSettings:
+def _settings(scene: Scene, period_s: float, limits: Limits) -> TouchSettings:
     task, servo = scene.task, scene.servo or ServoSettings()
     scanning = task.kind == "scan"
     return TouchSettings(
         period_s=period_s,
+        limits=limits,
         target_force=task.force_n,
-        force_max=scene.limits.force_max_n,
         start=np.array(task.start_mm) * 1e-3,
         axes=scan_axes(task),
         duration_s=task.duration_s,
@@ -77,7 +84,6 @@ def _settings(scene: Scene, period_s: float, tactile_timeout: int) -> TouchSetti
         search=task.search_mm * 1e-3,
         lead_s=CYCLES_TO_EFFECT * period_s + servo.drive_lag_ms * 1e-3,
         gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
-        tactile_timeout=tactile_timeout,
     )
 
 

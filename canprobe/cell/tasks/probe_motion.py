@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.joint_guard import outside_workspace
 from canprobe.robot.damped import damped_step
 from canprobe.robot.kinematics import forward_jacobian
 from canprobe.robot.puma260 import PumaModel
@@ -15,6 +17,23 @@ from canprobe.touch.servo import ProbePose
 Vector = NDArray[np.float64]
 SMALL_STEP = 0.01
 """Joint step of one cycle (rad) below which the exact inverse is taken: 230 deg/s at 400 Hz."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MotionBounds:
+    """What a probe's motion keeps to.
+
+    Attributes:
+        margin: distance from every joint stop, rad.
+        speed_share: of the joints' speed limits.
+        workspace: lowest and highest position (2, 3) of the probe's tip, m, base frame; None without one.
+        radius: from the probe's centre to its tip, m.
+    """
+
+    margin: float = 0.0
+    speed_share: float = 1.0
+    workspace: Vector | None = None
+    radius: float = 0.0
 
 
 class ProbeMotion:
@@ -28,15 +47,18 @@ class ProbeMotion:
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
         q: joint angles to start from (6,), rad.
         period_s: of the cycle.
-        margin: distance to keep from every joint stop, rad.
+        bounds: what joints and probe must keep to.
     """
 
-    def __init__(self, model: PumaModel, flange_probe: Vector, q: Vector, period_s: float, margin: float) -> None:
+    def __init__(
+        self, model: PumaModel, flange_probe: Vector, q: Vector, period_s: float, bounds: MotionBounds
+    ) -> None:
         self.q = np.array(q, dtype=float)
         self._model = model
         self._flange_probe = flange_probe
-        self._step_max = model.qd_max * period_s
-        self._low, self._high = model.q_min + margin, model.q_max - margin
+        self._bounds = bounds
+        self._step_max = model.qd_max * bounds.speed_share * period_s
+        self._low, self._high = model.q_min + bounds.margin, model.q_max - bounds.margin
         self.pose_matrix, _ = forward_jacobian(model, self.q, flange_probe)
         self._x_reference: tuple[float, float, float] = tuple(self.pose_matrix[:3, 0].tolist())
         self.limit: str | None = None
@@ -50,10 +72,13 @@ class ProbeMotion:
     def step(self, pose: ProbePose) -> Vector:
         """Joint targets (6,), rad, one step nearer to ``pose``.
 
-        Sets :attr:`limit` at a joint's stop; counts in :attr:`slowed` the cycles in which a joint could not keep up.
+        Sets :attr:`limit` at a joint's stop and outside the workspace; counts in :attr:`slowed` the cycles in which a
+        joint could not keep up.
         """
         T, J = forward_jacobian(self._model, self.q, self._flange_probe)
         self.pose_matrix = T
+        if self._bounds.workspace is not None:
+            self.limit = outside_workspace(T[:3, 3] + self._bounds.radius * T[:3, 2], self._bounds.workspace)
         twist = np.array(_pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference))
         dq = self._increment(J, twist)
         share = float((np.abs(dq) / self._step_max).max())

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from canprobe.touch.estimators import Estimator
 
 
+SHARPEST = 1e3
+"""1/m; no pad feels a ball of 1 mm, so an answer beyond it has diverged."""
+
+
 @dataclass(frozen=True, slots=True)
 class ShapeRecord:
     """One estimate with its place in the run.
@@ -38,12 +42,19 @@ class ShapeTracker:
         every: samples between two answers.
         gap_s: time without a contact after which the estimator starts afresh; by default it never does, as a loop
             that loses contact is at its end.
+
+    Attributes:
+        records: every answer.
+        samples: every contact.
+        travelled_m: path of the contact, m.
+        restarts: how often the estimator diverged and started afresh.
     """
 
     def __init__(self, estimator: Estimator, every: int, gap_s: float = math.inf) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
+        self.restarts = 0
         self._estimator = estimator
         self._every = max(1, every)
         self._gap_s = gap_s
@@ -62,9 +73,20 @@ class ShapeTracker:
         if len(self.samples) % self._every:
             return None
         estimate = self._estimator.estimate()
+        if estimate is not None and has_diverged(estimate):
+            self.restarts += 1
+            self._estimator.reset()
+            return None
         if estimate is not None:
             self.records.append(ShapeRecord(sample.t_s, self.travelled_m, estimate))
         return estimate
+
+
+def has_diverged(estimate: SurfaceEstimate) -> bool:
+    """Whether an answer is none: not finite, or sharper than anything that a pad can feel."""
+    known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
+    finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
+    return not (finite and bool((np.abs(known) < SHARPEST).all()))
 
 
 def replay_samples(

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import IntEnum
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
@@ -17,6 +20,9 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
 from canprobe.touch.servo import LocalSurface, ProbePose, SurfaceGains, TactileServo
 from canprobe.touch.strategy import PathFollower, Strategy
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
 LONGEST_STEP = 4
@@ -43,8 +49,8 @@ class TouchSettings:
 
     Attributes:
         period_s: of the cycle.
+        limits: of the cell; beyond them the probe retreats and the cell stops.
         target_force: N.
-        force_max: N; above it the probe retreats and the cell stops.
         touch_force: N; contact is made above it, lost below half of it.
         approach_speed, retreat_speed: m/s.
         start: expected contact point (3,), m, base frame.
@@ -57,12 +63,11 @@ class TouchSettings:
         ramp_s: time to reach the speed.
         rolling_share: 0…1.
         lead_s: from a SYNC to the moment its command has taken effect.
-        tactile_timeout: cycles without a tactile sample after which the probe retreats.
     """
 
     period_s: float
+    limits: Limits
     target_force: float
-    force_max: float
     start: Vector
     axes: Vector
     duration_s: float
@@ -78,8 +83,6 @@ class TouchSettings:
     retreat: float = 6e-3
     settle_s: float = 0.5
     ramp_s: float = 0.05
-    lost_s: float = 0.03
-    tactile_timeout: int = 12
 
 
 class TouchTask:
@@ -126,6 +129,7 @@ class TouchTask:
         self._pole0: Vector = np.zeros(3)
         self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
+        self._estimate: SurfaceEstimate | None = None
 
     @property
     def scan_cycles(self) -> tuple[int, int] | None:
@@ -144,6 +148,21 @@ class TouchTask:
         """Cycles in which a joint could not keep up with the probe's path."""
         return self._motion.slowed if self._motion is not None else 0
 
+    @property
+    def targets(self) -> dict[str, float]:
+        """What the servo aims at: `target_force_n` and `speed_m_s`."""
+        return {"target_force_n": self._s.target_force, "speed_m_s": self._s.speed}
+
+    def set_target(self, kind: str, value: float) -> None:
+        """Change one of `targets`, by a small step: the servo follows at once."""
+        force, speed = (value, self._s.speed) if kind == "target_force_n" else (self._s.target_force, value)
+        self._s = replace(self._s, target_force=force, speed=speed)
+
+    def stop(self) -> None:
+        """Let go and be done, from whatever phase."""
+        if self._motion is not None and self.phase < Phase.RETREAT:
+            self._leave(None)
+
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
         if self._motion is None:
@@ -151,20 +170,22 @@ class TouchTask:
             self._motion = self._motion_from(measurement.q)
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
+        self._estimate = None
         self._pass_time(measurement.t_ns)
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
         self._t += self._dt
         target = self._motion.step(pose)
-        if self._motion.limit is not None and self.phase < Phase.RETREAT:
-            self._leave(self._motion.limit)
+        if self._motion.limit is not None:
+            self.retreat(self._motion.limit)
         self._columns["phase"] = float(self.phase)
         return Command(
             q_target=target,
             done=self.phase is Phase.DONE and self.reason is None,
             stop_reason=self.reason if self.phase is Phase.DONE else None,
             columns=self._columns,
+            estimate=self._estimate,
         )
 
     # sensing and supervision
@@ -194,7 +215,7 @@ class TouchTask:
 
     def _take_shape(self, contact: ContactSample) -> None:
         assert self.shape is not None and self._servo is not None
-        estimate = self.shape.add(contact)
+        estimate = self._estimate = self.shape.add(contact)
         if estimate is None:
             return
         self._shape_columns = {
@@ -232,14 +253,16 @@ class TouchTask:
     def _watch(self, measurement: Measurement) -> None:
         if self.phase >= Phase.RETREAT:
             return
-        if self._force > self._s.force_max:
-            self._leave(f"measured force {self._force:.2f} N above the limit of {self._s.force_max:.2f} N")
-        elif measurement.tactile_age is not None and measurement.tactile_age > self._s.tactile_timeout:
-            self._leave(f"no tactile frame for {measurement.tactile_age} cycles")
-        elif self.phase in (Phase.SETTLE, Phase.SCAN):
-            self._lost = self._lost + self._dt if self._force < self._s.touch_force / 2 else 0.0
-            if self._lost > self._s.lost_s:
-                self._leave("contact lost")
+        touching = self.phase in (Phase.SETTLE, Phase.SCAN) and self._force < self._s.touch_force / 2
+        self._lost = self._lost + self._dt if touching else 0.0
+        finding = touch_finding(Contact(self._s.limits, self._force, measurement.tactile_age, self._lost))
+        if finding is not None:
+            self._leave(str(finding.error))
+
+    def retreat(self, reason: str) -> None:
+        """Let go for a reason that the cell has; nothing changes where the task is letting go already."""
+        if self.phase < Phase.RETREAT and self._motion is not None:
+            self._leave(reason)
 
     def _leave(self, reason: str | None) -> None:
         """Go to the retreat, for ``reason`` or because the work is done."""

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import smooth_step
 from canprobe.cell.tasks.sensing import patch_of
 from canprobe.touch.patch import PatchCalibration
@@ -53,14 +55,14 @@ class ListenTask:
         calibration: of the array.
         duration_s: how long.
         period_s: of the cycle.
-        tactile_timeout: cycles without a frame after which the task gives up.
+        limits: of the cell.
     """
 
-    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float, tactile_timeout: int) -> None:
+    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float, limits: Limits) -> None:
         self._calibration = calibration
         self._left = duration_s
         self._period = period_s
-        self._timeout = tactile_timeout
+        self._limits = limits
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Vector] = {}
 
@@ -76,6 +78,6 @@ class ListenTask:
                 "pad_u_mm": patch.u * 1e3,
                 "pad_v_mm": patch.v * 1e3,
             }
-        age = measurement.tactile_age
-        silent = f"no tactile frame for {age} cycles" if age is not None and age > self._timeout else None
+        finding = touch_finding(Contact(self._limits, 0.0, measurement.tactile_age))
+        silent = str(finding.error) if finding is not None else None
         return Command(done=self._left <= 0, stop_reason=silent, columns=self._columns)

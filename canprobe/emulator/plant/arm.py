@@ -14,20 +14,20 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.emulator.plant.motor import MotorDynamics
+from canprobe.robot.actuation import (
+    CONTINUOUS_TORQUE_NM,
+    COULOMB_NM,
+    PEAK_PERMILLE,
+    REFLECTED_INERTIA,
+    STICTION_RATE,
+    VISCOUS_NMS,
+)
 from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
 
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
 """Position, rate and reference of one motor: counts, counts/s, counts."""
 _NEVER = 1 << 62
-
-REFLECTED_INERTIA = (0.030, 0.088, 0.022, 0.0072, 0.0064, 0.0073)
-"""Motor inertia at the joint, kg m^2: PUMA 560 (Corke & Armstrong-Helouvry 1994) scaled by size."""
-COULOMB_NM = (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
-VISCOUS_NMS = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012)
-CONTINUOUS_TORQUE_NM = (6.4, 6.4, 6.4, 1.4, 0.7, 0.7)
-_PEAK_PERMILLE = 2000
-_STICTION_RATE = 0.01  # rad/s over which the Coulomb torque turns its sign
 
 
 def natural_frequency(bandwidth_hz: float, damping_ratio: float) -> float:
@@ -216,9 +216,17 @@ class IdealArm:
             rate += share * v
             acceleration += share * (stiffness * (r - q) - damping * v)
         torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
-        torque += COULOMB_NM[axis] * tanh(rate / _STICTION_RATE)
+        torque += COULOMB_NM[axis] * tanh(rate / STICTION_RATE)
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
-        return max(-_PEAK_PERMILLE, min(_PEAK_PERMILLE, permille))
+        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: these motors track as they do, whatever torque that takes.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
+        """
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.

@@ -119,6 +119,26 @@ class PressureField:
         low, high = floor(max(middle - reach, 0.0)), ceil(min(middle + reach, self._count - 1.0)) + 1
         return low, high
 
+    def points(self, centre: Array, axes: Array) -> Array:
+        """(n, 3) places of all samples on the undeformed probe, base frame.
+
+        Args:
+            centre: (3,) of the probe, m.
+            axes: (3, 3) rows: its x, y and z axes.
+        """
+        places: Array = centre + self.radius * self._directions.reshape(3, -1).T @ axes
+        return places
+
+    def mean_of(self, compression: Array) -> Array:
+        """Taxel means of a compression given at all samples, as ``mean_pressure`` gives them.
+
+        Args:
+            compression: (n,) m, in the order of ``points``; negative for gaps.
+        """
+        grid = np.maximum(compression, 0.0).reshape(self._count, self._count) * self._area
+        means: Array = self._rows @ grid @ self._columns
+        return means
+
     def mean_pressure(
         self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Array
     ) -> Array:

@@ -101,7 +101,7 @@ class TaxelArray:
     ) -> None:
         self.config = config
         self._rng = rng
-        self._field = PressureField(radius_m, blur_pitch=config.blur_pitch, samples=config.samples)
+        self.field = PressureField(radius_m, blur_pitch=config.blur_pitch, samples=config.samples)
         self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, (SIDE, SIDE))
         self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
         self._loop = np.zeros((SIDE, SIDE))
@@ -136,7 +136,20 @@ class TaxelArray:
         Returns:
             (16, 16) counts, row i at v = (i - 7.5) pitch, column j at u = (j - 7.5) pitch.
         """
-        y = self._field.mean_pressure(uv, depth, kappa, directions_pad)
+        return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
+
+    def image_of(self, compression: Array, t_s: float, pressure_factor: float = 1.0) -> Image:
+        """The rest of the pipeline: sample the array once under a known compression of the layer.
+
+        Args:
+            compression: (16, 16) taxel means as ``PressureField`` gives them, m; used up.
+            t_s: time of the sample, s, not before the previous one.
+            pressure_factor: of the layer's damping.
+
+        Returns:
+            (16, 16) counts.
+        """
+        y = compression
         y *= self._scale
         if pressure_factor != 1.0:
             y *= pressure_factor

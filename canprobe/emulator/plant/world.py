@@ -1,77 +1,35 @@
 """The plant: arm, probe, object and array as one thing that the emulated nodes share.
 
 Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
-and only when somebody asks. Contact does not push the ideal arm back: the drives are taken as stiff.
+and only when somebody asks. Contact pushes the dynamic arm back, not the ideal one: its drives are taken as stiff.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from math import cos, pi, sin
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from canprobe.emulator.plant.arm import IdealArm
+from canprobe.emulator.plant.arms import make_arm
+from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
 from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
 from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
+from canprobe.emulator.plant.resting import LEAST_CURVATURE, total_force
+from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import chain, point_velocity, tool_z_offset
-from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel, counts_to_joints
-from canprobe.touch.objects import ClosestPoint, ObjectShape
+from canprobe.robot.kinematics import chain, point_velocity
+from canprobe.robot.puma260 import Array, counts_to_joints
+from canprobe.touch.objects import ClosestPoint, Touches
+
+if TYPE_CHECKING:
+    from canprobe.emulator.plant.dynamic_arm import DynamicArm
 
 Axes = tuple[Vec, Vec, Vec]
 Truth = dict[str, float | bool | Array]
-
-
-@dataclass(frozen=True, slots=True)
-class PressMotion:
-    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
-
-    Args:
-        force_n: force at the mean depth.
-        swing: amplitude of the depth over its mean.
-        frequency_hz: of the swing.
-    """
-
-    force_n: float = 2.0
-    swing: float = 0.4
-    frequency_hz: float = 0.5
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlantConfig:
-    """What the plant is made of.
-
-    Args:
-        model: the arm; None for a sensor alone, pressed on the object by ``press``.
-        q0: (6,) joint angles at time 0, rad.
-        T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
-        radius_m: probe radius.
-        stiffness_n_m3: of the elastic layer (K/h).
-        damping_s_m: Hunt-Crossley alpha (assumed).
-        object: what can be touched; None for nothing.
-        taxels: the array's imperfections; None where there is no array.
-        bandwidth_hz: -3 dB frequency of every drive.
-        damping_ratio: of every drive.
-        press: motion of a probe without an arm.
-        seed: of taxel gains and noise.
-    """
-
-    model: PumaModel | None
-    q0: Array = field(default_factory=lambda: ELBOW_FORM)
-    T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
-    radius_m: float = 0.040
-    stiffness_n_m3: float = 1.27e8
-    damping_s_m: float = 0.3
-    object: ObjectShape | None = None
-    taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
-    bandwidth_hz: float = 30.0
-    damping_ratio: float = 1.0
-    press: PressMotion = PressMotion()
-    seed: int = 0
 
 
 class PlantState(NamedTuple):
@@ -124,22 +82,21 @@ class Plant:
 
     Args:
         config: what the plant is made of.
-
     Raises:
-        PlanError: for an object with a hollow as tight as the probe.
+        PlanError: for a probe without an arm over a hollow as tight as itself.
     """
 
     def __init__(self, config: PlantConfig) -> None:
         self.config = config
         self.t_ns = 0
-        self.arm: IdealArm | None = None
+        self.arm: IdealArm | DynamicArm | None = None
         self._pressed: _PressedProbe | None = None
         if config.model is not None:
-            self.arm = IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
-        if config.object is not None:
+            self.arm = make_arm(config)
+        if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
-            if config.model is None:
-                self._pressed = _PressedProbe(config)
+            self._pressed = _PressedProbe(config)
+        self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
             rng = np.random.default_rng(config.seed)
@@ -148,6 +105,7 @@ class Plant:
         self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
+        self._base: Vec = tuple(config.base_offset_m.tolist())
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
 
@@ -194,6 +152,18 @@ class Plant:
         """
         return self.arm.torque_permille(axis) if self.arm is not None else 0
 
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille: of the rated torque.
+            speed: counts/s.
+            torque_permille: of the rated torque.
+        """
+        if self.arm is not None:
+            self.arm.set_loop(axis, limit_permille, speed, torque_permille)
+
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
@@ -205,7 +175,7 @@ class Plant:
         """
         return self._need_arm().motor_dynamics(axis)
 
-    def _need_arm(self) -> IdealArm:
+    def _need_arm(self) -> IdealArm | DynamicArm:
         if self.arm is None:
             raise RuntimeError("this plant has no arm")
         return self.arm
@@ -223,17 +193,34 @@ class Plant:
         if self.array is None:
             return np.zeros((SIDE, SIDE), dtype=np.uint8)
         if self._image is None or self._image[0] != self.t_ns:
-            s = self._solution()
-            image = self.array.image(
-                s.pad_uv,
-                s.depth,
-                s.kappa,
-                _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
-                1e-9 * self.t_ns,
-                pressure_factor=s.contact.damping_factor,
-            )
-            self._image = (self.t_ns, image)
+            self._image = (self.t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
+
+    def pressure(self, state: PlantState | None = None) -> Array:
+        """(16, 16) mean pressure of every taxel, Pa, before the array's own imperfections; zeros without an array.
+
+        Args:
+            state: of this plant; the present one by default.
+        """
+        s = self._solution() if state is None else self._solve(state)
+        if self.array is None or s.depth <= 0.0:
+            return np.zeros((SIDE, SIDE))
+        field, directions = self.array.field, _in_pad(s.foot, s.probe, s.direction)
+        means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
+        return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
+
+    def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
+        if s.several and self.config.object is not None:
+            points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
+            return array.image_of(array.field.mean_of(-self.config.object.gaps(points)), 1e-9 * self.t_ns)
+        return array.image(
+            s.pad_uv,
+            s.depth,
+            s.kappa,
+            _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
+            1e-9 * self.t_ns,
+            pressure_factor=s.contact.damping_factor,
+        )
 
     def state(self) -> PlantState:
         """The present state: cheap to take, `truth` can be asked for it at any time."""
@@ -291,7 +278,8 @@ class Plant:
             p2 + x2 * a + y2 * b + z2 * d,
         )
         axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
-        return _Probe(centre, axes, point_velocity(c, centre, qd))
+        b0, b1, b2 = self._base
+        return _Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
 
     def _solve(self, state: PlantState) -> _Solution:
         config, q, qd = self.config, np.zeros(6), np.zeros(6)
@@ -305,13 +293,29 @@ class Plant:
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
         k1, k2 = foot.kappa.tolist()
+        touches = config.object.touches(probe.centre, config.radius_m)
         contact = elastic_contact(
-            depth, (k1, k2), config.radius_m, config.stiffness_n_m3, depth_rate=rate, damping=config.damping_s_m
+            depth,
+            (max(k1, self._tightest), max(k2, self._tightest)),
+            config.radius_m,
+            config.stiffness_n_m3,
+            depth_rate=rate,
+            damping=config.damping_s_m,
         )
+        if touches is not None:
+            contact = self._resting(touches, probe)
         # Contact direction on the probe: from its centre against the object's outward normal.
         (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
         d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
-        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), pad_coordinates(d, config.radius_m), d)
+        uv = pad_coordinates(d, config.radius_m)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+
+    def _resting(self, touches: Touches, probe: _Probe) -> Contact:
+        """Several places at once, as one contact with the resultant force; it has no patch of its own."""
+        config = self.config
+        rates = -(touches.normals @ np.array(probe.velocity))
+        force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
+        return replace(NO_CONTACT, force=float(np.linalg.norm(force)))
 
 
 def _turned(axes: Axes, R: Array) -> Axes:
@@ -339,6 +343,7 @@ class _Solution:
     kappa: tuple[float, float]
     pad_uv: tuple[float, float]
     direction: Vec  # of the contact from the probe's centre, pad frame
+    several: bool = False  # it touches in several places, and these are of the deepest
 
 
 _POLE = (0.0, 0.0, 1.0)
@@ -346,6 +351,7 @@ _NOWHERE = ClosestPoint(np.zeros(3), np.zeros(3), 0.0, np.zeros(2), np.zeros((2,
 
 
 def _refuse_tight_hollow(config: PlantConfig) -> None:
+    """A probe without an arm is pressed on the object's reference point, which it must be able to reach."""
     assert config.object is not None
     tightest = config.object.tightest_concave_radius()
     if tightest <= config.radius_m:

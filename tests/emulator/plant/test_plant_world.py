@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.contact import depth_for_force
 from canprobe.emulator.plant.field import PITCH_M, pad_direction
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS
-from canprobe.emulator.plant.world import Plant, PlantConfig, PressMotion
+from canprobe.emulator.plant.world import Plant
 from canprobe.errors import PlanError
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
@@ -305,8 +306,8 @@ def test_sensor_alone_without_an_object_is_idle():
 def test_a_hollow_as_tight_as_the_probe_is_refused():
     bowl = make_object("bowl", T_base_object=np.eye(4), radius=0.04)
     with pytest.raises(PlanError, match=r"hollow of radius 40\.0 mm"):
-        Plant(PlantConfig(UPENN, ELBOW_FORM, object=bowl))
-    Plant(PlantConfig(UPENN, ELBOW_FORM, object=make_object("bowl", T_base_object=np.eye(4), radius=0.06)))
+        Plant(PlantConfig(None, object=bowl))
+    Plant(PlantConfig(None, object=make_object("bowl", T_base_object=np.eye(4), radius=0.06)))
 
 
 def test_real_centroid_follows_the_true_contact_point():

@@ -1,0 +1,83 @@
+"""A live view in Foxglove: its WebSocket server, with the same channels as the MCAP file.
+
+Whoever is not subscribed to costs nothing: no message is made for a channel that nobody looks at. A viewer that cannot
+follow loses its oldest messages in the server; neither the cell nor another viewer waits for it.
+"""
+
+from __future__ import annotations
+
+from importlib import resources
+
+import foxglove
+
+from canprobe.bridge.cdr import Encoder
+from canprobe.bridge.messages import Messages
+from canprobe.bridge.sample import Sample
+from canprobe.bridge.sink import Context
+from canprobe.bridge.topics import TOPICS, Topic
+from canprobe.errors import UsageError
+
+LAYOUT = "foxglove_layout.json"
+STATIC_EVERY_NS = 1_000_000_000
+"""The protocol keeps no last message for viewers that come later, so that the fixed frames are told again."""
+
+
+class FoxgloveSink:
+    """Serves one run.
+
+    Args:
+        context: of the run.
+
+    Raises:
+        UsageError: the address is taken, or is none of this machine's.
+    """
+
+    def __init__(self, context: Context) -> None:
+        settings, encoder = context.settings, Encoder()
+        room = self._room = foxglove.Context()  # its channels are gone when nobody holds it
+        self._channels = {topic.name: _channel(topic, encoder, room) for topic in TOPICS}
+        self._messages = Messages(context.plan, encoder, self._is_watched, STATIC_EVERY_NS)
+        try:
+            self._server = foxglove.start_server(
+                name=f"canprobe {context.plan.scene.name}",
+                host=settings.foxglove_host,
+                port=settings.foxglove_port,
+                context=room,
+            )
+        except (RuntimeError, OSError) as error:
+            where = f"{settings.foxglove_host}:{settings.foxglove_port}"
+            raise UsageError(f"{where}: {error}; set bridge.foxglove_port, 0 takes any that is free") from error
+        self._host = settings.foxglove_host
+
+    @property
+    def where(self) -> str:
+        """The address for Foxglove's “open connection”, and the layout to import there."""
+        return f"ws://{self._host}:{self._server.port}, layout {resources.files('canprobe') / 'bridge' / LAYOUT}"
+
+    def start(self, epoch_ns: int) -> None:
+        """Take the epoch."""
+        self._messages.epoch_ns = epoch_ns
+
+    def write(self, sample: Sample) -> None:
+        """Send what somebody looks at."""
+        for topic, t_ns, data in self._messages.of(sample):
+            self._channels[topic.name].log(data, log_time=t_ns)
+
+    def close(self, summary: str | None) -> None:
+        """Stop the server."""
+        self._server.stop()
+
+    def _is_watched(self, topic: Topic) -> bool:
+        return self._channels[topic.name].has_sinks()
+
+
+def open_sink(context: Context) -> FoxgloveSink:
+    """Start the server."""
+    return FoxgloveSink(context)
+
+
+def _channel(topic: Topic, encoder: Encoder, room: foxglove.Context) -> foxglove.Channel:
+    schema = foxglove.Schema(
+        name=topic.type_name, encoding="ros2msg", data=encoder.definition(topic.type_name).encode()
+    )
+    return foxglove.Channel(topic.name, schema=schema, message_encoding="cdr", context=room)

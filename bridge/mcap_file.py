@@ -1,0 +1,103 @@
+"""One MCAP file a run: ROS 2 messages with their definitions, and scene, EDS, DBC and summary as attachments.
+
+Source: MCAP specification, well-known profile `ros2`, message encoding `cdr`, schema encoding `ros2msg`; channel
+metadata as rosbag2_storage_mcap writes it.
+"""
+
+from __future__ import annotations
+
+import os
+
+from mcap.writer import Writer
+
+from canprobe import __version__
+from canprobe.bridge.attachments import attachments_of
+from canprobe.bridge.cdr import Encoder
+from canprobe.bridge.messages import Messages
+from canprobe.bridge.sample import Sample
+from canprobe.bridge.sink import Context
+from canprobe.bridge.topics import TOPICS, Topic
+from canprobe.errors import UsageError
+from canprobe.planning.bridges import BRIDGES
+
+
+class McapSink:
+    """Writes `run.mcap` into the run's folder.
+
+    Args:
+        context: of the run.
+    """
+
+    def __init__(self, context: Context) -> None:
+        if context.out is None:
+            raise UsageError("it writes a file, and this run writes none: name a folder (out=, --out)")
+        context.out.mkdir(parents=True, exist_ok=True)
+        self._context = context
+        self._path = context.out / str(BRIDGES["mcap"].output)
+        self._part = self._path.with_suffix(".mcap.part")  # a run that breaks off leaves no file that looks whole
+        self._encoder = Encoder()
+        self._messages = Messages(context.plan, self._encoder)
+        self._file = self._part.open("wb")
+        self._writer = Writer(self._file)
+        self._writer.start(profile="ros2", library=f"canprobe {__version__}")
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+        self._counts: dict[str, int] = {}
+        self._last_ns = 0
+
+    @property
+    def where(self) -> str:
+        """The file."""
+        return str(self._path)
+
+    def start(self, epoch_ns: int) -> None:
+        """Take the epoch; every channel is there from the first message on, whether or not it will have any."""
+        self._messages.epoch_ns = epoch_ns
+        for topic in TOPICS:
+            self._channels[topic.name] = self._register(topic)
+
+    def write(self, sample: Sample) -> None:
+        """Write the messages of a sample."""
+        for topic, t_ns, data in self._messages.of(sample):
+            count = self._counts[topic.name] = self._counts.get(topic.name, 0) + 1
+            self._writer.add_message(self._channels[topic.name], t_ns, data, t_ns, count)
+            self._last_ns = max(self._last_ns, t_ns)
+
+    def close(self, summary: str | None) -> None:
+        """Attach what the run was, write the index, and give the file its name."""
+        for name, media_type, content in attachments_of(self._context.plan, self._context.out, summary):
+            self._writer.add_attachment(self._last_ns, self._last_ns, name, media_type, content)
+        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.close()
+        os.replace(self._part, self._path)
+
+    def _register(self, topic: Topic) -> int:
+        schema = self._schemas.get(topic.type_name)
+        if schema is None:
+            text = self._encoder.definition(topic.type_name).encode()
+            schema = self._schemas[topic.type_name] = self._writer.register_schema(topic.type_name, "ros2msg", text)
+        metadata = {
+            "offered_qos_profiles": _qos_yaml(topic),
+            "topic_type_hash": self._encoder.type_hash(topic.type_name),
+        }
+        return self._writer.register_channel(topic.name, "cdr", schema, metadata)
+
+
+def open_sink(context: Context) -> McapSink:
+    """Begin the file."""
+    return McapSink(context)
+
+
+def _qos_yaml(topic: Topic) -> str:
+    """Quality of service as rosbag2 stores it, so that a replay offers it again."""
+    return (
+        "- history: keep_last\n"
+        f"  depth: {topic.depth}\n"
+        f"  reliability: {'best_effort' if topic.best_effort else 'reliable'}\n"
+        f"  durability: {'transient_local' if topic.transient else 'volatile'}\n"
+        "  deadline:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  lifespan:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  liveliness: automatic\n"
+        "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
+        "  avoid_ros_namespace_conventions: false\n"
+    )

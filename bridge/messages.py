@@ -1,0 +1,238 @@
+"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge import topics
+from canprobe.bridge.cdr import Encoder, encode_can_frame
+from canprobe.bridge.sample import (
+    BASE,
+    CONTACT,
+    FLANGE,
+    JOINT_NAMES,
+    PROBE,
+    CanFrame,
+    ContactFrame,
+    Joints,
+    Sample,
+    SurfacePatch,
+    TaxelImage,
+    Wrench,
+)
+from canprobe.bridge.topics import Topic
+from canprobe.bridge.transforms import flange_transform, link_transforms, quaternion_of
+from canprobe.planning.model import Plan
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene_geometry import T_flange_probe
+
+Array = NDArray[np.float64]
+Message = tuple[Topic, int, bytes]
+"""Topic, time in ns since the epoch, CDR."""
+_FLOAT32, _PATCH_FIELDS = 7, ("x", "y", "z", "sigma")
+
+
+class Messages:
+    """Makes the messages of one run.
+
+    Args:
+        plan: of the run.
+        encoder: the one encoder.
+        wanted: whether anybody takes a topic; nothing is made of the others.
+        static_every_ns: when the fixed frames are told again; by default once is enough.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        encoder: Encoder,
+        wanted: Callable[[Topic], bool] = lambda _: True,
+        static_every_ns: int = 1 << 62,
+    ) -> None:
+        self.encoder = encoder
+        self.epoch_ns = 0
+        self._types: Any = encoder.store.types
+        arm, probe = plan.scene.arm, plan.scene.probe
+        self._model = MODELS[arm.model] if arm is not None else None
+        self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
+        self._wanted = wanted
+        self._static_every_ns = static_every_ns
+        self._static_due_ns = -(1 << 62)
+        self._fields = [
+            self._make("sensor_msgs/msg/PointField", name=name, offset=4 * i, datatype=_FLOAT32, count=1)
+            for i, name in enumerate(_PATCH_FIELDS)
+        ]
+
+    def of(self, sample: Sample) -> Iterator[Message]:
+        """Every message of a sample that is wanted; the time of each is its own."""
+        yield from self._can_frames(sample.frames)
+        for topic, t_ns, make in self._parts(sample):
+            if self._wanted(topic):
+                yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
+
+    def _can_frames(self, frames: tuple[CanFrame, ...]) -> Iterator[Message]:
+        """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
+        classic, fd = self._wanted(topics.CAN_FRAMES), self._wanted(topics.CAN_FD_FRAMES)
+        for frame in frames:
+            t_ns = self._epoch_time(frame.t_ns)
+            if len(frame.data) <= 8:
+                if classic:
+                    yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+            elif fd:
+                message = self._make(
+                    topics.CAN_FD_FRAMES.type_name,
+                    header=self._header(frame.t_ns, ""),
+                    id=frame.can_id,
+                    is_extended=frame.extended,
+                    is_error=False,
+                    len=len(frame.data),
+                    data=np.frombuffer(frame.data, np.uint8),
+                )
+                yield topics.CAN_FD_FRAMES, t_ns, self.encoder.encode(topics.CAN_FD_FRAMES.type_name, message)
+
+    def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
+        """What there is in a sample: topic, time, and how to make the message."""
+        t_ns, joints, patch = sample.t_ns, sample.joints, sample.patch
+        taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
+        if self._model is not None and t_ns >= self._static_due_ns:
+            self._static_due_ns = t_ns + self._static_every_ns
+            yield topics.TF_STATIC, t_ns, lambda: self._static(t_ns)
+        if joints is not None and self._model is not None:
+            yield topics.JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
+            yield topics.TF, t_ns, lambda: self._links(t_ns, joints)
+        if taxels is not None:
+            yield topics.TAXELS, taxels.t_ns, lambda: self._image(taxels)
+        if wrench is not None:
+            yield topics.WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
+        if contact is not None:
+            yield topics.TF, contact.t_ns, lambda: self._contact(contact)
+        if patch is not None:
+            yield topics.PATCH, patch.t_ns, lambda: self._cloud(patch)
+            yield topics.CURVATURE, patch.t_ns, lambda: self._curvature(patch)
+        if sample.diagnostics:
+            yield topics.DIAGNOSTICS, t_ns, lambda: self._diagnostics(sample)
+
+    # one function a message
+
+    def _joint_state(self, t_ns: int, joints: Joints) -> Any:
+        nothing = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
+        return self._make(
+            "sensor_msgs/msg/JointState",
+            header=self._header(t_ns, BASE),
+            name=list(JOINT_NAMES),
+            position=np.asarray(joints.position, np.float64),
+            velocity=nothing,
+            effort=nothing,
+        )
+
+    def _links(self, t_ns: int, joints: Joints) -> Any:
+        assert self._model is not None
+        return self._tf(t_ns, link_transforms(self._model, joints.position))
+
+    def _static(self, t_ns: int) -> Any:
+        fixed = [flange_transform()]
+        if self._T_flange_probe is not None:
+            fixed.append((FLANGE, PROBE, self._T_flange_probe))
+        return self._tf(t_ns, fixed)
+
+    def _contact(self, contact: ContactFrame) -> Any:
+        return self._tf(contact.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
+
+    def _wrench(self, wrench: Wrench) -> Any:
+        body = self._make(
+            "geometry_msgs/msg/Wrench", force=self._vector(wrench.force), torque=self._vector(wrench.torque)
+        )
+        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(wrench.t_ns, PROBE), wrench=body)
+
+    def _image(self, image: TaxelImage) -> Any:
+        rows, columns = image.counts.shape
+        return self._make(
+            "sensor_msgs/msg/Image",
+            header=self._header(image.t_ns, PROBE),
+            height=rows,
+            width=columns,
+            encoding="mono8",
+            is_bigendian=0,
+            step=columns,
+            data=image.counts.ravel(),
+        )
+
+    def _cloud(self, patch: SurfacePatch) -> Any:
+        points, sigma = patch.grid()
+        rows = np.column_stack([points, sigma]).astype("<f4")
+        step = rows.shape[1] * 4
+        return self._make(
+            "sensor_msgs/msg/PointCloud2",
+            header=self._header(patch.t_ns, BASE),
+            height=1,
+            width=len(rows),
+            fields=self._fields,
+            is_bigendian=False,
+            point_step=step,
+            row_step=step * len(rows),
+            data=np.frombuffer(rows.tobytes(), np.uint8),
+            is_dense=bool(np.isfinite(rows).all()),
+        )
+
+    def _curvature(self, patch: SurfacePatch) -> Any:
+        """Principal curvatures κ1, κ2 as x and y, 1/m, for plots; z is their mean."""
+        first, second = patch.kappa
+        vector = self._vector(np.array([first, second, 0.5 * (first + second)]))
+        return self._make("geometry_msgs/msg/Vector3Stamped", header=self._header(patch.t_ns, CONTACT), vector=vector)
+
+    def _diagnostics(self, sample: Sample) -> Any:
+        status = [
+            self._make(
+                "diagnostic_msgs/msg/DiagnosticStatus",
+                level=d.level,
+                name=d.name,
+                message=d.message,
+                hardware_id="canprobe",
+                values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values],
+            )
+            for d in sample.diagnostics
+        ]
+        return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header(sample.t_ns, ""), status=status)
+
+    # parts of messages
+
+    def _epoch_time(self, t_ns: int) -> int:
+        return max(self.epoch_ns + t_ns, 0)  # a sample may be a moment older than the bus
+
+    def _make(self, type_name: str, **fields: Any) -> Any:
+        return self._types[type_name](**fields)
+
+    def _header(self, t_ns: int, frame_id: str) -> Any:
+        seconds, ns = divmod(self._epoch_time(t_ns), 1_000_000_000)
+        stamp = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=ns)
+        return self._make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+
+    def _vector(self, v: Array) -> Any:
+        x, y, z = v.tolist()
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
+    def _tf(self, t_ns: int, transforms: list[tuple[str, str, Array]]) -> Any:
+        return self._make(
+            "tf2_msgs/msg/TFMessage",
+            transforms=[
+                self._make(
+                    "geometry_msgs/msg/TransformStamped",
+                    header=self._header(t_ns, parent),
+                    child_frame_id=child,
+                    transform=self._transform(T),
+                )
+                for parent, child, T in transforms
+            ],
+        )
+
+    def _transform(self, T: Array) -> Any:
+        x, y, z, w = quaternion_of(T[:3, :3])
+        return self._make(
+            "geometry_msgs/msg/Transform",
+            translation=self._vector(T[:3, 3]),
+            rotation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
+        )

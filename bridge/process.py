@@ -1,0 +1,194 @@
+"""A bridge as the cell sees it: an observer that hands everything to a process of its own and never waits for it.
+
+A crash, a hang or a full queue over there costs samples, which are counted, and nothing else.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import marshal
+import os
+import select
+import subprocess
+import sys
+import tempfile
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from canprobe.bridge.codec import pack_observation
+from canprobe.bridge.feed import Feed
+from canprobe.bus.clock import elapsed_ns, epoch_now_ns
+from canprobe.cell.observe import Observation
+from canprobe.errors import UsageError
+from canprobe.planning.model import Plan
+from canprobe.scene_writer import dump_scene
+
+READY_TIMEOUT_S = 60.0
+END_TIMEOUT_S = 10.0
+KILL_TIMEOUT_S = 2.0
+LATENCY_S = 0.02
+"""Samples of this time leave by one system call."""
+_OBSERVATION, _END = b"o", b"e"
+
+
+class BridgeProcess:
+    """One bridge in a process of its own.
+
+    Args:
+        name: of the bridge.
+        plan: of the run.
+        out: folder of the run; None where no files are written.
+        virtual: the run is not in real time: its feed waits for room, and its time begins at 0.
+
+    Attributes:
+        requests: what the other tool asked of the cell, oldest first.
+    """
+
+    def __init__(self, name: str, plan: Plan, out: Path | None, *, virtual: bool) -> None:
+        self.name = name
+        self.requests: deque[dict[str, Any]] = deque(maxlen=100)
+        self._config = {"scene": dump_scene(plan.scene), "out": str(out.resolve()) if out is not None else None}
+        self._virtual = virtual
+        self._takes_requests = name == "ros2" and bool(plan.scene.bridge and plan.scene.bridge.ros2_commands)
+        self._epoch: bytes | None = None
+        self._where: str | None = None
+        self._error: str | None = None
+        self._received: int | None = None
+        self._text = b""
+        self._poll_in = self._batch = max(1, round(LATENCY_S * plan.scene.cycle.rate_hz))
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end
+        reader, writer = os.pipe()
+        self._process = subprocess.Popen(  # a new session: Ctrl-C is for the cell
+            [sys.executable, "-m", "canprobe.bridge.worker", name],
+            stdin=reader,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            start_new_session=True,
+        )
+        os.close(reader)
+        assert self._process.stdout is not None
+        self._back = self._process.stdout.fileno()
+        os.set_blocking(self._back, False)
+        self._feed = Feed(writer, batch=self._batch, lossless=virtual)
+
+    @property
+    def pid(self) -> int:
+        """Of its process."""
+        return self._process.pid
+
+    def await_ready(self) -> str:
+        """Wait until the bridge says where it is to be found; at once where it has.
+
+        Raises:
+            UsageError: it could not begin; with its own words.
+        """
+        if self._where is not None:
+            return self._where
+        self._feed.put(marshal.dumps(self._config))
+        self._feed.flush(READY_TIMEOUT_S)
+        self._feed.taken = 0
+        deadline = elapsed_ns() + round(READY_TIMEOUT_S * 1e9)
+        while self._where is None and self._error is None:
+            left = (deadline - elapsed_ns()) * 1e-9
+            if left <= 0:
+                self._error = f"not ready after {READY_TIMEOUT_S:g} s"
+            elif not self._listen(left):
+                self._error = self._last_words() or "ended before it began"
+        if self._where is None:
+            raise UsageError(f"bridge {self.name}: {self._error}")
+        return self._where
+
+    def observe(self, observation: Observation) -> None:
+        """Hand one observation over, or drop it; where commands are allowed, see now and then whether there is one."""
+        if self._epoch is None:
+            epoch = 0 if self._virtual else epoch_now_ns() - observation.t_ns
+            self._epoch = epoch.to_bytes(8, "little")
+        feed = self._feed
+        feed.put(_OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
+        if self._takes_requests and not feed.broken:
+            self._poll_in -= 1
+            if self._poll_in <= 0:
+                self._poll_in = self._batch
+                self._listen(0.0)
+
+    def _listen(self, timeout_s: float) -> bool:
+        """Take what came back; False at its end."""
+        readable, _, _ = select.select([self._back], [], [], timeout_s)
+        if not readable:
+            return True
+        data = b""
+        with contextlib.suppress(BlockingIOError):
+            data = os.read(self._back, 1 << 16)
+        *lines, self._text = (self._text + data).split(b"\n")
+        for line in lines:
+            self._take(json.loads(line))
+        return bool(data)
+
+    def _take(self, document: dict[str, Any]) -> None:
+        self._where = document.get("ready", self._where)
+        self._error = document.get("error", self._error)
+        if "done" in document:
+            self._received = document["done"]["received"]
+        if "request" in document:
+            self.requests.append(document["request"])
+
+    # the end
+
+    def status(self) -> dict[str, Any]:
+        """What stands in the summary: samples handed over and dropped, where it is, and what went wrong."""
+        feed = self._feed
+        dropped = feed.dropped if self._received is None else feed.taken - self._received
+        return {"samples": feed.taken, "dropped": dropped, "where": self._where, "error": self._error}
+
+    def end(self, summary: str | None) -> dict[str, Any]:
+        """Hand over the last samples and the summary, and wait for the process, within bounds.
+
+        Args:
+            summary: content of `summary.json`, or None.
+
+        Returns:
+            `status`, with what was lost until the very end.
+        """
+        try:
+            self._feed.flush(END_TIMEOUT_S)
+            taken, dropped = self._feed.taken, self._feed.dropped
+            self._feed.put(_END + (summary or "").encode())
+            self._feed.flush(END_TIMEOUT_S)
+            self._feed.taken, self._feed.dropped = taken, max(dropped, self._feed.dropped - 1)
+            self._feed.close()
+            self._wait()
+        finally:
+            self.kill()
+        return self.status()
+
+    def _wait(self) -> None:
+        """Until the process has said its last, or its time is up."""
+        deadline = elapsed_ns() + round(END_TIMEOUT_S * 1e9)
+        while (left := (deadline - elapsed_ns()) * 1e-9) > 0:
+            if not self._listen(left):
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(max(left, 0.1))
+                break
+        if self._received is None and self._error is None:
+            code = self._process.poll()
+            self._error = self._last_words() or (
+                f"did not end within {END_TIMEOUT_S:g} s" if code is None else f"ended with status {code}"
+            )
+
+    def kill(self) -> None:
+        """Make sure that nothing is left of the process. Twice is allowed."""
+        self._feed.close()
+        if self._process.poll() is None:
+            self._process.kill()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(KILL_TIMEOUT_S)
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+    def _last_words(self) -> str:
+        self._errors.seek(0)
+        lines = self._errors.read().decode(errors="replace").strip().splitlines()
+        return lines[-1] if lines else ""

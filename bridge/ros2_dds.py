@@ -1,0 +1,154 @@
+"""Live ROS 2 topics without ROS: Cyclone DDS with ROS's names, types, hashes and quality of service; commands back.
+
+Topics carry the bytes of the one encoder. Commands are taken only where `[bridge] ros2_commands` says so:
+`/canprobe/start` and `/canprobe/stop` (std_msgs/Empty), `/canprobe/target_force` in N and `/canprobe/speed` in m/s
+(std_msgs/Float64). Each is answered on `/canprobe/status`; one that the scene's own limits forbid is refused there.
+
+Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash=…;` in USER_DATA), rmw_cyclonedds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Any
+
+from cyclonedds.core import DDSException, Policy, Qos
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter, Publisher
+from cyclonedds.sub import DataReader, Subscriber
+from cyclonedds.topic import Topic as DdsTopic
+from cyclonedds.util import duration
+
+from canprobe.bridge.cdr import Encoder
+from canprobe.bridge.limits import refuse
+from canprobe.bridge.messages import Messages
+from canprobe.bridge.ros2_types import DdsTypes
+from canprobe.bridge.sample import Sample
+from canprobe.bridge.sink import Context
+from canprobe.bridge.topics import TOPICS, Topic
+
+EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
+START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)
+FORCE, SPEED = Topic("/canprobe/target_force", FLOAT64), Topic("/canprobe/speed", FLOAT64)
+STATUS = Topic("/canprobe/status", STRING, depth=10, transient=True)
+COMMANDS = {START: "start", STOP: "stop", FORCE: "target_force_n", SPEED: "speed_m_s"}
+POLL_SAMPLES = 8
+"""Commands are looked for every so many samples."""
+LOOPBACK = """\
+<CycloneDDS><Domain Id="any">
+<General><Interfaces><NetworkInterface address="127.0.0.1"/></Interfaces>
+<AllowMulticast>false</AllowMulticast></General>
+<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>32</MaxAutoParticipantIndex>
+<Peers><Peer Address="127.0.0.1"/></Peers></Discovery>
+</Domain></CycloneDDS>"""
+"""One machine, without multicast: as ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST."""
+
+
+class Ros2Node:
+    """A participant with writers and readers that ROS 2 takes for its own.
+
+    Args:
+        domain: ROS_DOMAIN_ID.
+        loopback: stay on this machine; otherwise as Cyclone is configured (`CYCLONEDDS_URI`).
+        encoder: the one encoder.
+    """
+
+    def __init__(self, domain: int, loopback: bool, encoder: Encoder) -> None:
+        self.types = DdsTypes(encoder)
+        self._encoder = encoder
+        self._domain = Domain(domain, LOOPBACK) if loopback else None
+        self.participant = DomainParticipant(domain)
+        self._publisher = Publisher(self.participant)
+        self._subscriber = Subscriber(self.participant)
+
+    def writer(self, topic: Topic) -> Any:
+        """A writer of `rt/…` with the topic's quality of service."""
+        return DataWriter(self._publisher, self._dds_topic(topic), qos=self._qos(topic, _AUTODISPOSE))
+
+    def reader(self, topic: Topic) -> Any:
+        """A reader of `rt/…` with the topic's quality of service."""
+        return DataReader(self._subscriber, self._dds_topic(topic), qos=self._qos(topic))
+
+    def _dds_topic(self, topic: Topic) -> Any:
+        return DdsTopic(self.participant, f"rt{topic.name}", self.types.of(topic.type_name))
+
+    def _qos(self, topic: Topic, *more: Any) -> Any:
+        reliable = Policy.Reliability.Reliable(max_blocking_time=duration(milliseconds=100))
+        return Qos(
+            Policy.Reliability.BestEffort if topic.best_effort else reliable,
+            Policy.Durability.TransientLocal if topic.transient else Policy.Durability.Volatile,
+            Policy.History.KeepLast(topic.depth),
+            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.Userdata(f"typehash={self._encoder.type_hash(topic.type_name)};".encode()),
+            *more,
+        )
+
+
+_AUTODISPOSE = Policy.WriterDataLifecycle(autodispose=False)
+
+
+class Ros2Sink:
+    """Publishes one run, and takes commands where the scene allows them.
+
+    Args:
+        context: of the run.
+    """
+
+    def __init__(self, context: Context) -> None:
+        settings, encoder = context.settings, Encoder()
+        self._plan = context.plan
+        self._send = context.send
+        self._encoder = encoder
+        self._node = Ros2Node(settings.ros2_domain, settings.ros2_loopback, encoder)
+        self._writers = {topic.name: self._node.writer(topic) for topic in TOPICS}
+        self._messages = Messages(context.plan, encoder, self._is_read)
+        self._readers = {topic: self._node.reader(topic) for topic in COMMANDS} if settings.ros2_commands else {}
+        self._status = self._node.writer(STATUS) if settings.ros2_commands else None
+        self._poll_in = 0
+        self.where = f"domain {settings.ros2_domain}{', this machine only' if settings.ros2_loopback else ''}"
+
+    def start(self, epoch_ns: int) -> None:
+        """Take the epoch."""
+        self._messages.epoch_ns = epoch_ns
+
+    def write(self, sample: Sample) -> None:
+        """Publish a sample's messages; now and then look for commands."""
+        for topic, t_ns, data in self._messages.of(sample):
+            self._writers[topic.name].write(self._node.types.carry(topic.type_name, data), t_ns)
+        self._poll_in -= 1
+        if self._poll_in <= 0 and self._readers:
+            self._poll_in = POLL_SAMPLES
+            for topic, reader in self._readers.items():
+                for message in reader.take(N=10):
+                    self._command(topic, getattr(message, "data", None))
+
+    def close(self, summary: str | None) -> None:
+        """Let the last messages arrive; the domain is left with the last reference, that is with this process."""
+        for topic in TOPICS:
+            if not topic.best_effort:
+                with contextlib.suppress(DDSException, AttributeError):  # the latter is its time-out in 11.0.1
+                    self._writers[topic.name].wait_for_acks(duration(milliseconds=100))
+        self._writers.clear()
+        self._readers.clear()
+
+    def _is_read(self, topic: Topic) -> bool:
+        """Nothing is made for a topic without a reader, unless one that comes later is to have it."""
+        return topic.transient or bool(self._writers[topic.name].get_matched_subscriptions())
+
+    def _command(self, topic: Topic, value: float | None) -> None:
+        kind = COMMANDS[topic]
+        why = refuse(self._plan, kind, value)
+        if why is None:
+            self._send({"request": {"kind": kind, "value": value}})
+        shown = kind if value is None else f"{kind} {value:g}"
+        self._say(f"{shown}: taken" if why is None else f"{shown}: refused: {why}")
+
+    def _say(self, text: str) -> None:
+        assert self._status is not None
+        cdr = self._encoder.encode(STRING, self._encoder.store.types[STRING](data=text))
+        self._status.write(self._node.types.carry(STRING, cdr))
+
+
+def open_sink(context: Context) -> Ros2Sink:
+    """Join the domain."""
+    return Ros2Sink(context)

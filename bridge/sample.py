@@ -1,0 +1,226 @@
+"""What every bridge is fed: one neutral sample of the cell, in SI units, with its time in nanoseconds.
+
+A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool, a
+message type or a bus. Frames are named as in `FRAME_NAMES`; z of the contact frame is the inward normal.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
+FRAME_NAMES = (BASE, "link_1", "link_2", "link_3", "link_4", "link_5", "link_6", FLANGE, PROBE, CONTACT)
+JOINT_NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Joints:
+    """The arm at the SYNC of the sample.
+
+    Attributes:
+        position: (6,) rad.
+        T_base_probe: (4, 4) probe's centre frame (z is the pole) to base, m; None in a scene without a probe.
+        age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
+        torque_permille: of each motor's rated torque (6,), as the drive tells it.
+        statuswords: CiA 402 statuswords (6,).
+    """
+
+    position: Array
+    T_base_probe: Array | None = None
+    age: tuple[int, ...] = ()
+    torque_permille: tuple[int, ...] = ()
+    statuswords: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TaxelImage:
+    """One frame of the tactile array.
+
+    Attributes:
+        t_ns: when it was sampled, on the clock of the samples.
+        counts: (16, 16) uint8, row by row; zero outside the window.
+        window: (row, column) of the first taxel of an 8×8 window, None where the whole image came.
+        overload: a taxel reached full scale.
+    """
+
+    t_ns: int
+    counts: NDArray[np.uint8]
+    window: tuple[int, int] | None = None
+    overload: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Wrench:
+    """What the object does to the probe, expressed in the probe's centre frame.
+
+    The array feels pressure only: the force runs along the contact normal, without a torque about the sphere's centre.
+
+    Attributes:
+        t_ns: when the array was sampled.
+        force: (3,) N.
+        torque: (3,) N m.
+    """
+
+    t_ns: int
+    force: Array
+    torque: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ContactFrame:
+    """Where the probe touches.
+
+    Attributes:
+        t_ns: when the array was sampled.
+        T_base_contact: (4, 4) contact frame to base, m: origin at the contact point, z along the inward normal.
+        force: magnitude, N.
+    """
+
+    t_ns: int
+    T_base_contact: Array
+    force: float
+
+    @property
+    def point(self) -> Array:
+        """(3,) contact point, base frame, m."""
+        return self.T_base_contact[:3, 3]
+
+    @property
+    def normal(self) -> Array:
+        """(3,) outward unit normal of the object, base frame."""
+        return -self.T_base_contact[:3, 2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SurfacePatch:
+    """A new answer of the estimator in the loop: the surface round the contact, z = ½ (x, y) K (x, y)ᵀ.
+
+    Attributes:
+        t_ns: of the cycle that got it.
+        T_base_contact: (4, 4) the estimate's contact frame to base, m; z is the inward normal.
+        K: (2, 2) curvature in that frame, 1/m, positive where convex.
+        covariance: (3, 3) of (K11, K12, K22), 1/m²; not finite where not observed.
+        observed: of each principal curvature (κ1 ≥ κ2).
+    """
+
+    t_ns: int
+    T_base_contact: Array
+    K: Array
+    covariance: Array
+    observed: tuple[bool, bool]
+
+    @property
+    def kappa(self) -> tuple[float, float]:
+        """Principal curvatures κ1 ≥ κ2, 1/m; NaN where not observed."""
+        if not np.isfinite(self.K).all():
+            return (np.nan, np.nan)
+        low, high = np.linalg.eigvalsh(self.K).tolist()
+        return (high if self.observed[0] else np.nan, low if self.observed[1] else np.nan)
+
+    def heights(self, x: Array, y: Array) -> tuple[Array, Array]:
+        """The surface over points of its tangent plane.
+
+        Args:
+            x, y: coordinates in the contact frame, any shape, m.
+
+        Returns:
+            z towards the object's inside and its standard deviation, each of that shape, m. Where the curvature is not
+            known the surface is taken as flat, with an infinite deviation away from the contact.
+        """
+        weights = np.stack([0.5 * x * x, x * y, 0.5 * y * y], axis=-1)
+        K = self.K if np.isfinite(self.K).all() else np.zeros((2, 2))
+        z: Array = weights @ np.array([K[0, 0], K[0, 1], K[1, 1]])
+        if np.isfinite(self.covariance).all():
+            variance = np.einsum("...i,ij,...j->...", weights, self.covariance, weights)
+            return z, np.sqrt(np.maximum(variance, 0.0))
+        return z, np.where(weights.any(axis=-1), np.inf, 0.0)
+
+    def grid(self, radius: float = 8e-3, n: int = 17) -> tuple[Array, Array]:
+        """A disc of points of the patch.
+
+        Args:
+            radius: of the disc, m.
+            n: points along a diameter.
+
+        Returns:
+            Points (m, 3) in the base frame, and the standard deviation of each along the normal (m,), m.
+        """
+        line = np.linspace(-radius, radius, n)
+        x, y = (axis.ravel() for axis in np.meshgrid(line, line))
+        inside = x * x + y * y <= radius * radius * (1 + 1e-9)
+        x, y = x[inside], y[inside]
+        z, sigma = self.heights(x, y)
+        points = np.stack([x, y, z], axis=1) @ self.T_base_contact[:3, :3].T + self.T_base_contact[:3, 3]
+        return points, sigma
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """One frame that was on the bus.
+
+    Attributes:
+        t_ns: when, on the clock of the samples.
+        can_id: 11 or 29 bits.
+        data: up to 8 bytes; up to 64 in CAN FD.
+        extended: the identifier has 29 bits.
+        remote: a remote request.
+    """
+
+    t_ns: int
+    can_id: int
+    data: bytes
+    extended: bool = False
+    remote: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnostic:
+    """The state of one thing that can be well or not.
+
+    Attributes:
+        name: of the thing, such as `node 3 (joint 3)`.
+        level: 0 well, 1 worth a look, 2 failed, 3 silent.
+        message: one line.
+        values: (name, value) pairs as text, units in the name.
+    """
+
+    name: str
+    level: int
+    message: str
+    values: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sample:
+    """What was new in one cycle.
+
+    Attributes:
+        t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
+        cycle: its number; None before the first cycle and after the last.
+        phase: of the task in lower case (`approach`, `scan`, …); None where the controller tells none.
+        joints: the arm; None without one, or before all joints were heard.
+        taxels: a tactile frame that became usable in this cycle.
+        wrench: what it says of the force.
+        contact: where it was felt; None without contact, or without an arm.
+        patch: a new answer of the estimator.
+        frames: what was on the bus since the sample before.
+        diagnostics: of all nodes and of the bridge, about once a second.
+        dropped: samples that were lost on the way to this bridge so far.
+    """
+
+    t_ns: int
+    cycle: int | None = None
+    phase: str | None = None
+    joints: Joints | None = None
+    taxels: TaxelImage | None = None
+    wrench: Wrench | None = None
+    contact: ContactFrame | None = None
+    patch: SurfacePatch | None = None
+    frames: tuple[CanFrame, ...] = ()
+    diagnostics: tuple[Diagnostic, ...] = ()
+    dropped: int = 0

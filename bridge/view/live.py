@@ -1,0 +1,91 @@
+"""The bridge `view`: the cell in a browser while it runs."""
+
+from __future__ import annotations
+
+from collections import deque
+from contextlib import ExitStack
+
+import numpy as np
+
+from canprobe.bridge.sample import Sample
+from canprobe.bridge.sink import Context
+from canprobe.bridge.view.curves import NAMES, Curves, row_of
+from canprobe.bridge.view.moments import Follower, Moment
+from canprobe.bridge.view.panel import Panel
+from canprobe.bridge.view.path_nodes import GrowingPath
+from canprobe.bridge.view.server import address, open_server
+from canprobe.bridge.view.stage import Stage
+from canprobe.bridge.view.trail import Trail, error_scale, true_kappa
+from canprobe.bus.clock import MonotonicClock
+from canprobe.scene_geometry import true_object
+
+FRAME_NS, PLOT_NS = 40_000_000, 250_000_000
+"""Time on the wall between two pictures, and between two drawings of the plots."""
+ROW_S, WINDOW_S = 0.05, 30.0
+"""Time between two points of a plot, and how much of the past it shows."""
+
+
+class LiveView:
+    """A sink of samples that shows the newest of them, as often as a browser wants to see it.
+
+    Args:
+        context: the plan, and where to listen.
+    """
+
+    def __init__(self, context: Context) -> None:
+        scene, settings = context.plan.scene, context.settings
+        shape = None if scene.object is None else true_object(scene.object)
+        errors = error_scale(shape)
+        self._stack = ExitStack()
+        server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
+        self._address = address(server)
+        self._stage = Stage(server, scene)
+        self._panel = Panel(server, scene, errors, true_kappa(shape))
+        self._trail = Trail()
+        self._path = GrowingPath(server.scene, self._trail, errors)
+        self._follower = Follower(shape)
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
+        self._clock = MonotonicClock()
+        self._frame_ns = self._plot_ns = 0
+
+    @property
+    def where(self) -> str:
+        """Its address."""
+        return self._address
+
+    def start(self, epoch_ns: int) -> None:
+        """Nothing to do: times are shown from the opening of the bus."""
+
+    def write(self, sample: Sample) -> None:
+        """Take one sample; now and then show where the cell is."""
+        moment = self._follower.take(sample)
+        if sample.contact is not None and moment.phase != "approach":
+            value = moment.error if self._follower.shape is not None else moment.sigma
+            self._trail.add(moment.t_s, sample.contact.point, sample.contact.normal, value)
+        if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
+            self._rows.append(row_of(moment))
+        now_ns = self._clock.now_ns()
+        if now_ns - self._frame_ns >= FRAME_NS:
+            self._frame_ns = now_ns
+            self._show(moment, now_ns)
+
+    def _show(self, moment: Moment, now_ns: int) -> None:
+        curves = None
+        if now_ns - self._plot_ns >= PLOT_NS:
+            self._plot_ns = now_ns
+            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
+            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.refresh()
+            self._panel.show(moment, curves)
+
+    def close(self, summary: str | None) -> None:
+        """Take the page away."""
+        self._show(self._follower.moment, self._plot_ns + PLOT_NS)
+        self._stack.close()
+
+
+def open_sink(context: Context) -> LiveView:
+    """The bridge `view`."""
+    return LiveView(context)

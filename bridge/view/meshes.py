@@ -1,0 +1,167 @@
+"""Triangle meshes as plain arrays: prisms with rounded rims, solids of revolution, grids.
+
+Faces wind counter-clockwise seen from outside. Vertices are doubled at edges, so that smooth shading stops there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Faces = NDArray[np.int64]
+
+SECTORS = 48
+Circle = tuple[tuple[float, float], float]
+"""Centre (x, y) and radius, m."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (n, 3) m.
+        faces: (m, 3) indices into them.
+    """
+
+    vertices: Array
+    faces: Faces
+
+    def moved(self, T: Array) -> Mesh:
+        """The mesh carried by a transform (4, 4)."""
+        return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
+
+    @property
+    def volume(self) -> float:
+        """Enclosed volume of a closed mesh, m³; negative where it is inside out."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def merged(meshes: Iterable[Mesh]) -> Mesh:
+    """Several meshes as one."""
+    vertices: list[Array] = []
+    faces: list[Faces] = []
+    count = 0
+    for mesh in meshes:
+        vertices.append(mesh.vertices)
+        faces.append(mesh.faces + count)
+        count += len(mesh.vertices)
+    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+
+
+def grid(points: ArrayLike) -> Mesh:
+    """A sheet through a grid of points.
+
+    Args:
+        points: (rows, columns, 3); the front side is that of rows × columns directions.
+    """
+    p = np.asarray(points, dtype=np.float64)
+    rows, columns = p.shape[:2]
+    index = np.arange(rows * columns).reshape(rows, columns)
+    a, b, c, d = (x.ravel() for x in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return Mesh(p.reshape(-1, 3), faces)
+
+
+def prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
+    """A closed body along z from outlines at rising heights: walls between them, flat ends.
+
+    Args:
+        rings: (outline (n, 2) m, counter-clockwise and convex; height m), all of one n, with increasing height.
+    """
+    outlines = [np.column_stack([outline, np.full(len(outline), z)]) for outline, z in rings]
+    closed = [np.vstack([ring, ring[:1]]) for ring in outlines]
+    # a wall seen from outside: round the outline first, then up
+    walls = [grid(np.stack([low, high], axis=1)) for low, high in pairwise(closed)]
+    return merged([*walls, _fan(outlines[0][::-1]), _fan(outlines[-1])])
+
+
+def _fan(ring: Array) -> Mesh:
+    """A convex flat face round its middle."""
+    n = len(ring)
+    around = np.arange(n)
+    faces = np.stack([np.full(n, n), around, (around + 1) % n], axis=1)
+    return Mesh(np.vstack([ring, ring.mean(axis=0)]), faces)
+
+
+def link_outline(first: Circle, second: Circle, sectors: int = SECTORS) -> Array:
+    """Outline of a link seen along its joint axes: two circles and their common tangents, (sectors + 2, 2).
+
+    Args:
+        first, second: where the axes pass and the radii round them; where one lies in the other, the larger radius
+            round the first centre.
+        sectors: even number of points on the two arcs together.
+    """
+    (a, r0), (b, r1) = first, second
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    length = math.hypot(dx, dy)
+    if length <= abs(r0 - r1):
+        r0 = r1 = max(r0, r1)
+        b, length = a, 0.0
+    heading = math.atan2(dy, dx) if length else 0.0
+    spread = math.acos((r0 - r1) / length) if length else math.pi / 2
+    near = np.linspace(heading - spread, heading + spread, sectors // 2 + 1)
+    far = np.linspace(heading + spread, heading + 2 * math.pi - spread, sectors // 2 + 1)
+    return np.concatenate([_arc(b, r1, near), _arc(a, r0, far)])
+
+
+def _arc(centre: tuple[float, float], radius: float, angles: Array) -> Array:
+    points: Array = centre + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    return points
+
+
+def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 0.0) -> Mesh:
+    """A link between two parallel joint axes along z, its rims rounded off.
+
+    Args:
+        first, second: where the axes pass (x, y) and the radii round them, m.
+        span: its two flat sides, lower first, m.
+        rim: radius of the rounding, m, below both radii and half the thickness.
+    """
+    (a, r0), (b, r1) = first, second
+    low, high = span
+    steps = [0.0] if rim <= 0.0 else [math.radians(angle) for angle in (0.0, 22.5, 45.0, 67.5, 90.0)]
+    inset = [rim * (1.0 - math.sin(angle)) for angle in steps] if rim > 0.0 else [0.0]
+    rise = [rim * (1.0 - math.cos(angle)) for angle in steps]
+    outlines = [link_outline((a, r0 - i), (b, r1 - i)) for i in inset]
+    below = [(outline, low + z) for outline, z in zip(outlines, rise, strict=True)]
+    above = [(outline, high - z) for outline, z in zip(outlines, rise, strict=True)][::-1]
+    return prism([*below, *above])
+
+
+def cylinder(radius: float, span: tuple[float, float], rim: float = 0.0) -> Mesh:
+    """A round cylinder along z; see :func:`link`."""
+    return link(((0.0, 0.0), radius), ((0.0, 0.0), radius), span, rim)
+
+
+def revolved(profile: ArrayLike, sectors: int = SECTORS) -> Mesh:
+    """A surface of revolution about z.
+
+    Args:
+        profile: (n, 2) rows (distance from the axis, height), m; the outside lies to its right.
+        sectors: round the axis.
+    """
+    p = np.asarray(profile, dtype=np.float64)
+    angles = np.linspace(0.0, 2.0 * math.pi, sectors + 1)
+    x, y = np.outer(np.cos(angles), p[:, 0]), np.outer(np.sin(angles), p[:, 0])
+    return grid(np.stack([x, y, np.broadcast_to(p[:, 1], x.shape)], axis=-1))
+
+
+def dome(radius: float, opening_rad: float, rings: int = 24, sectors: int = SECTORS) -> Mesh:
+    """The part of a sphere round its pole (+z), centre at the origin.
+
+    Args:
+        radius: m.
+        opening_rad: angle from the pole to the rim; π for the whole sphere.
+        rings: from the rim to the pole.
+        sectors: round the pole.
+    """
+    angle = np.linspace(opening_rad, 0.0, rings + 1)
+    return revolved(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]), sectors)

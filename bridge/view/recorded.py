@@ -1,0 +1,189 @@
+"""A folder that `canprobe run` wrote → what there is to show, instant by instant."""
+
+from __future__ import annotations
+
+import json
+import math
+import zipfile
+from bisect import bisect_right
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge.sample import ContactFrame, SurfacePatch
+from canprobe.bridge.view.meshes import Array
+from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigma
+from canprobe.bridge.view.recorded_taxels import read_taxels
+from canprobe.cell.tasks.touch import Phase
+from canprobe.errors import UsageError
+from canprobe.results import SCHEMA
+from canprobe.scene import Scene
+from canprobe.scene_geometry import true_object
+from canprobe.scene_loader import load_scene
+from canprobe.touch.frames import tangent_rotation
+
+_SHAPES: dict[str, tuple[int, ...]] = {
+    "t_s": (),
+    "q_rad": (6,),
+    "phase": (),
+    "force_n": (),
+    "contact_mm": (3,),
+    "normal": (3,),
+    "kappa_per_m": (2,),
+    "T_base_contact_m": (4, 4),
+    "K_per_m": (2, 2),
+    "K_covariance_per_m2": (3, 3),
+}
+"""Columns of ``log.npz`` that are shown, and the shape of a row."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RecordedRun:
+    """What is shown of a run.
+
+    Attributes:
+        scene: as resolved.
+        title: of the scene.
+        log: the columns of `_SHAPES` that the run has; every row one cycle.
+        answers: rows at which the estimator gave a new answer.
+        patches: the answers.
+        errors, sigmas: of each answer, 1/m, as in `Moment`.
+        taxels: (t_s, (16, 16) counts) of each tactile frame.
+    """
+
+    scene: Scene
+    title: str
+    log: dict[str, Array]
+    answers: NDArray[np.int64]
+    patches: tuple[SurfacePatch, ...]
+    errors: Array
+    sigmas: Array
+    taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Time of the last cycle, s."""
+        return float(self.log["t_s"][-1])
+
+    def times(self, step_s: float) -> Array:
+        """Instants at an even distance from the first cycle to the last, s."""
+        start = float(self.log["t_s"][0])
+        return np.append(np.arange(start, self.duration_s - 1e-9, step_s), self.duration_s)
+
+    def at(self, t_s: float) -> Moment:
+        """What the cell knew at an instant."""
+        log = self.log
+        row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
+        answer = int(np.searchsorted(self.answers, row, side="right")) - 1
+        frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
+        return Moment(
+            t_s=float(log["t_s"][row]),
+            phase=self._phase(row),
+            q=log["q_rad"][row] if "q_rad" in log and np.isfinite(log["q_rad"][row]).all() else None,
+            contact=self._contact(row),
+            patch=self.patches[answer] if answer >= 0 else None,
+            taxels=self.taxels[frame][1] if frame >= 0 else None,
+            force=float(log["force_n"][row]) if "force_n" in log else math.nan,
+            error=float(self.errors[answer]) if answer >= 0 else math.nan,
+            sigma=float(self.sigmas[answer]) if answer >= 0 else math.nan,
+        )
+
+    def _phase(self, row: int) -> str | None:
+        value = self.log["phase"][row] if "phase" in self.log else math.nan
+        return Phase(int(value)).name.lower() if math.isfinite(value) else None
+
+    def _contact(self, row: int) -> ContactFrame | None:
+        if "contact_mm" not in self.log or not np.isfinite(self.log["contact_mm"][row]).all():
+            return None
+        T = np.eye(4)
+        T[:3, :3] = tangent_rotation(-self.log["normal"][row])
+        T[:3, 3] = self.log["contact_mm"][row] * 1e-3
+        t_ns = round(float(self.log["t_s"][row]) * 1e9)
+        return ContactFrame(t_ns, T, float(self.log["force_n"][row]))
+
+
+def read_run(folder: Path) -> RecordedRun:
+    """Read what is shown of a run.
+
+    Args:
+        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``bus.log``.
+
+    Raises:
+        UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should
+            be; with the file's name.
+        SceneError: a scene that cannot be loaded.
+    """
+    if not folder.is_dir():
+        raise UsageError(f"{folder}: no such folder; expected one that `canprobe run --out DIR` wrote")
+    for name in ("scene.toml", "log.npz"):
+        if not (folder / name).is_file():
+            raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
+    _check_schema(folder / "summary.json")
+    scene = load_scene(folder / "scene.toml")
+    log = _read_log(folder / "log.npz")
+    answers, patches = _answers(log)
+    shape = None if scene.object is None else true_object(scene.object)
+    errors = [math.nan if shape is None else curvature_error(patch, shape) for patch in patches]
+    taxels = read_taxels(folder / "bus.log", scene) if scene.sensor is not None else ()
+    return RecordedRun(
+        scene, scene.title or scene.name, log, answers, patches, np.array(errors),
+        np.array([curvature_sigma(patch) for patch in patches]), taxels,
+    )  # fmt: skip
+
+
+def _check_schema(file: Path) -> None:
+    if not file.is_file():
+        return
+    try:
+        summary = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{file}: expected the summary of a run; cannot be read: {error}") from error
+    found = summary.get("schema") if isinstance(summary, dict) else None
+    if found != SCHEMA:
+        raise UsageError(f"{file}: expected schema {SCHEMA}, got {found!r}; run the scene again with this canprobe")
+
+
+def _read_log(file: Path) -> dict[str, Array]:
+    try:
+        with file.open("rb") as opened:  # numpy leaves a file open that it cannot read
+            saved = np.load(opened, allow_pickle=False)
+            if isinstance(saved, np.ndarray):
+                raise UsageError(f"{file}: expected the log of a run, got a single array")
+            log = {name: saved[name] for name in saved.files if name in _SHAPES}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{file}: expected the log of a run; cannot be read: {error}") from error
+    rows = len(log["t_s"]) if "t_s" in log and log["t_s"].ndim else 0
+    if rows == 0:
+        raise UsageError(f"{file}: expected a column 't_s' with a row for each cycle, got none")
+    for name, values in log.items():
+        if values.shape != (rows, *_SHAPES[name]) or values.dtype.kind != "f":
+            raise UsageError(
+                f"{file}: {name}: expected floats of shape {(rows, *_SHAPES[name])}, got {values.dtype} of"
+                f" {values.shape}"
+            )
+    return log
+
+
+def _answers(log: dict[str, Array]) -> tuple[NDArray[np.int64], tuple[SurfacePatch, ...]]:
+    """Rows at which the estimate changed, and the estimates; the log repeats each until the next."""
+    if "K_per_m" not in log or "T_base_contact_m" not in log:
+        return np.empty(0, np.int64), ()
+    key = np.concatenate([log[name].reshape(len(log["t_s"]), -1) for name in ("T_base_contact_m", "K_per_m")], axis=1)
+    known = np.isfinite(log["T_base_contact_m"]).all(axis=(1, 2))
+    new = np.append(True, (key[1:] != key[:-1]).any(axis=1)) & known
+    rows = np.nonzero(new)[0]
+    return rows, tuple(_patch(log, int(row)) for row in rows)
+
+
+def _patch(log: dict[str, Array], row: int) -> SurfacePatch:
+    unknown = np.full((3, 3), np.nan)
+    observed = np.isfinite(log["kappa_per_m"][row]) if "kappa_per_m" in log else (True, True)
+    return SurfacePatch(
+        t_ns=round(float(log["t_s"][row]) * 1e9),
+        T_base_contact=log["T_base_contact_m"][row],
+        K=log["K_per_m"][row],
+        covariance=log["K_covariance_per_m2"][row] if "K_covariance_per_m2" in log else unknown,
+        observed=(bool(observed[0]), bool(observed[1])),
+    )

@@ -1,0 +1,192 @@
+"""The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge.transforms import quaternion_of
+from canprobe.bridge.view.arm import arm_parts, link_frames, probe_parts
+from canprobe.bridge.view.colours import UNKNOWN
+from canprobe.bridge.view.meshes import Array, Mesh
+from canprobe.bridge.view.moments import Moment
+from canprobe.bridge.view.objects import object_lines, object_mesh
+from canprobe.bridge.view.patch import disc_faces, disc_points, patch_shape
+from canprobe.bridge.view.taxels import taxel_colours, taxel_poses, tile
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene import Scene
+from canprobe.scene_geometry import T_flange_probe, true_object
+
+OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (78, 88, 104), (255, 150, 40), (250, 190, 40), (214, 40, 30)
+FORCE_M_PER_N = 0.02
+"""Length of the force arrow."""
+LEAST_FORCE_N = 0.05
+ALONE = (0.0, 0.0, 0.12)
+"""Where the probe stands, pole up, in a scene without an arm, m."""
+
+
+class Stage:
+    """All nodes of one scene on a viser server.
+
+    Args:
+        server: a `viser.ViserServer`, or a client handle; only its `scene` and `initial_camera` are used.
+        scene: which arm, probe and object.
+    """
+
+    def __init__(self, server: Any, scene: Scene) -> None:
+        self._api = server.scene
+        self._model = None if scene.arm is None else MODELS[scene.arm.model]
+        self._shape = None if scene.object is None else true_object(scene.object)
+        self._probe = None
+        self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
+        self._light()
+        if self._shape is not None:
+            self._add_object()
+        if self._model is not None:
+            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
+            for part in arm_parts(self._model):
+                self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
+        if scene.probe is not None:
+            self._add_probe(scene.probe.radius_mm * 1e-3, taxels=scene.sensor is not None)
+        self._add_contact()
+        self._look(server, scene)
+        self._drawn_patch: object = None
+
+    # building
+
+    def _add(self, name: str, mesh: Mesh, colour: tuple[int, int, int], **settings: Any) -> Any:
+        return self._api.add_mesh_simple(
+            name, mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32), color=colour, **settings
+        )
+
+    def _light(self) -> None:
+        api = self._api
+        api.configure_default_lights(enabled=False)
+        api.configure_environment_map(None)
+        api.add_light_hemisphere("/light/sky", sky_color=(255, 255, 255), ground_color=(176, 168, 156), intensity=1.6)
+        for name, place, intensity, shadow in (
+            ("sun", (-0.9, -1.2, 2.0), 2.2, True),
+            ("fill", (1.5, -0.4, 0.8), 0.9, False),
+        ):
+            api.add_light_directional(f"/light/{name}", position=place, intensity=intensity, cast_shadow=shadow)
+        api.add_grid(
+            "/floor", width=1.6, height=1.6, cell_size=0.05, section_size=0.2, cell_color=(226, 229, 233),
+            section_color=(200, 206, 212), plane_color=(247, 248, 250), plane_opacity=1.0, shadow_opacity=0.25,
+        )  # fmt: skip
+
+    def _add_object(self) -> None:
+        assert self._shape is not None
+        self._add("/object/ghost", object_mesh(self._shape), OBJECT, opacity=0.45, side="double", cast_shadow=False)
+        self._api.add_line_segments(
+            "/object/lines", object_lines(self._shape).astype(np.float32), (96, 116, 140), thickness=1.0,
+            thickness_units="screen",
+        )  # fmt: skip
+
+    def _add_probe(self, radius: float, *, taxels: bool) -> None:
+        self._probe = self._api.add_frame("/probe", show_axes=False, position=ALONE)
+        holder, elastic = probe_parts(radius, self._tool)
+        self._add("/probe/holder", holder, PROBE)
+        self._add("/probe/dome", elastic, (120, 128, 140), opacity=0.14, side="double", cast_shadow=False)
+        if taxels:
+            places, turns = taxel_poses(radius)
+            vertices, faces = tile()
+            blank = np.zeros(len(places), np.uint8)
+            self._taxels = self._api.add_batched_meshes_simple(
+                "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
+                batched_colors=taxel_colours(blank), batched_opacities=_opacities(blank), side="double",
+                cast_shadow=False, lod="off",
+            )  # fmt: skip
+        else:
+            self._taxels = None
+
+    def _add_contact(self) -> None:
+        api, xy = self._api, disc_points()
+        self._xy = xy
+        self._contact = api.add_frame(
+            "/contact", axes_length=0.03, axes_radius=0.0007, origin_radius=0.0014, visible=False
+        )
+        self._force = api.add_arrows(
+            "/force", np.zeros((1, 2, 3), np.float32), FORCE, shaft_radius=0.0018, head_radius=0.0045,
+            head_length=0.011, visible=False,
+        )  # fmt: skip
+        self._label = api.add_label("/force/label", "", anchor="bottom-center", visible=False)
+        self._patch = api.add_frame("/patch", show_axes=False, visible=False)
+        flat = Mesh(np.column_stack([xy, np.zeros(len(xy))]), disc_faces())
+        self._disc = self._add("/patch/surface", flat, PATCH, opacity=0.85, side="double", cast_shadow=False)
+        self._shells = [
+            self._add(f"/patch/{name}", flat, SHELL, opacity=0.28, side="double", cast_shadow=False)
+            for name in ("above", "below")
+        ]
+
+    def _look(self, server: Any, scene: Scene) -> None:
+        """From the side on which the arm hides nothing; close where something is touched."""
+        camera = server.initial_camera
+        if self._shape is not None or scene.task.kind in ("scan", "press"):
+            place = np.array(scene.task.start_mm) * 1e-3 if self._shape is None else self._shape.T_base_object[:3, 3]
+            target, away = place + np.array((0.0, 0.015, 0.035)), np.array((-0.35, 0.20, 0.18))
+        elif self._model is not None:
+            target, away = np.array((0.0, 0.0, 0.32)), np.array((-1.0, 0.55, 0.3))
+        else:
+            target, away = np.array(ALONE), np.array((-0.12, -0.16, 0.16))
+        camera.look_at, camera.position, camera.up = target, target + away, (0.0, 0.0, 1.0)
+        camera.fov = math.radians(38.0)
+
+    # showing
+
+    def show(self, moment: Moment) -> None:
+        """Move everything to a moment."""
+        if moment.q is not None and self._model is not None:
+            self._move_arm(moment.q)
+        if moment.taxels is not None and self._taxels is not None:
+            counts = moment.taxels.reshape(-1)
+            self._taxels.batched_colors = taxel_colours(counts)
+            self._taxels.batched_opacities = _opacities(counts)
+        self._show_contact(moment)
+        self._show_patch(moment)
+
+    def _move_arm(self, q: Array) -> None:
+        assert self._model is not None
+        frames = link_frames(self._model, q)
+        for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
+            _place(handle, T)
+        if self._probe is not None:
+            _place(self._probe, frames[6] @ self._tool)
+
+    def _show_contact(self, moment: Moment) -> None:
+        contact = moment.contact
+        pressed = contact is not None and moment.force > LEAST_FORCE_N
+        self._contact.visible = self._force.visible = self._label.visible = pressed
+        if not pressed or contact is None:
+            return
+        _place(self._contact, contact.T_base_contact)
+        tip = contact.point + FORCE_M_PER_N * moment.force * contact.normal
+        self._force.points = np.array([[contact.point, tip]], np.float32)
+        self._label.position = tuple(tip)
+        self._label.text = f"{moment.force:.2f} N"
+
+    def _show_patch(self, moment: Moment) -> None:
+        patch = moment.patch
+        self._patch.visible = patch is not None
+        if patch is None or patch is self._drawn_patch:
+            return
+        self._drawn_patch = patch
+        shape = patch_shape(patch, self._xy)
+        _place(self._patch, patch.T_base_contact)
+        self._disc.vertices = shape.surface.astype(np.float32)
+        self._disc.color = PATCH if all(patch.observed) else UNKNOWN
+        for handle, vertices in zip(self._shells, (shape.above, shape.below), strict=True):
+            handle.vertices = vertices.astype(np.float32)
+
+
+def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Taxels that feel nothing are hardly there."""
+    return np.where(counts > 0, 0.85, 0.04).astype(np.float32)
+
+
+def _place(handle: Any, T: Array) -> None:
+    x, y, z, w = quaternion_of(T[:3, :3])
+    handle.wxyz = (w, x, y, z)
+    handle.position = T[:3, 3]

@@ -1,0 +1,103 @@
+"""The process of one bridge: records from the cell on stdin, lines of JSON back on stdout.
+
+Back go `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or `{"error":
+text}` at any time. The end of stdin without a last record means that the cell is gone: the sink is closed all the same.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import marshal
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from canprobe.bridge.codec import unpack_observation
+from canprobe.bridge.feed import read_records
+from canprobe.bridge.sink import Context, Sink
+from canprobe.bridge.source import SampleSource
+from canprobe.errors import CanprobeError
+from canprobe.planning import make_plan
+from canprobe.planning.bridges import BRIDGES
+from canprobe.scene import BridgeSettings
+from canprobe.scene_loader import parse_scene
+
+NICE = 10
+"""Whatever a bridge computes, the cell and its nodes come first."""
+OBSERVATION, END = b"o"[0], b"e"[0]
+"""First byte of a record: what follows."""
+
+
+def run(name: str, records: Iterator[bytes], fd: int) -> int:
+    """Serve one bridge to the end of its records.
+
+    Args:
+        name: of the bridge.
+        records: the first is the configuration, the others are observations, the last may be the end.
+        fd: where lines are written back.
+
+    Returns:
+        The exit status: 0, or 1 after an error, which was written back.
+    """
+
+    def send(document: dict[str, object]) -> None:
+        os.write(fd, (json.dumps(document) + "\n").encode())
+
+    try:
+        context = _context(marshal.loads(next(records)), send)
+        sink: Sink = importlib.import_module(f"canprobe.bridge.{BRIDGES[name].module}").open_sink(context)
+        send({"ready": sink.where})
+        received = _serve(sink, SampleSource(context.plan), records)
+        send({"done": {"received": received, "where": sink.where}})
+    except BrokenPipeError:
+        return 1  # the cell is gone, and the sink is closed
+    except (CanprobeError, OSError) as error:
+        send({"error": str(error)})
+        return 1
+    except Exception as error:  # told to the cell in a line, to whoever looks for it in full
+        traceback.print_exc()
+        send({"error": repr(error)})
+        return 1
+    return 0
+
+
+def _context(config: dict[str, Any], send: Any) -> Context:
+    plan = make_plan(parse_scene(config["scene"]))
+    out = Path(config["out"]) if config["out"] is not None else None
+    return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
+
+
+def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> int:
+    received = 0
+    summary: str | None = None
+    started = False
+    for record in records:
+        body = record[1:]
+        if record[0] == END:
+            summary = body.decode() or None
+            break
+        if not started:
+            started = True
+            sink.start(int.from_bytes(body[:8], "little"))
+        sink.write(source.sample(unpack_observation(body[8:])))
+        received += 1
+    sink.close(summary)
+    return received
+
+
+def main() -> int:
+    """The process: Ctrl-C is for the cell, which ends this one by the end of its records."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICE)
+    fd = os.dup(1)
+    os.dup2(2, 1)  # what a library prints does not mix with the lines back
+    return run(sys.argv[1], read_records(sys.stdin.buffer), fd)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

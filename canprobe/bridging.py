@@ -1,0 +1,99 @@
+"""The bridges of a run: started before its bus is opened, fed by its cycles, ended after its summary.
+
+Nothing of `canprobe.bridge` is imported unless a bridge is asked for, and then by name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from canprobe.planning import Plan
+from canprobe.planning.bridges import check_bridges
+
+
+class Bridges:
+    """Every bridge that a scene asks for. A context manager: leaving ends those that are still there.
+
+    Args:
+        plan: of the run.
+        out: folder of the run; None where no files are written.
+        virtual: the run is not in real time.
+        say: called with where each bridge is to be found.
+
+    Attributes:
+        observers: what the cell has to feed, one a bridge.
+    """
+
+    def __init__(
+        self, plan: Plan, out: Path | None, *, virtual: bool, say: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self.observers: list[Any] = []
+        self._plan = plan
+        self._out = out
+        self._virtual = virtual
+        self._say = say
+        self._names = plan.scene.bridge.use if plan.scene.bridge is not None else ()
+
+    def __enter__(self) -> Bridges:
+        """Start every bridge.
+
+        Raises:
+            UsageError: one cannot be had, or could not begin; none is left.
+        """
+        if not self._names:
+            return self
+        check_bridges(self._names)
+        start = importlib.import_module("canprobe.bridge.process").BridgeProcess
+        try:
+            for name in self._names:
+                self.observers.append(start(name, self._plan, self._out, virtual=self._virtual))
+            for bridge in self.observers:
+                self._say(f"bridge {bridge.name}: {bridge.await_ready()}")
+        except BaseException:
+            self._kill()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end(None)
+
+    @property
+    def requests(self) -> tuple[Any, ...]:
+        """Where requests of other tools arrive; empty where none are allowed."""
+        settings = self._plan.scene.bridge
+        allowed = settings is not None and settings.ros2_commands
+        return tuple(bridge.requests for bridge in self.observers) if allowed else ()
+
+    def status(self) -> dict[str, dict[str, Any]] | None:
+        """What stands in the summary of each bridge; None without any."""
+        return {bridge.name: bridge.status() for bridge in self.observers} or None
+
+    def end(self, summary: dict[str, Any] | None) -> dict[str, dict[str, Any]] | None:
+        """Hand the summary to every bridge, and end them. Twice is allowed.
+
+        Returns:
+            Their status then, as `status`.
+        """
+        bridges, self.observers = self.observers, []
+        text = None if summary is None else json.dumps(summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n"
+        statuses: dict[str, dict[str, Any]] = {}
+        try:
+            while bridges:
+                bridge = bridges.pop(0)
+                statuses[bridge.name] = bridge.end(text)
+        finally:
+            for bridge in bridges:  # an interrupt has cut the end of one short
+                bridge.kill()
+        return statuses or None
+
+    def _kill(self) -> None:
+        for bridge in self.observers:
+            bridge.kill()
+        self.observers = []

@@ -1,0 +1,114 @@
+"""The CAN controllers on one timed bus: who has to wait, who is cut off, and when he comes back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from canprobe.bus.fault_confinement import ErrorCounters
+from canprobe.bus.lockstep import BusNode, LockstepPort
+from canprobe.bus.port import ControllerState
+from canprobe.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
+
+_RECESSIVE_BITS = 11
+_AFTER_ACK_BITS = (
+    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
+)
+
+
+class Controllers:
+    """Error counters of every node, and what follows from them. As long as no bit fails, nothing has to be asked.
+
+    Args:
+        bits_ns: time of so many bits.
+
+    Attributes:
+        troubled: somebody's counters are not 0.
+        suspended: error-passive nodes that must not start before this time after a frame of their own.
+    """
+
+    def __init__(self, bits_ns: Callable[[int], int]) -> None:
+        self.troubled = False
+        self.suspended: dict[BusNode, int] = {}
+        self._bits_ns = bits_ns
+        self._counters: dict[BusNode, ErrorCounters] = {}
+        self._quiet_ns = 0  # since when the wire has been recessive, less what was counted of it
+
+    def add(self, node: BusNode) -> None:
+        """A new node."""
+        self._counters[node] = ErrorCounters()
+
+    def remove(self, node: BusNode) -> None:
+        """A node that leaves."""
+        self.suspended.pop(node, None)
+        del self._counters[node]
+
+    def of(self, owner: object) -> ErrorCounters:
+        """Counters of a participant or a port.
+
+        Raises:
+            KeyError: it is not on the bus.
+        """
+        for node, counters in self._counters.items():
+            if node.owner is owner:
+                return counters
+        raise KeyError(owner)
+
+    def is_off(self, node: BusNode) -> bool:
+        """It is bus off: it neither sends nor hears."""
+        return self.troubled and bool(self._counters[node].outstanding)
+
+    def off(self) -> list[BusNode]:
+        """Who is bus off."""
+        return [node for node, counters in self._counters.items() if counters.outstanding]
+
+    def fail(self, sender: BusNode, end_ns: int) -> None:
+        """An error frame has ended at `end_ns`; everybody saw it."""
+        self.troubled = True
+        self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmit_error(acknowledge=len(self._counters) < 2)
+            else:
+                counters.receive_error()
+            if isinstance(node.owner, LockstepPort):
+                node.owner.counters.error_frames += 1
+        self._suspend(sender, end_ns)
+        self._tell()
+
+    def succeed(self, sender: BusNode, end_ns: int) -> None:
+        """A frame has ended at `end_ns`; only of interest while somebody is troubled."""
+        self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
+        for node, counters in self._counters.items():
+            if node is sender:
+                counters.transmitted()
+            elif not counters.outstanding:
+                counters.received()
+        self._suspend(sender, end_ns)
+        self._tell()
+        self.troubled = any(c.transmit or c.receive or c.outstanding for c in self._counters.values())
+
+    def hear_silence(self, until_ns: int) -> None:
+        """The wire has been recessive until now: nodes that are bus off count sequences of eleven such bits."""
+        sequence = self._bits_ns(_RECESSIVE_BITS)
+        count = (until_ns - self._quiet_ns) // sequence
+        self._quiet_ns += count * sequence
+        if any([counters.heard_recessive(count) for counters in self._counters.values()]):
+            self._tell()
+
+    def next_return_ns(self) -> int | None:
+        """When the next node that is bus off comes back, if the wire stays silent."""
+        least = min((c.outstanding for c in self._counters.values() if c.outstanding), default=None)
+        return None if least is None else self._quiet_ns + least * self._bits_ns(_RECESSIVE_BITS)
+
+    def _suspend(self, sender: BusNode, end_ns: int) -> None:
+        """After its own frame an error-passive node waits for eight bits more."""
+        if self._counters[sender].state is ControllerState.PASSIVE:
+            self.suspended[sender] = end_ns + self._bits_ns(INTERMISSION_BITS + SUSPEND_BITS)
+        else:
+            self.suspended.pop(sender, None)
+
+    def _tell(self) -> None:
+        """Ports show the state of their controller."""
+        for node, counters in self._counters.items():
+            if isinstance(node.owner, LockstepPort):
+                node.owner.state = counters.state

@@ -1,0 +1,97 @@
+"""Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
+
+SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+
+from canprobe.bus.clock import Clock
+from canprobe.bus.port import ControllerState, Frame, Port, PortCounters, TimedFrame
+
+_SLICE_NS = 200_000
+"""How long one bus is waited for before the others are looked at again."""
+
+
+class JoinedPort:
+    """A port on several buses.
+
+    Args:
+        ports: by channel; all on one clock.
+        routes: channel of each identifier that belongs to one bus alone.
+    """
+
+    def __init__(self, ports: Mapping[str, Port], routes: Mapping[int, str]) -> None:
+        self._ports = dict(ports)
+        self._routes = {can_id: self._ports[channel] for can_id, channel in routes.items()}
+        self._arrived: list[TimedFrame] = []
+
+    @property
+    def clock(self) -> Clock:
+        """The ports' clock."""
+        return next(iter(self._ports.values())).clock
+
+    @property
+    def channel(self) -> str:
+        """The channels."""
+        return "+".join(self._ports)
+
+    @property
+    def counters(self) -> PortCounters:
+        """What has passed through all of them."""
+        every = [port.counters for port in self._ports.values()]
+        return PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+
+    @property
+    def state(self) -> ControllerState:
+        """The worst of their controllers' states."""
+        return max(port.state for port in self._ports.values())
+
+    @property
+    def stamps_arrival(self) -> bool:
+        """Whether all of them do."""
+        return all(port.stamps_arrival for port in self._ports.values())
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send each frame on the bus of its identifier, or on all.
+
+        Raises:
+            InterfaceError: a bus is down, closed, lost or stays full.
+        """
+        for port in self._ports.values():
+            mine = [frame for frame in frames if self._routes.get(frame[0], port) is port]
+            if mine:
+                port.send_batch(mine, t_ns)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return every frame that has arrived on any bus, by time."""
+        self._take()
+        frames, self._arrived = self._arrived, []
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Return as soon as a frame is there on any bus, at `until_ns` at the latest."""
+        clock = self.clock
+        self._take()
+        while not self._arrived and clock.now_ns() < until_ns:
+            for port in self._ports.values():
+                port.wait(min(until_ns, clock.now_ns() + _SLICE_NS))
+                self._take()
+                if self._arrived:
+                    return
+
+    def close(self) -> None:
+        """Close all of them."""
+        for port in self._ports.values():
+            port.close()
+
+    def _take(self) -> None:
+        new = [frame for port in self._ports.values() for frame in port.drain()]
+        if new:
+            self._arrived = sorted([*self._arrived, *new], key=_time)
+
+
+def _time(frame: TimedFrame) -> int:
+    return frame[2]

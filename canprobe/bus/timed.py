@@ -1,0 +1,359 @@
+"""A lockstep bus with a bit rate: one frame at a time, each as long as its bits, the lowest identifier first.
+
+A frame that was queued while another is on the wire waits for its end; whoever has the lowest identifier when the bus
+is free again sends, to the end. Receivers get a frame with the last bit of its end-of-frame field; the next may follow
+after three bits of intermission. A frame that the wire corrupts ends in an error frame and is sent again; every
+controller counts errors as ISO 11898-1 has it, waits as an error-passive transmitter, and is cut off when it is bus off
+until it has heard 128 times eleven recessive bits.
+
+All of it in virtual time and deterministic, like the `LockstepBus`. Which of its frames a node sends first is its
+controller's: with `queue="priority"` the lowest identifier, as from mailboxes; with "fifo" the oldest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from heapq import heapify, heappop, heappush
+from typing import Literal
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.controllers import Controllers
+from canprobe.bus.fault_confinement import ErrorCounters
+from canprobe.bus.lockstep import BusNode, LockstepBus, LockstepPort, Participant, arbitration_key, name_of
+from canprobe.bus.port import Frame
+from canprobe.bus.wire_errors import WireErrors
+from canprobe.protocol.frame_bits import (
+    ERROR_DELIMITER_BITS,
+    ERROR_FLAG_BITS,
+    INTERMISSION_BITS,
+    exact_bits,
+)
+
+Queue = Literal["priority", "fifo"]
+LINGER_NS = 50_000_000
+"""How long a port that closes lets the bus carry what is queued, at most."""
+_NS = 1_000_000_000
+_RECESSIVE_BITS = 11
+_AFTER_ACK_BITS = (
+    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
+)
+_ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
+
+_Entry = tuple[int, int, BusNode, Frame]
+"""A frame that takes part in the arbitration: what the wire compares, order of queueing, sender, frame."""
+
+
+class TimedBus(LockstepBus):
+    """The bus itself; attach participants and take ports as of a `LockstepBus`.
+
+    Args:
+        clock: virtual time, possibly shared with other buses.
+        channel: the bus's name in messages and logs.
+        bitrate: bit/s.
+        queue: what a node with several frames sends first.
+        errors: where the wire fails; None: nowhere.
+        length: bits of a frame with its intermission, exact by default.
+        max_frames: frames that may wait at once before somebody is taken to send for ever.
+
+    Attributes:
+        errors: as above; another model may take its place while the bus runs.
+        frames, error_frames, busy_ns: so far; the time includes intermissions.
+    """
+
+    def __init__(
+        self,
+        clock: VirtualClock,
+        channel: str = "can0",
+        *,
+        bitrate: int = 1_000_000,
+        queue: Queue = "priority",
+        errors: WireErrors | None = None,
+        length: Callable[[int, bytes], int] = exact_bits,
+        max_frames: int = 20_000,
+    ) -> None:
+        super().__init__(clock, channel, max_frames=max_frames)
+        self.bitrate = bitrate
+        self._bit_ns = 0 if _NS % bitrate else _NS // bitrate  # 0: no whole number
+        self._gap_ns = self._bits_ns(INTERMISSION_BITS)
+        self.frames = self.error_frames = self.busy_ns = 0
+        self._fifo = queue == "fifo"
+        self.errors = errors
+        self._length = length
+        self._ready: list[_Entry] = []  # a heap
+        self._order = 0
+        self._flying: _Entry | None = None
+        self._planned: _Entry | None = None  # what flies next, unless something better is queued before
+        self._planned_end_ns = 0
+        self._hit = False
+        self._end_ns = self._free_ns = 0
+        self._since_ns = 0  # when the first of those who are ready queued its frame
+        self._controllers = Controllers(self._bits_ns)
+        self._stale = True  # the participants' deadlines have to be read again
+        self._first_due: int | None = None
+
+    # what is to be seen
+
+    def counters(self, owner: Participant | LockstepPort) -> ErrorCounters:
+        """Error counters of a participant or a port.
+
+        Raises:
+            KeyError: it is not on the bus.
+        """
+        if self._flying is None:
+            self._controllers.hear_silence(self.clock.now_ns())
+        return self._controllers.of(owner)
+
+    # time
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when the wire or a participant next has something to do."""
+        if self._stale or (self._flying is None and not self._ready):
+            self._first_due = super().next_deadline_ns()
+            self._stale = False
+        first = self._first_due
+        if self._flying is not None:
+            wire: int | None = self._end_ns
+        else:
+            wire = self._next_on_the_wire(first) if self._ready else None
+        if wire is not None and (first is None or wire < first):
+            first = wire
+        if self._controllers.troubled and self._flying is None:
+            back = self._controllers.next_return_ns()
+            if back is not None and (first is None or back < first):
+                first = back
+        return first
+
+    def _next_on_the_wire(self, first_due: int | None) -> int:
+        """When the next frame starts; or already when it ends, if until it starts nobody else can want to send.
+
+        Whoever calls for the next deadline lets time move on. What still comes before the start is taken in by then.
+        """
+        start = self._next_start()
+        unsure = self._controllers.troubled or self.errors is not None or len(self._nodes) < 2
+        if unsure or (first_due is not None and first_due <= start):
+            return start
+        entry = self._ready[0]
+        if entry is not self._planned:
+            self._planned = entry
+            self._planned_end_ns = start + self._bits_ns(self._length(*entry[3]) - INTERMISSION_BITS)
+        return self._planned_end_ns
+
+    def settle(self) -> None:
+        """Do what is due at the present instant: end of a frame, deadlines of participants, start of the next frame."""
+        if self._settling:
+            return
+        t_ns = self.clock.now_ns()
+        self._catch_up(t_ns)
+        self._settling = True
+        if self._stale:
+            self.next_deadline_ns()
+        rounds_left = self._max_frames
+        try:
+            while True:
+                if self._flying is not None and self._end_ns <= t_ns:
+                    self._finish()
+                    continue
+                due = self._first_due is not None and self._first_due <= t_ns
+                if not due and self._flying is None and self._ready and self._free_ns <= t_ns and self._start(t_ns):
+                    continue
+                if not due or not self._advance_due(t_ns):
+                    break
+                self._first_due = self._earliest()
+                rounds_left -= 1
+                if rounds_left < 0:
+                    raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
+            if self._controllers.troubled and self._flying is None:
+                self._controllers.hear_silence(t_ns)
+        finally:
+            self._settling = False
+
+    def _catch_up(self, t_ns: int) -> None:
+        """Start the frame that went on the wire before `t_ns`, while nobody looked."""
+        if self._flying is None and self._ready:
+            start = self._next_start()
+            if start >= t_ns:
+                return
+            if self._ready[0] is self._planned:
+                self._fly(heappop(self._ready), start, self._planned_end_ns)
+            else:
+                self._start(start)
+
+    def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
+        self._stale = True
+        self._queue(node, frames)
+        self.settle()
+
+    def _earliest(self) -> int | None:
+        dues = [node.due for node, _ in self._participants if node.due is not None]
+        return min(dues) if dues else None
+
+    def _bits_ns(self, bits: int) -> int:
+        return bits * self._bit_ns if self._bit_ns else -(-bits * _NS // self.bitrate)
+
+    # queues and arbitration
+
+    def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        if not frames or self._controllers.is_off(node):
+            return  # a controller that is bus off takes no part
+        if not self._settling:
+            self._catch_up(self.clock.now_ns())
+        for frame in frames:
+            self._check(node, frame)
+            if self._fifo and (node.outbox or self._is_ready(node)):
+                node.outbox.append(frame)
+            else:
+                self._compete(node, frame)
+        if len(self._ready) + len(node.outbox) > self._max_frames:
+            self._ready.clear()
+            raise self._endless(
+                self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {name_of(node.owner)}"
+            )
+
+    def _is_ready(self, node: BusNode) -> bool:
+        flying = self._flying
+        return (flying is not None and flying[2] is node) or any(entry[2] is node for entry in self._ready)
+
+    def _compete(self, node: BusNode, frame: Frame) -> None:
+        can_id = frame[0]
+        self._order += 1
+        if not self._ready:
+            self._since_ns = self.clock.now_ns()
+        heappush(self._ready, (can_id << 21 if can_id <= 0x7FF else arbitration_key(can_id), self._order, node, frame))
+
+    def _start(self, t_ns: int) -> bool:
+        """Let the winner of the arbitration send; False where all who want to have to wait."""
+        entry = self._winner(t_ns) if self._controllers.suspended else heappop(self._ready)
+        if entry is None:
+            return False
+        can_id, data = entry[3]
+        bits = self._length(can_id, data) - INTERMISSION_BITS
+        if self._controllers.troubled:
+            self._controllers.hear_silence(t_ns)
+        hit = None if self.errors is None else self.errors(can_id, data, bits)
+        if len(self._nodes) < 2:
+            hit = bits - 9  # the slot in which nobody acknowledges it
+        if hit is not None:
+            bits = hit + 1 + _ERROR_BITS
+        self._fly(entry, t_ns, t_ns + self._bits_ns(bits))
+        self._hit = hit is not None
+        return True
+
+    def _fly(self, entry: _Entry, start_ns: int, end_ns: int) -> None:
+        """Put a frame on the wire."""
+        self._flying, self._planned, self._hit = entry, None, False
+        self._end_ns = end_ns
+        self._free_ns = end_ns + self._gap_ns
+        self.busy_ns += self._free_ns - start_ns
+
+    def _winner(self, t_ns: int) -> _Entry | None:
+        """The winner among those who do not have to wait after a frame of their own."""
+        waiting = []
+        found = None
+        while self._ready and found is None:
+            entry = heappop(self._ready)
+            if self._controllers.suspended.get(entry[2], 0) > t_ns:
+                waiting.append(entry)
+            else:
+                found = entry
+        for entry in waiting:
+            heappush(self._ready, entry)
+        return found
+
+    def _next_start(self) -> int:
+        """When the next frame can start."""
+        start = max(self._free_ns, self._since_ns)
+        if self._controllers.suspended:
+            start = max(start, min(self._controllers.suspended.get(entry[2], 0) for entry in self._ready))
+        return start
+
+    # the end of a frame
+
+    def _finish(self) -> None:
+        """End what is on the wire: deliver it, or count its error and let it compete again."""
+        entry = self._flying
+        assert entry is not None
+        _, _, sender, frame = entry
+        t_ns, self._flying = self._end_ns, None
+        if self._hit:
+            self._fail(entry, t_ns)
+            return
+        self.frames += 1
+        if self._fifo and sender.outbox:
+            self._compete(sender, sender.outbox.popleft())
+        if self._controllers.troubled:
+            self._controllers.succeed(sender, t_ns)
+        self._hand_over(sender, frame, t_ns)
+
+    def _hand_over(self, sender: BusNode, frame: Frame, t_ns: int) -> None:
+        can_id, data = frame
+        if self.recorder is not None:
+            self.recorder(can_id, data, t_ns)
+        off = self._controllers.off() if self._controllers.troubled else ()
+        changed = False
+        listeners = sender.listeners.get(can_id)
+        for receive, receiver in self._listeners_of(sender, can_id) if listeners is None else listeners:
+            if off and receiver in off:
+                continue
+            answers = receive(can_id, data, t_ns)
+            due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
+            changed = changed or due != receiver.due
+            receiver.due = due
+            if answers:
+                self._queue(receiver, answers)
+        if changed:
+            self._first_due = self._earliest()
+        if off:
+            self._deliver_to_ports(sender, (can_id, data, t_ns), off)
+            return
+        stamped = (can_id, data, t_ns)
+        for put in sender.inboxes:
+            put(stamped)
+
+    def _deliver_to_ports(self, sender: BusNode, stamped: tuple[int, bytes, int], off: Sequence[BusNode]) -> None:
+        for node in self._nodes:
+            if node is not sender and node not in off and isinstance(node.owner, LockstepPort):
+                node.owner.inbox.append(stamped)
+
+    # errors
+
+    def _fail(self, entry: _Entry, t_ns: int) -> None:
+        """What was on the wire is lost: its sender tries again, unless that was once too often."""
+        self.error_frames += 1
+        sender = entry[2]
+        self._controllers.fail(sender, t_ns)
+        if self._controllers.is_off(sender):
+            self._silence(sender)
+        else:
+            heappush(self._ready, entry)
+
+    def _silence(self, node: BusNode) -> None:
+        """A node that is bus off loses what it wanted to say."""
+        node.outbox.clear()
+        self._ready = [entry for entry in self._ready if entry[2] is not node]
+        heapify(self._ready)
+
+    # who is there
+
+    def remove_port(self, port: LockstepPort) -> None:
+        """Take a closed port off the bus, after what it has sent is through, and what is answered at once."""
+        limit_ns = self.clock.now_ns() + LINGER_NS
+        while (self._flying is not None or self._ready) and self.clock.step(limit_ns):
+            pass
+        super().remove_port(port)
+
+    def _add(self, owner: Participant | LockstepPort) -> BusNode:
+        node = super()._add(owner)
+        self._controllers.add(node)
+        self._stale = True
+        return node
+
+    def _remove(self, owner: Participant | LockstepPort) -> None:
+        self._catch_up(self.clock.now_ns())
+        for node in [node for node in self._nodes if node.owner is owner]:
+            self._silence(node)
+            self._controllers.remove(node)
+            if self._flying is not None and self._flying[2] is node:
+                self._flying = None  # it falls silent in the middle of a frame
+        super()._remove(owner)
+        self._stale = True

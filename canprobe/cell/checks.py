@@ -1,0 +1,193 @@
+"""The checks of the table of conditions: each looks at the cell or the contact and names what is wrong, or says None.
+
+Pure: no clock, no port. The table is `canprobe.cell.conditions`.
+"""
+
+from __future__ import annotations
+
+from canprobe.bus.port import ControllerState
+from canprobe.cell.supervision import Contact, Seen
+from canprobe.cell.watch import EmcyEvent
+from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.protocol.cia402 import DriveState
+from canprobe.protocol.frames import NmtState
+
+# nodes
+
+
+def heartbeat_lost(seen: Seen) -> NodeError | None:
+    """A node has been silent for longer than its heartbeat's time-out."""
+    node_id = seen.watch.silent(seen.sync_ns)
+    return NodeError(node_id, "lost: no heartbeat within its time-out") if node_id is not None else None
+
+
+def not_operational(seen: Seen) -> NodeError | None:
+    """A node tells another NMT state than operational; a boot-up is one."""
+    node_id = seen.watch.not_in(NmtState.OPERATIONAL)
+    if node_id is None:
+        return None
+    return NodeError(node_id, f"left operation: NMT state {seen.watch.states[node_id].name}")
+
+
+def drive_not_enabled(seen: Seen) -> NodeError | None:
+    """A drive's statusword tells another state than operation enabled."""
+    drives = seen.drives
+    if drives is None or seen.measurement.enabled:
+        return None
+    i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
+    node_id = drives.axes[i].node_id
+    why = "".join(f"; {e}" for e in [e for e in seen.watch.alarms if e.node_id == node_id][-1:])
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
+
+
+def is_communication(event: EmcyEvent) -> bool:
+    """Whether an emergency is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
+    return event.emcy.code >> 8 in (0x81, 0x82)
+
+
+def device_emcy(seen: Seen) -> NodeError | None:
+    """A device reports an error of its own."""
+    alarms = seen.watch.alarms
+    for event in alarms[seen.first_alarm :] if len(alarms) > seen.first_alarm else ():
+        if not is_communication(event):
+            return NodeError(event.node_id, str(event).partition(": ")[2])
+    return None
+
+
+def communication_emcys(seen: Seen) -> int:
+    """Emergencies about frames."""
+    return sum(map(is_communication, seen.watch.alarms)) if seen.watch.alarms else 0
+
+
+def foreign_master(seen: Seen) -> SafetyStop | None:
+    """Somebody else sends what only a master sends."""
+    foreign = seen.watch.foreign
+    return SafetyStop(f"another master is on the bus: {foreign[0]}") if foreign else None
+
+
+# PDOs
+
+
+def missed_pdos(seen: Seen) -> int:
+    """TPDOs of drives that were not there in time."""
+    return seen.drives.missed if seen.drives is not None else 0
+
+
+def drive_silent(seen: Seen) -> NodeError | None:
+    """A drive's TPDO has been missing for too long."""
+    if seen.drives is None:
+        return None
+    limit = seen.limits.missed_cycles
+    for axis, age in zip(seen.drives.axes, seen.measurement.q_age, strict=True):
+        if age > limit:
+            return NodeError(axis.node_id, f"lost: no TPDO for {age} cycles")
+    return None
+
+
+def torn_frames(seen: Seen) -> int:
+    """Tactile frames dropped for what they are."""
+    if seen.tactile is None:
+        return 0
+    assembler = seen.tactile.assembler
+    return assembler.torn + assembler.crc_errors + assembler.orphans + assembler.malformed + assembler.duplicates
+
+
+def misplaced_frames(seen: Seen) -> int:
+    """Tactile frames dropped for their place in time."""
+    return seen.tactile.stale if seen.tactile is not None else 0
+
+
+# the bus
+
+
+def error_frames(seen: Seen) -> int:
+    """Error frames."""
+    return seen.counters.error_frames
+
+
+def dropped_frames(seen: Seen) -> int:
+    """Frames that the kernel dropped."""
+    return seen.counters.overruns
+
+
+def error_passive(seen: Seen) -> SafetyStop | None:
+    """The controller may only listen to errors, not signal them, and not for long."""
+    if seen.controller_state is not ControllerState.PASSIVE or seen.passive_ns > seen.limits.hold_ns:
+        return None
+    return SafetyStop("CAN controller error-passive")
+
+
+def held_too_long(seen: Seen) -> SafetyStop | None:
+    """The controller has been error-passive for too long."""
+    if seen.passive_ns <= seen.limits.hold_ns:
+        return None
+    return SafetyStop(f"CAN controller error-passive for {seen.passive_ns * 1e-9:.1f} s: check termination and cabling")
+
+
+def bus_off(seen: Seen) -> InterfaceError | None:
+    """The controller has left the bus."""
+    if seen.controller_state is not ControllerState.BUS_OFF:
+        return None
+    return InterfaceError("CAN controller bus-off: check bit rate, termination and cabling, then restart the interface")
+
+
+# time, arm, files
+
+
+def overruns(seen: Seen) -> SafetyStop | None:
+    """Too many cycles of the last second were late."""
+    if seen.late_share <= seen.limits.late_share:
+        return None
+    return SafetyStop(
+        f"{100 * seen.late_share:.0f} % of the last second's cycles came more than half a period late,"
+        f" limit {100 * seen.limits.late_share:.0f} %"
+    )
+
+
+def joint_speed(seen: Seen) -> SafetyStop | None:
+    """A measured joint moved as none can."""
+    return SafetyStop(seen.speeding) if seen.speeding is not None else None
+
+
+def slowed_targets(seen: Seen) -> int:
+    """Targets that were too far away for one cycle."""
+    return seen.slowed
+
+
+def estimator_restarts(seen: Seen) -> int:
+    """Restarts of the estimator."""
+    return seen.restarts
+
+
+def log_failed(seen: Seen) -> SafetyStop | None:
+    """Frames are no longer written down."""
+    return SafetyStop(f"the log cannot be written: {seen.log_failure}") if seen.log_failure is not None else None
+
+
+# the touch
+
+
+def force(contact: Contact) -> SafetyStop | None:
+    """The measured force is above the limit."""
+    limit = contact.limits.force_max
+    if contact.force <= limit:
+        return None
+    return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
+
+
+def sensor_stale(contact: Contact) -> SafetyStop | None:
+    """No tactile sample for too long."""
+    age = contact.tactile_age
+    if age is None or age <= contact.limits.tactile_timeout:
+        return None
+    return SafetyStop(f"no tactile frame for {age} cycles")
+
+
+def contact_lost(contact: Contact) -> SafetyStop | None:
+    """No force where there must be one."""
+    return SafetyStop("contact lost") if contact.lost_s * 1e9 > contact.limits.lost_ns else None
+
+
+def limit_reached(contact: Contact) -> SafetyStop | None:
+    """A joint is at its stop, or the probe at the border of its workspace."""
+    return SafetyStop(contact.limit) if contact.limit is not None else None

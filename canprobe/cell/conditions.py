@@ -1,0 +1,304 @@
+"""The table of conditions; see `canprobe.cell.supervision` for what its columns mean."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from canprobe.cell import checks
+from canprobe.cell.supervision import Condition, Limits, Reaction
+
+AGAIN = "run again"
+BY_ITSELF = "by itself"
+ARRAY_RECOVERY_NS = 30_000_000
+"""For so long after the touch the array's creep and hysteresis may still show half of the touch force."""
+
+
+def _cycles(number: int, plus_ns: int = 0) -> Callable[[Limits], int]:
+    return lambda limits: number * limits.period_ns + plus_ns
+
+
+def _after(name: str, cycles: int = 1) -> Callable[[Limits], int]:
+    """A time of the limits, and some cycles until it is looked at."""
+    return lambda limits: int(getattr(limits, name)) + cycles * limits.period_ns
+
+
+def _sample(limits: Limits) -> int:
+    """From an instant to the reaction on the tactile sample that shows it: sampled, sent one frame later, taken in."""
+    return (2 * limits.tactile_cycles + 2) * limits.period_ns
+
+
+CONDITIONS: tuple[Condition, ...] = (
+    # nodes
+    Condition(
+        "heartbeat",
+        "heartbeat of a node lost",
+        "none for 250 ms",
+        Reaction.STOP,
+        _after("heartbeat_timeout_ns"),
+        AGAIN,
+        check=checks.heartbeat_lost,
+        enabling=True,
+    ),
+    Condition(
+        "nmt_state",
+        "node not operational, or booted again",
+        "its heartbeat, every 100 ms and at a change",
+        Reaction.STOP,
+        _after("heartbeat_produced_ns"),
+        AGAIN,
+        check=checks.not_operational,
+        enabling=True,
+    ),
+    Condition(
+        "drive_fault",
+        "drive leaves operation enabled (fault, quick stop)",
+        "statusword in each TPDO",
+        Reaction.STOP,
+        _cycles(2),
+        "bring-up resets the fault; run again",
+        check=checks.drive_not_enabled,
+    ),
+    Condition(
+        "emcy",
+        "EMCY of a device error",
+        "every frame",
+        Reaction.STOP,
+        _cycles(2),
+        "mend what it names; run again",
+        check=checks.device_emcy,
+        enabling=True,
+    ),
+    Condition(
+        "emcy_communication",
+        "EMCY of communication (81xxh, 82xxh)",
+        "every frame",
+        Reaction.DEGRADE,
+        _cycles(2),
+        BY_ITSELF,
+        "noted in `faults`",
+        count=checks.communication_emcys,
+    ),
+    Condition(
+        "foreign_master",
+        "another master on the bus",
+        "its SYNC, NMT or heartbeat",
+        Reaction.STOP,
+        _cycles(2),
+        "stop it; bring-up refuses until then",
+        check=checks.foreign_master,
+        enabling=True,
+    ),
+    # PDOs
+    Condition(
+        "pdo_missed",
+        "TPDO of a drive missed, late, twice or malformed",
+        "not there 0.6 periods after its SYNC",
+        Reaction.DEGRADE,
+        _cycles(1),
+        BY_ITSELF,
+        "its last position holds; counted",
+        count=checks.missed_pdos,
+    ),
+    Condition(
+        "drive_silent",
+        "drive silent",
+        "no TPDO for more than `arm.missed_syncs` (5) cycles",
+        Reaction.STOP,
+        lambda limits: (limits.missed_cycles + 2) * limits.period_ns,
+        AGAIN,
+        check=checks.drive_silent,
+    ),
+    Condition(
+        "torn_frame",
+        "tactile frame torn, corrupt or mixed",
+        "a PDO is missing, twice or late, or the CRC is wrong",
+        Reaction.DEGRADE,
+        lambda limits: (limits.tactile_cycles + 2) * limits.period_ns,
+        BY_ITSELF,
+        "the frame is dropped; counted",
+        count=checks.torn_frames,
+    ),
+    Condition(
+        "sync_mismatch",
+        "tactile frame names another SYNC than it followed",
+        "its SYNC counter against its arrival",
+        Reaction.DEGRADE,
+        lambda limits: (limits.tactile_cycles + 2) * limits.period_ns,
+        BY_ITSELF,
+        "the frame is dropped; counted",
+        count=checks.misplaced_frames,
+    ),
+    Condition(
+        "sensor_stale",
+        "no usable tactile frame",
+        "none for 6 frame periods",
+        Reaction.RETREAT,
+        lambda limits: (limits.tactile_timeout + limits.tactile_cycles + 1) * limits.period_ns,
+        AGAIN,
+        check=checks.sensor_stale,
+        touch=True,
+    ),
+    # the bus
+    Condition(
+        "error_frames",
+        "bus error frames",
+        "every frame",
+        Reaction.DEGRADE,
+        _cycles(2),
+        BY_ITSELF,
+        "noted in `faults` once; counted",
+        count=checks.error_frames,
+    ),
+    Condition(
+        "frames_dropped",
+        "frames dropped by the kernel",
+        "SO_RXQ_OVFL",
+        Reaction.DEGRADE,
+        _cycles(2),
+        BY_ITSELF,
+        "noted in `faults` once; counted",
+        count=checks.dropped_frames,
+    ),
+    Condition(
+        "error_passive",
+        "CAN controller error-passive",
+        "its error frame",
+        Reaction.HOLD,
+        _cycles(2),
+        "goes on when it is active again; after 1 s retreat",
+        check=checks.error_passive,
+        enabling=True,
+    ),
+    Condition(
+        "error_passive_long",
+        "CAN controller error-passive for 1 s",
+        "time of the hold",
+        Reaction.RETREAT,
+        _after("hold_ns", 2),
+        "termination, cabling, bit rate; run again",
+        check=checks.held_too_long,
+    ),
+    Condition(
+        "bus_off",
+        "CAN controller bus-off",
+        "its error frame",
+        Reaction.STOP,
+        _cycles(2),
+        "the drives stop by themselves; `restart-ms` or `ip link set can0 type can restart`, then run again",
+        check=checks.bus_off,
+        enabling=True,
+    ),
+    Condition(
+        "interface",
+        "interface removed or down",
+        "error of the socket",
+        Reaction.STOP,
+        _cycles(1),
+        "the drives stop by themselves; `ip link set can0 up`, then run again",
+    ),
+    # time
+    Condition(
+        "overruns",
+        "overrun budget used up",
+        "`limits.late_cycles_max_percent` (80 %) of the last second's cycles late by half a period",
+        Reaction.RETREAT,
+        _after("hold_ns", 2),
+        "a quieter machine, or a lower rate",
+        check=checks.overruns,
+    ),
+    # the touch and the arm
+    Condition(
+        "force",
+        "measured force above `limits.force_max_n`",
+        "every tactile frame",
+        Reaction.RETREAT,
+        _sample,
+        AGAIN,
+        check=checks.force,
+        touch=True,
+    ),
+    Condition(
+        "contact_lost",
+        "contact lost in a hold or scan",
+        "below half of the touch force for 30 ms",
+        Reaction.RETREAT,
+        lambda limits: limits.lost_ns + _sample(limits) + ARRAY_RECOVERY_NS,
+        AGAIN,
+        check=checks.contact_lost,
+        touch=True,
+    ),
+    Condition(
+        "joint_stop",
+        "joint or workspace limit",
+        "target beyond a stop less `limits.joint_margin_deg`, or outside `limits.workspace_*_mm`",
+        Reaction.RETREAT,
+        _cycles(1),
+        "another path or posture",
+        "the target is not sent",
+        check=checks.limit_reached,
+        touch=True,
+    ),
+    Condition(
+        "target_speed",
+        "target too far for one cycle",
+        "`limits.joint_speed_share` of the joints' speeds",
+        Reaction.DEGRADE,
+        _cycles(1),
+        BY_ITSELF,
+        "approached at that speed; counted",
+        count=checks.slowed_targets,
+    ),
+    Condition(
+        "joint_speed",
+        "measured joint motion that no joint can make",
+        "between two TPDOs more than 1.5 × the speed limit allows",
+        Reaction.STOP,
+        _cycles(2),
+        "a TPDO was wrong, or the arm ran away: look first",
+        check=checks.joint_speed,
+        enabling=True,
+    ),
+    Condition(
+        "estimator",
+        "shape estimator diverges",
+        "an answer that is not finite, or curved beyond 1/mm",
+        Reaction.DEGRADE,
+        _cycles(1),
+        BY_ITSELF,
+        "it starts afresh, the servo keeps its surface; counted",
+        count=checks.estimator_restarts,
+    ),
+    # outside
+    Condition(
+        "interrupt",
+        "Ctrl-C, SIGTERM, an exception in your controller",
+        "the signal or exception",
+        Reaction.STOP,
+        _cycles(2),
+        AGAIN,
+    ),
+    Condition(
+        "master_dead",
+        "master dead or killed",
+        "each drive misses `arm.missed_syncs` (5) SYNCs; heartbeat consumers, 250 ms",
+        Reaction.STOP,
+        lambda limits: limits.missed_cycles * limits.period_ns + limits.period_ns // 2,
+        AGAIN,
+        "the drives quick-stop by themselves",
+    ),
+    Condition(
+        "log",
+        "frames cannot be written down (full disk)",
+        "error of the file",
+        Reaction.RETREAT,
+        _cycles(2),
+        "make room; what was written until then is whole lines",
+        check=checks.log_failed,
+        enabling=True,
+    ),
+)
+
+BY_KEY = {condition.key: condition for condition in CONDITIONS}
+CYCLE_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and not c.touch)
+TOUCH_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and c.touch)
+COUNTED = tuple(c for c in CONDITIONS if c.count is not None)

@@ -1,0 +1,163 @@
+"""What can go wrong in a running cell: one row a condition, with its check, its time, its reaction and the way back.
+
+The table `CONDITIONS` drives the checks of :class:`canprobe.cell.supervisor.Supervisor` and of the touch tasks, and the
+README prints it (`canprobe.cell.supervision_text`). What a check needs is in `Seen`; `Limits` follows from the plan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.port import ControllerState, PortCounters
+from canprobe.cell.drives import DriveGroup
+from canprobe.cell.measurement import Measurement
+from canprobe.cell.tactile import TactileReceiver
+from canprobe.cell.watch import NodeWatch
+from canprobe.errors import CanprobeError
+
+Vector = NDArray[np.float64]
+
+
+class Reaction(Enum):
+    """What the cell does about a condition, the mildest first."""
+
+    DEGRADE = "degrade"
+    HOLD = "hold"
+    RETREAT = "retreat"
+    STOP = "quick stop"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Limits:
+    """The numbers behind the checks, from the plan.
+
+    Attributes:
+        period_ns: of the cycle.
+        missed_cycles: without a TPDO after which a drive is lost, and SYNCs after which it takes its master for dead.
+        heartbeat_produced_ns, heartbeat_timeout_ns: between two heartbeats, and silence after which a node is lost.
+        tactile_cycles: between two tactile frames.
+        tactile_timeout: cycles without a tactile sample.
+        lost_ns: without contact force in a touch after which the contact is lost.
+        force_max: N.
+        late_share: of the last second's cycles that may be overruns.
+        hold_ns: longest hold.
+        joint_low, joint_high: range of the joint targets (6,), rad; None without an arm.
+        joint_speed: speed limits (6,), rad/s.
+        count: joint angle of one encoder count (6,), rad.
+        workspace: lowest and highest position (2, 3) of the probe's tip, m, base frame; None without one.
+        tip_of: position of the probe's tip (3,), m, base frame, of joint angles (6,), rad; None without an arm.
+    """
+
+    period_ns: int
+    missed_cycles: int = 5
+    heartbeat_produced_ns: int = 100_000_000
+    heartbeat_timeout_ns: int = 250_000_000
+    tactile_cycles: int = 2
+    tactile_timeout: int = 12
+    lost_ns: int = 30_000_000
+    force_max: float = 5.0
+    late_share: float = 0.8
+    hold_ns: int = 1_000_000_000
+    joint_low: Vector | None = None
+    joint_high: Vector | None = None
+    joint_speed: Vector | None = None
+    count: Vector | None = None
+    workspace: Vector | None = None
+    tip_of: Callable[[Vector], Vector] | None = None
+
+
+@dataclass(slots=True)
+class Seen:
+    """The cell in one cycle, as the checks see it.
+
+    Attributes:
+        limits: of the plan.
+        watch: heartbeats and emergencies.
+        drives, tactile: the arm and the sensor, None where there is none.
+        counters: of the port.
+        controller_state: of the CAN controller.
+        measurement: of this cycle.
+        sync_ns: when its SYNC went out, on the port's clock.
+        first_alarm: number of the first alarm that was raised while the cell cycles.
+        overruns: cycles late so far.
+        late_share: share of the last second's cycles that were late.
+        passive_ns: how long the controller has been error-passive.
+        speeding: what a joint did that no joint can do; None where all is well.
+        slowed: targets so far that were too far away for one cycle.
+        restarts: of a diverging estimator so far.
+        log_failure: why frames are no longer written down; None while they are.
+    """
+
+    limits: Limits
+    watch: NodeWatch
+    drives: DriveGroup | None
+    tactile: TactileReceiver | None
+    counters: PortCounters
+    controller_state: ControllerState = ControllerState.ACTIVE
+    measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))
+    sync_ns: int = 0
+    first_alarm: int = 0
+    overruns: int = 0
+    late_share: float = 0.0
+    passive_ns: int = 0
+    speeding: str | None = None
+    slowed: int = 0
+    restarts: int = 0
+    log_failure: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """A touch as its checks see it.
+
+    Attributes:
+        limits: of the plan.
+        force: as measured last, N.
+        tactile_age: cycles since the trigger of the newest sample; None before the first.
+        lost_s: how long the force has been below that of a contact, where there must be one.
+        limit: what a joint or the workspace forbids; None where all is well.
+    """
+
+    limits: Limits
+    force: float
+    tactile_age: int | None
+    lost_s: float = 0.0
+    limit: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """One row of the table.
+
+    Attributes:
+        key: its name in code, tests and studies.
+        what: for people.
+        seen: how it is detected, for people.
+        reaction: what the cell does.
+        within: longest time from the fault to the reaction, ns; None where no such time applies.
+        back: what the user or the cell does afterwards.
+        does: more about the reaction, for people.
+        check: of a `Seen` in every cycle, or of a `Contact` in a touch: the error that names what is wrong, or None.
+            A condition without check and count shows by itself: an exception, or a node that stops.
+        count: for what the cell lives with: how often it has happened.
+        touch: the check takes a `Contact`.
+        enabling: the check holds already while the drives are enabled.
+    """
+
+    key: str
+    what: str
+    seen: str
+    reaction: Reaction
+    within: Callable[[Limits], int] | None
+    back: str
+    does: str = ""
+    check: Callable[[Any], CanprobeError | None] | None = None
+    count: Callable[[Seen], int] | None = None
+    touch: bool = False
+    enabling: bool = False

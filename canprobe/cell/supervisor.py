@@ -1,0 +1,125 @@
+"""Runs the table of conditions over a cell, cycle by cycle. Pure: no clock, no port, so a log can be supervised too."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from canprobe.bus.port import ControllerState, PortCounters
+from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
+from canprobe.cell.joint_guard import JointGuard
+from canprobe.cell.measurement import Command, Measurement, TactileSample
+from canprobe.cell.supervision import Condition, Contact, Seen
+from canprobe.errors import CanprobeError
+
+NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
+"""Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """A condition that holds, and the error that names what is wrong."""
+
+    condition: Condition
+    error: CanprobeError
+
+
+class Supervisor:
+    """The checks of the table and what they have to remember.
+
+    Args:
+        seen: the cell; brought up to date by :meth:`step`.
+        force_of: force (N) of a tactile sample, for controllers that do not guard their contact; None without touch.
+
+    Attributes:
+        counts: how often each condition that the cell lives with has happened.
+        first: cycle in which each condition was seen first.
+    """
+
+    def __init__(self, seen: Seen, force_of: Callable[[TactileSample], float] | None = None) -> None:
+        self.seen = seen
+        self.counts: dict[str, int] = {condition.key: 0 for condition in COUNTED}
+        self.first: dict[str, int] = {}
+        self._force_of = force_of
+        self._force = 0.0
+        self._joints = JointGuard(seen.limits)
+        window = max(1, round(1e9 / seen.limits.period_ns))
+        self._late: deque[int] = deque([0] * window, maxlen=window)
+        self._late_sum = 0
+        self._active_ns = 0
+        self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
+
+    def step(
+        self,
+        measurement: Measurement,
+        *,
+        sync_ns: int,
+        overruns: int,
+        counters: PortCounters,
+        controller_state: ControllerState,
+        log_failure: str | None = None,
+    ) -> None:
+        """Take in one cycle."""
+        seen = self.seen
+        late = overruns - seen.overruns
+        self._late_sum += late - self._late[0]
+        self._late.append(late)
+        seen.late_share = self._late_sum / len(self._late)
+        seen.overruns = overruns
+        seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
+        if controller_state is not ControllerState.PASSIVE:
+            self._active_ns = measurement.t_ns
+        seen.passive_ns = measurement.t_ns - self._active_ns
+        seen.controller_state, seen.log_failure = controller_state, log_failure
+        seen.speeding = self._joints.measure(measurement)
+        for condition in COUNTED:
+            count = condition.count(seen)  # type: ignore[misc]  # COUNTED have one
+            if count != self.counts[condition.key]:
+                self.counts[condition.key] = count
+                self.first.setdefault(condition.key, measurement.cycle)
+
+    def finding(self, *, enabling: bool = False) -> Finding | None:
+        """The first condition of the table that holds now."""
+        for condition in self._enabling if enabling else CYCLE_CHECKS:
+            error = condition.check(self.seen)  # type: ignore[misc]  # CYCLE_CHECKS have one
+            if error is not None:
+                self.first.setdefault(condition.key, self.seen.measurement.cycle)
+                return Finding(condition, error)
+        return None
+
+    def guard_contact(self, measurement: Measurement) -> Finding | None:
+        """What must not go on in a touch, whatever the controller thinks of it."""
+        if self._force_of is not None and measurement.tactile is not None:
+            self._force = self._force_of(measurement.tactile)
+        return touch_finding(Contact(self.seen.limits, self._force, measurement.tactile_age))
+
+    def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
+        """The command that may be sent: a target too far away is approached, one out of bounds is left out."""
+        if command.q_target is None:
+            return command, None
+        guarded = self._joints.command(command.q_target, self.seen.measurement)
+        self.seen.slowed = self._joints.slowed
+        if guarded.limit is not None:
+            held = Command(None, command.done, command.stop_reason, command.columns)
+            return held, touch_finding(Contact(self.seen.limits, 0.0, None, limit=guarded.limit))
+        if guarded.q is command.q_target:
+            return command, None
+        return Command(guarded.q, command.done, command.stop_reason, command.columns), None
+
+    def notes(self) -> list[str]:
+        """What happened and was lived with, a line each."""
+        return [
+            f"{condition.what}: {self.counts[condition.key]}, the first in cycle {self.first[condition.key]}"
+            for condition in COUNTED
+            if condition.key in NOTED_ONCE and self.counts[condition.key]
+        ]
+
+
+def touch_finding(contact: Contact) -> Finding | None:
+    """The first condition of a touch that holds."""
+    for condition in TOUCH_CHECKS:
+        error = condition.check(contact)  # type: ignore[misc]  # TOUCH_CHECKS have one
+        if error is not None:
+            return Finding(condition, error)
+    return None

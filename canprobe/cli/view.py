@@ -1,0 +1,134 @@
+"""`canprobe view`: see a scene or a recorded run in three dimensions, in a browser."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import os
+import webbrowser
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.output import say
+from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
+from canprobe.cli.target import target_of
+
+if TYPE_CHECKING:
+    from canprobe.api import AnyObserver
+
+_EXAMPLE = """\
+A scene is run and shown live, in the pace of real time, and afterwards as a replay. The page stays until Ctrl-C.
+
+examples:
+  canprobe view cylinder
+  canprobe view runs/cylinder-20260101-120000 --port 9000 --no-open
+  canprobe view runs/cylinder-20260101-120000 --html cylinder.html
+"""
+
+
+def add_parser(commands: Commands[Parser]) -> None:
+    """Add the command."""
+    parser = commands.add_parser("view", help="see a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE)
+    parser.add_argument("what", metavar="SCENE|RUN_DIR", help="a scene to run, or the folder of a recorded run")
+    add_bus(parser)
+    parser.add_argument("--host", metavar="H", default="127.0.0.1", help="0.0.0.0 for other machines too [127.0.0.1]")
+    parser.add_argument("--port", metavar="N", type=whole(0, 65_535), default=8080, help="0 takes a free one [8080]")
+    parser.add_argument("--no-open", action="store_true", help="only say where it is to be seen")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay into one file, and leave")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder for the results")
+    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: of everything random")
+    parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase, seconds")
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Show it until Ctrl-C, or write the file."""
+    from canprobe.planning.bridges import check_bridges
+
+    check_bridges(["view"])
+    folder, browser = Path(args.what), _Browser(quiet=args.no_open)
+    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+        if not folder.is_dir():
+            folder = _run_scene(args, browser)
+        recorded = importlib.import_module("canprobe.bridge.view.recorded").read_run(folder)
+        if args.html is not None:
+            importlib.import_module("canprobe.bridge.view.page").write_page(recorded, args.html)
+            print(args.html)
+            return 0
+        serve = importlib.import_module("canprobe.bridge.view.replay").serve_run
+        serve(recorded, port=args.port, host=args.host, ready=browser.show)
+    return 0
+
+
+def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
+    """Run the scene, shown live unless only a file is wanted; the folder of its results."""
+    from dataclasses import replace
+
+    from canprobe import api
+    from canprobe.scene import BridgeSettings
+    from canprobe.scene_loader import load_scene
+
+    scene = load_scene(args.what)
+    target = target_of(args, scene)
+    settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
+    live = args.html is None
+    folder = api.results_folder(scene, args.out)
+    api.run(
+        replace(scene, bridge=settings),
+        interface=target.interface,
+        channel=target.channel,
+        bitrate=target.bitrate,
+        out=folder,
+        seed=args.seed,
+        duration_s=args.duration,
+        bridge=("view",) if live else (),
+        observers=[_paced()] if live and target.interface == "lockstep" else [],
+        say=browser.say,
+    )
+    return folder
+
+
+class _Browser:
+    """Says where it is to be seen, and opens that in the user's browser, once.
+
+    Args:
+        quiet: only say it.
+    """
+
+    def __init__(self, *, quiet: bool) -> None:
+        self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+    def show(self, address: str) -> None:
+        """The page is there."""
+        print(f"{address} (Ctrl-C ends it)", flush=True)
+        if not self._quiet:
+            self._quiet = True
+            webbrowser.open(address)
+
+    def say(self, line: str) -> None:
+        """A step of the run; the bridge's own is its address."""
+        where = line.removeprefix("bridge view: ")
+        if where != line:
+            self.show(where)
+        else:
+            say(line)
+
+
+def _paced() -> AnyObserver:
+    """An observer that lets virtual time pass no faster than the clock on the wall."""
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.cell.observe import Observation
+
+    clock = MonotonicClock()
+    offset_ns: int | None = None
+
+    def wait(observation: Observation) -> None:
+        nonlocal offset_ns
+        now_ns = clock.now_ns()
+        if offset_ns is None or now_ns > offset_ns + observation.t_ns:  # behind: what is lost is not caught up
+            offset_ns = now_ns - observation.t_ns
+        clock.sleep_until_ns(offset_ns + observation.t_ns)
+
+    return wait

@@ -1,0 +1,95 @@
+"""What a plant is made of."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.robot.kinematics import tool_z_offset
+from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel
+from canprobe.touch.objects import ObjectShape
+
+Fidelity = Literal["ideal", "dynamic"]
+
+
+@dataclass(frozen=True, slots=True)
+class PressMotion:
+    """What the probe does without an arm: slow sinusoidal indentation at the object's reference point.
+
+    Args:
+        force_n: force at the mean depth.
+        swing: amplitude of the depth over its mean.
+        frequency_hz: of the swing.
+    """
+
+    force_n: float = 2.0
+    swing: float = 0.4
+    frequency_hz: float = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class DynamicSettings:
+    """A dynamic arm beyond its geometry.
+
+    Args:
+        payload_kg: mass of the probe, a ball.
+        friction: Coulomb coefficient between probe and object.
+        integral_s: reset time of the velocity loops; 0 for none.
+        velocity_feed_forward: share of the reference's speed that the drives add; 1 removes their lag.
+        torque_limit_permille: of the continuous torque.
+        method: a key of ``integrators.STEPS``.
+        step_ns: longest step of it.
+        hold_ns: how long mass matrix, bias and contact geometry are held.
+    """
+
+    payload_kg: float = 0.3
+    friction: float = 0.3
+    integral_s: float = 0.02
+    velocity_feed_forward: float = 0.0
+    torque_limit_permille: int = 2000
+    method: str = "rosenbrock"
+    step_ns: int = 1_250_000
+    hold_ns: int = 2_500_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlantConfig:
+    """What the plant is made of.
+
+    Args:
+        model: the arm; None for a sensor alone, pressed on the object by ``press``.
+        q0: (6,) joint angles at time 0, rad.
+        T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
+        radius_m: probe radius.
+        stiffness_n_m3: of the elastic layer (K/h).
+        damping_s_m: Hunt-Crossley alpha (assumed).
+        object: what can be touched; None for nothing.
+        taxels: the array's imperfections; None where there is no array.
+        bandwidth_hz: -3 dB frequency of every drive.
+        damping_ratio: of every drive.
+        press: motion of a probe without an arm.
+        seed: of taxel gains and noise.
+        fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
+            of the object.
+        dynamics: of a dynamic arm.
+        base_offset_m: (3,) of the arm's base in the frame that counts as base.
+    """
+
+    model: PumaModel | None
+    q0: Array = field(default_factory=lambda: ELBOW_FORM)
+    T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
+    radius_m: float = 0.040
+    stiffness_n_m3: float = 1.27e8
+    damping_s_m: float = 0.3
+    object: ObjectShape | None = None
+    taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
+    bandwidth_hz: float = 30.0
+    damping_ratio: float = 1.0
+    press: PressMotion = PressMotion()
+    seed: int = 0
+    fidelity: Fidelity = "ideal"
+    dynamics: DynamicSettings = DynamicSettings()
+    base_offset_m: Array = field(default_factory=lambda: np.zeros(3))

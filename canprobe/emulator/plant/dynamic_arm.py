@@ -1,0 +1,189 @@
+"""Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place.
+
+Time goes in steps from the last change of a reference on; a step ends where a reference bends. What is asked between
+two steps is answered by a shorter step that is then forgotten, so that asking changes nothing. Mass matrix, bias and
+contact geometry are held over ``hold_ns``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.emulator.plant.equations import ArmEquations
+from canprobe.emulator.plant.integrators import STEPS
+from canprobe.emulator.plant.motor import MotorDynamics
+from canprobe.emulator.plant.reference import Reference
+from canprobe.robot.actuation import (
+    CONTINUOUS_TORQUE_NM,
+    COULOMB_NM,
+    PEAK_PERMILLE,
+    REFLECTED_INERTIA,
+    VISCOUS_NMS,
+    counts_per_radian,
+)
+from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
+
+
+@dataclass(frozen=True, slots=True)
+class Stepping:
+    """How the arm is integrated.
+
+    Args:
+        method: a key of ``integrators.STEPS``.
+        step_ns: longest step.
+        hold_ns: how long mass matrix, bias and contact geometry are held.
+    """
+
+    method: str = "rosenbrock"
+    step_ns: int = 1_250_000
+    hold_ns: int = 2_500_000
+
+
+class DynamicArm:
+    """Six motors that drive the arm's links.
+
+    Args:
+        model: the arm's geometry.
+        q0: (6,) joint angles at time 0, at rest, rad.
+        equations: of motion.
+        stepping: how they are integrated.
+    """
+
+    def __init__(self, model: PumaModel, q0: npt.ArrayLike, equations: ArmEquations, stepping: Stepping) -> None:
+        self.model = model
+        self.equations = equations
+        self.t_ns = 0
+        self._stepping, self._step = stepping, STEPS[stepping.method]
+        self._scale = counts_per_radian(model)
+        counts = joints_to_counts(model, q0)
+        self._references = [Reference(c) for c in counts.tolist()]
+        self._y = equations.resting(counts / self._scale)
+        self._y_ns = 0
+        self._hold_ns = -stepping.hold_ns
+        self._bend_ns = 0
+        self._now: tuple[int, Array] | None = None
+        self._bend()
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
+
+        A ramp that began in the past acts from the present time on.
+
+        Args:
+            axis: 0 to 5.
+            start_counts: reference at t0.
+            end_counts: reference at t1 and after.
+            t0_ns: start.
+            t1_ns: end; not after t0 for a step.
+        """
+        self._advance_to(self.t_ns)
+        self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
+        self._bend_ns = self._y_ns
+        self._now = None
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        self.t_ns = max(self.t_ns, t_ns)
+
+    def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Positions (counts) and rates (counts/s) of the six motors now."""
+        y = self._state()
+        return tuple((y[:6] * self._scale).tolist()), tuple((y[6:12] * self._scale).tolist())
+
+    @property
+    def q(self) -> Array:
+        """(6,) joint angles now, rad."""
+        return counts_to_joints(self.model, self.motors()[0])
+
+    @property
+    def qd(self) -> Array:
+        """(6,) joint rates now, rad/s."""
+        return counts_to_joints(self.model, self.motors()[1])
+
+    def motor_counts(self, axis: int) -> float:
+        """Position of one motor now, counts, continuous.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return float(self._state()[axis] * self._scale[axis])
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one motor over its continuous limit, as a drive reports it (6077h).
+
+        Args:
+            axis: 0 to 5.
+        """
+        y = self._state()
+        torque = float(self.equations.torque(1e-9 * self.t_ns, y)[axis])
+        permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
+        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive from now on.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+        self._advance_to(self.t_ns)
+        rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
+        self.equations.set_loop(axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille)
+        self._now = None
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor would answer to torque alone: its own inertia and friction, without the links.
+
+        Args:
+            axis: 0 to 5.
+        """
+        inertia, rated = REFLECTED_INERTIA[axis], CONTINUOUS_TORQUE_NM[axis]
+        return MotorDynamics(
+            gain=1e-3 * rated * float(self._scale[axis]) / inertia,
+            coulomb=1000.0 * COULOMB_NM[axis] / rated,
+            damping=VISCOUS_NMS[axis] / inertia,
+        )
+
+    def _state(self) -> Array:
+        """State now."""
+        if self._now is None or self._now[0] != self.t_ns:
+            self._advance_to(self.t_ns, keep=False)
+        assert self._now is not None
+        return self._now[1]
+
+    def _advance_to(self, t_ns: int, *, keep: bool = True) -> None:
+        """Take all whole steps up to t and one to t itself, which is kept or only noted."""
+        while self._y_ns < t_ns:
+            if self._y_ns >= self._bend_ns:
+                self._bend()
+            end_ns = min(self._y_ns + self._stepping.step_ns, self._bend_ns)
+            if end_ns > t_ns:
+                break
+            self._y, self._y_ns = self._stepped(end_ns), end_ns
+        y = self._stepped(t_ns) if t_ns > self._y_ns else self._y
+        if keep:
+            self._y, self._y_ns = y, t_ns
+        self._now = (t_ns, y)
+
+    def _bend(self) -> None:
+        """Some reference changes its slope here."""
+        rows = [r.at(self._y_ns) for r in self._references]
+        self.equations.set_reference(
+            1e-9 * self._y_ns, *(np.array(column) / self._scale for column in zip(*rows, strict=True))
+        )
+        self._bend_ns = min(r.next_bend(self._y_ns) for r in self._references)
+
+    def _stepped(self, end_ns: int) -> Array:
+        if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
+            self.equations.hold(self._y)
+            self._hold_ns = self._y_ns
+        return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))

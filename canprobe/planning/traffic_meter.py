@@ -1,0 +1,171 @@
+"""Counts what is on a bus, frame by frame, for `canprobe.planning.measured`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+from canprobe.planning.measured import ClassTraffic, Kind, MeasuredTraffic
+from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus
+from canprobe.planning.traffic import on_the_wire
+from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """One message of the plan.
+
+    Attributes:
+        cob_id: identifier.
+        kind: its class.
+        rate_hz: planned; None for a service that has no rate.
+        bits_worst: of one frame; None where its length is open.
+        latest_ns: worst case from the end of the SYNC's frame to the end of its own; None where it keeps its own time.
+    """
+
+    cob_id: int
+    kind: Kind
+    rate_hz: float | None = None
+    bits_worst: int | None = None
+    latest_ns: int | None = None
+
+
+def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
+    """Every message that the plan lists for one of its buses, by identifier."""
+    sync_bytes = 1 if SYNC_OVERFLOW else 0
+    shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.scene.bus.bitrate
+    found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, worst_case_bits(sync_bytes)), Expected(NMT_ID, "NMT")]
+    for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
+        kind: Kind = "drive RPDO" if pdo.direction == "rpdo" else "drive TPDO"
+        triggered = pdo.response_ns is not None and pdo.transmission_type <= 240
+        latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
+        kind = "tactile PDO" if pdo.kind == "tactile" else kind
+        found.append(Expected(pdo.cob_id, kind, pdo.rate_hz, pdo.bits_worst, latest))
+    beat = 1000 / HEARTBEAT_PRODUCED_MS
+    for node in (*bus.node_ids, MASTER_NODE_ID):
+        found.append(Expected(HEARTBEAT_BASE + node, "heartbeat", beat, worst_case_bits(1)))
+    for node in bus.node_ids:
+        found += [Expected(EMCY_BASE + node, "EMCY"), Expected(SDO_TX_BASE + node, "SDO")]
+        found.append(Expected(SDO_RX_BASE + node, "SDO"))
+    return {message.cob_id: message for message in found}
+
+
+@dataclass(slots=True)
+class _Count:
+    frames: int = 0
+    bits: int = 0
+    late: int = 0
+    slowest_ns: int = 0
+
+
+@dataclass(slots=True)
+class TrafficMeter:
+    """Counts frames in the order of the bus; `report` sets them beside the plan.
+
+    Attributes:
+        plan: what to expect.
+        channel: of the bus, as the plan names it; None: its first one.
+        exact: count stuff bits too, which costs a few µs a frame.
+        error_frames: to be counted by the reader.
+    """
+
+    plan: Plan
+    channel: str | None = None
+    exact: bool = True
+    error_frames: int = 0
+    _bus: PlannedBus = field(init=False)
+    _expected: dict[int, Expected] = field(init=False)
+    _counts: dict[int, _Count] = field(init=False, default_factory=dict)
+    _before: dict[int, _Count] = field(init=False, default_factory=dict)
+    _cycle: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
+    _first_ns: int | None = field(init=False, default=None)
+    _sync_ns: int = field(init=False, default=0)
+    _by_counter: dict[int, int] = field(init=False, default_factory=dict)
+    _header_id: int | None = field(init=False, default=None)
+    _tactile_ns: int | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        buses = self.plan.buses
+        self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
+        self._expected = expected_messages(self.plan, self._bus)
+        self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one frame; it is counted with the next SYNC."""
+        if can_id == SYNC_ID:
+            self._count()
+            self._sync_ns = t_ns
+            if self._first_ns is None:
+                self._first_ns = t_ns
+                self._before, self._counts = self._counts, {}
+            self._by_counter[data[0] if data else 0] = t_ns
+        self._cycle.append((can_id, data, t_ns))
+
+    def report(self) -> MeasuredTraffic:
+        """What was counted so far, beside the plan."""
+        counts = self._counts if self._first_ns is not None else {}
+        ns = 0 if self._first_ns is None else self._sync_ns - self._first_ns
+        seen = Counter(can_id for can_id, _, _ in self._cycle)
+        for part in (self._before, self._counts):
+            seen.update({can_id: one.frames for can_id, one in part.items()})
+        return MeasuredTraffic(
+            duration_s=ns * 1e-9,
+            bitrate=self.plan.scene.bus.bitrate,
+            exact=self.exact,
+            classes=tuple(self._classes(counts, ns * 1e-9)),
+            unlisted={can_id: n for can_id, n in seen.items() if can_id not in self._expected},
+            missing=tuple(
+                one.cob_id
+                for one in self._expected.values()
+                if one.kind in ("drive TPDO", "drive RPDO", "tactile PDO") and one.cob_id not in seen
+            ),
+            error_frames=self.error_frames,
+            planned_worst=self._bus.traffic.load,
+        )
+
+    def _count(self) -> None:
+        """Count the frames since the last SYNC."""
+        counts, bus, exact = self._counts, self.plan.scene.bus, self.exact
+        for can_id, data, t_ns in self._cycle:
+            count = counts.get(can_id)
+            if count is None:
+                count = counts[can_id] = _Count()
+            count.frames += 1
+            count.bits += exact_frame_bits(can_id, data, bus) if exact else unstuffed_frame_bits(len(data), bus)
+            expected = self._expected.get(can_id)
+            if expected is None or expected.latest_ns is None:
+                continue
+            trigger = self._trigger(expected, data)
+            if trigger is not None:
+                took = t_ns - trigger
+                count.slowest_ns = max(count.slowest_ns, took)
+                count.late += took > expected.latest_ns
+        self._cycle.clear()
+
+    def _trigger(self, expected: Expected, data: bytes) -> int | None:
+        """When the SYNC behind a frame was through: the last one, or the one that a tactile header names."""
+        if expected.kind != "tactile PDO":
+            return self._sync_ns
+        if expected.cob_id == self._header_id:
+            self._tactile_ns = self._by_counter.get(data[1]) if len(data) == 8 else None
+        return self._tactile_ns
+
+    def _classes(self, counts: dict[int, _Count], seconds: float) -> Iterator[ClassTraffic]:
+        found: dict[Kind, ClassTraffic] = {}
+        for expected in self._expected.values():
+            one = found.setdefault(expected.kind, ClassTraffic(expected.kind))
+            count = counts.get(expected.cob_id, _Count())
+            one.messages += 1
+            one.frames += count.frames
+            one.bits += count.bits
+            one.late += count.late
+            if expected.rate_hz is not None and expected.bits_worst is not None:
+                planned = expected.rate_hz * seconds
+                one.planned_frames = (one.planned_frames or 0.0) + planned
+                one.planned_bits = (one.planned_bits or 0.0) + planned * expected.bits_worst
+            if expected.latest_ns and count.slowest_ns:
+                one.slowest = max(one.slowest or 0.0, count.slowest_ns / expected.latest_ns)
+        yield from found.values()

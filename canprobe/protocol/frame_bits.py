@@ -1,0 +1,248 @@
+"""How many bits a CAN frame takes on the wire: exact for given contents, and the best and worst that can be.
+
+Lengths run from start of frame to the end of the intermission, so that frames laid end to end fill the bus. A stuff
+bit follows five equal bits, stuff bits included; in a classical frame up to the end of the CRC sequence, in an FD frame
+up to the end of the data field, whose CRC field has stuff bits at fixed places instead.
+
+Source: ISO 11898-1:2015 (frame formats, bit stuffing, CRC field, error frame, interframe space); worst cases as in
+Davis, Burns, Bril, Lukkien 2007, equation (1), and, for FD, Bordoloi and Samii, "The frame packing problem for CAN-FD",
+RTSS 2014, whose formula lacks the stuff count that ISO added in 2015 (4 bits and a fixed stuff bit).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache, lru_cache
+
+from canprobe.errors import ProtocolError
+from canprobe.protocol.crc import CRC15
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
+from canprobe.protocol.stuffing import START_OF_FRAME, Table, feed, most_stuff_bits, tables
+
+ERROR_FLAG_BITS = 6
+ERROR_DELIMITER_BITS = 8
+INTERMISSION_BITS = 3
+SUSPEND_BITS = 8  # an error-passive node waits so long after its own frame
+RECOVERY_RECESSIVE_BITS = 128 * 11  # a node that is bus off listens for so many before it comes back
+
+FD_LENGTHS = (0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64)
+"""Data bytes of an FD frame by its data length code."""
+
+_TAIL = 1 + 1 + 1 + 7 + INTERMISSION_BITS  # CRC delimiter, ACK slot, ACK delimiter, end of frame
+_FD_TAIL = _TAIL - 1  # its CRC delimiter belongs to the data phase
+
+
+@dataclass(frozen=True, slots=True)
+class FrameLength:
+    """A frame's bits.
+
+    Attributes:
+        nominal: at the nominal bit rate.
+        data: at the data bit rate: of an FD frame with bit-rate switch from ESI to the CRC delimiter, else 0. (The bits
+            in which the rate changes are each half one and half the other, which adds up to one of both.)
+    """
+
+    nominal: int
+    data: int = 0
+
+    @property
+    def total(self) -> int:
+        """All bits."""
+        return self.nominal + self.data
+
+    def time_ns(self, bitrate: int, data_bitrate: int | None = None) -> int:
+        """Time on the wire, ns, rounded up.
+
+        Args:
+            bitrate: nominal, bit/s.
+            data_bitrate: of the data phase, bit/s; None: the nominal one.
+        """
+        fast = data_bitrate or bitrate
+        return -(-(self.nominal * fast + self.data * bitrate) * 1_000_000_000 // (bitrate * fast))
+
+
+def best_case_bits(n_data: int, *, extended: bool = False) -> int:
+    """Bits of a classical frame without one stuff bit: 47 + 8 n, or 67 + 8 n with a 29-bit identifier.
+
+    A remote frame is as long as one without data.
+
+    Raises:
+        ProtocolError: not 0..8 data bytes.
+    """
+    return _stuffed_part(n_data, extended) + _TAIL
+
+
+def worst_case_bits(n_data: int, *, extended: bool = False) -> int:
+    """Bits of a classical frame with every stuff bit there can be: 55 + 10 n, or 80 + 10 n with a 29-bit identifier.
+
+    Raises:
+        ProtocolError: not 0..8 data bytes.
+
+    Source: Davis et al. 2007, equation (1).
+    """
+    stuffed = _stuffed_part(n_data, extended)
+    return stuffed + (stuffed - 1) // 4 + _TAIL
+
+
+def _stuffed_part(n_data: int, extended: bool) -> int:
+    if not 0 <= n_data <= 8:
+        raise ProtocolError(f"a CAN frame carries 0..8 data bytes, not {n_data}")
+    return (54 if extended else 34) + 8 * n_data
+
+
+def exact_bits(can_id: int, data: bytes, *, dlc: int | None = None) -> int:
+    """Bits of this very classical frame, with its CRC and its stuff bits.
+
+    Args:
+        can_id: with `EFF_FLAG` for 29 bits and `RTR_FLAG` for a remote request.
+        data: 0..8 bytes; none in a remote request.
+        dlc: data length code where it is not the length of `data`: of a remote request.
+
+    Raises:
+        ProtocolError: an identifier or a length that no frame has.
+    """
+    code = len(data) if dlc is None else dlc
+    if not 0 <= code <= 15 or len(data) != (0 if can_id & RTR_FLAG else min(code, 8)):
+        raise ProtocolError(f"{can_id:X}: no classical frame has {len(data)} data bytes and the length code {code}")
+    bits, register, table, effects = _header(can_id, code)
+    for byte, effect in zip(data, effects, strict=True):
+        register ^= effect[byte]
+        table, stuffed = table[byte]
+        bits += stuffed
+    table, stuffed = table[register >> 7]
+    return bits + stuffed + table[256][register & 127]  # type: ignore[no-any-return]
+
+
+@lru_cache(maxsize=4096)
+def _header(can_id: int, code: int) -> tuple[int, int, Table, tuple[tuple[int, ...], ...]]:
+    """What a frame's header settles.
+
+    Returns:
+        Its bits without those that data and CRC stuff, its CRC with data of 0, its stuffing, and what each data byte
+        does to the CRC.
+    """
+    remote = 1 if can_id & RTR_FLAG else 0
+    identifier = can_id & ~(EFF_FLAG | RTR_FLAG)
+    if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
+        value = (identifier >> 18) << 27 | 0b11 << 25 | (identifier & 0x3FFFF) << 7 | remote << 6 | code
+        n_bits = 39
+    elif 0 <= identifier <= 0x7FF:
+        value, n_bits = identifier << 7 | remote << 6 | code, 19
+    else:
+        raise ProtocolError(f"{can_id:X} is no CAN identifier; one of 29 bits carries the flag {EFF_FLAG:X}")
+    n_bytes = 0 if remote else min(code, 8)
+    n_data = 8 * n_bytes
+    stuffing = feed(START_OF_FRAME, value, n_bits - 1)
+    bits = n_bits + (stuffing >> 4) + n_data + 15 + _TAIL
+    return bits, CRC15.of(value << n_data, n_bits + n_data), tables()[stuffing & 15], _crc15_bytes()[8 - n_bytes :]
+
+
+@cache
+def _crc15_bytes() -> tuple[tuple[int, ...], ...]:
+    return CRC15.byte_tables(8)
+
+
+def fd_dlc(n_data: int) -> int:
+    """Data length code of an FD frame.
+
+    Raises:
+        ProtocolError: an FD frame cannot have this length.
+    """
+    try:
+        return FD_LENGTHS.index(n_data)
+    except ValueError:
+        raise ProtocolError(f"an FD frame carries {', '.join(map(str, FD_LENGTHS))} data bytes, not {n_data}") from None
+
+
+def exact_fd_bits(can_id: int, data: bytes, *, brs: bool = True, esi: bool = False) -> FrameLength:
+    """Bits of this very FD frame.
+
+    The CRC and the stuff count do not change the length: their stuff bits have fixed places.
+
+    Args:
+        can_id: with `EFF_FLAG` for 29 bits.
+        data: of a length that FD has.
+        brs: the data phase has its own bit rate.
+        esi: the sender is error-passive.
+
+    Raises:
+        ProtocolError: a remote request, an identifier or a length that no FD frame has.
+    """
+    value, n_bits = _fd_arbitration(can_id, brs)
+    stuffing = feed(START_OF_FRAME, value, n_bits - 1)
+    before = stuffing >> 4
+    # the last bit before the CRC field is left out: the field begins with a stuff bit, whatever came before
+    rest = ((esi << 4 | fd_dlc(len(data))) << 8 * len(data) | int.from_bytes(data, "big")) >> 1
+    stuffing = feed(stuffing, rest >> 8 * len(data), 4)
+    count, table = (stuffing >> 4) - before, tables()[stuffing & 15]
+    for byte in (rest & (1 << 8 * len(data)) - 1).to_bytes(len(data), "big"):
+        table, stuffed = table[byte]
+        count += stuffed
+    nominal, fast = n_bits + before + _FD_TAIL, _fd_data_phase(len(data)) + count
+    return FrameLength(nominal, fast) if brs else FrameLength(nominal + fast)
+
+
+def worst_case_fd_bits(n_data: int, *, extended: bool = False, brs: bool = True, esi: bool = False) -> FrameLength:
+    """Bits of an FD frame with every stuff bit that identifier and data can cause.
+
+    Raises:
+        ProtocolError: an FD frame cannot have this length.
+    """
+    return _fd_bound(n_data, extended, brs, esi)
+
+
+def best_case_fd_bits(n_data: int, *, extended: bool = False, brs: bool = True) -> FrameLength:
+    """Bits of an FD frame without one dynamic stuff bit.
+
+    Raises:
+        ProtocolError: an FD frame cannot have this length.
+    """
+    fd_dlc(n_data)
+    nominal, fast = (36 if extended else 17) + _FD_TAIL, _fd_data_phase(n_data)
+    return FrameLength(nominal, fast) if brs else FrameLength(nominal + fast)
+
+
+def _fd_arbitration(can_id: int, brs: bool) -> tuple[int, int]:
+    """Start of frame to BRS: value and number of bits."""
+    identifier = can_id & ~EFF_FLAG
+    if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
+        return ((identifier >> 18) << 20 | 0b11 << 18 | identifier & 0x3FFFF) << 4 | 0b0100 | brs, 36
+    if 0 <= can_id <= 0x7FF:
+        return can_id << 5 | 0b00100 | brs, 17
+    raise ProtocolError(f"{can_id:X} is no identifier of an FD frame; there are no remote requests in CAN FD")
+
+
+def _fd_data_phase(n_data: int) -> int:
+    """ESI, DLC, data, stuff count, CRC, fixed stuff bits, CRC delimiter."""
+    crc, fixed = (17, 6) if n_data <= 16 else (21, 7)
+    return 1 + 4 + 8 * n_data + 4 + crc + fixed + 1
+
+
+@lru_cache(maxsize=256)
+def _fd_bound(n_data: int, extended: bool, brs: bool, esi: bool) -> FrameLength:
+    code = f"{fd_dlc(n_data):04b}"
+    arbitration = "0" + ("x" * 11 + "11" + "x" * 18 + "0" if extended else "x" * 11 + "00") + f"10{brs:d}"
+    rest = f"{esi:d}{code}" + "x" * (8 * n_data)
+    best = best_case_fd_bits(n_data, extended=extended, brs=brs)
+    if not brs:
+        return FrameLength(best.nominal + most_stuff_bits((arbitration + rest)[:-1]))
+    return FrameLength(best.nominal + most_stuff_bits(arbitration), best.data + most_stuff_bits(("1" + rest)[:-1]))
+
+
+def error_bits(*, flag: int = ERROR_FLAG_BITS, suspend: bool = False) -> int:
+    """Bits from the first of an error flag to the end of the intermission: 17, or up to 31.
+
+    Args:
+        flag: 6, up to 12 where the others answer the first flag with theirs.
+        suspend: the sender is error-passive and waits before it tries again.
+
+    Raises:
+        ProtocolError: a flag is 6 to 12 bits long.
+    """
+    if not ERROR_FLAG_BITS <= flag <= 2 * ERROR_FLAG_BITS:
+        raise ProtocolError(f"superposed error flags are 6..12 bits long, not {flag}")
+    return flag + ERROR_DELIMITER_BITS + INTERMISSION_BITS + (SUSPEND_BITS if suspend else 0)
+
+
+WORST_ERROR_BITS = error_bits(flag=2 * ERROR_FLAG_BITS, suspend=True)
+"""31, the overhead of one error besides the frame that has to be sent again (Tindell and Burns 1994)."""

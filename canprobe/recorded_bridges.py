@@ -1,0 +1,178 @@
+"""A recorded run into other tools: the same observations as the cell handed out, made again from its log."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridging import Bridges
+from canprobe.bus.candump import read_candump
+from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.port import TimedFrame
+from canprobe.cell.deadlines import find_deadlines
+from canprobe.cell.log_cycles import LogCycles
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.observe import Observation
+from canprobe.cell.recording import Recording, read_recording
+from canprobe.planning import Plan, make_plan
+from canprobe.planning.bridges import BRIDGES
+from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
+from canprobe.protocol.frames import SYNC_ID
+from canprobe.recorded import ReplayResult, find_log, replay, scene_of
+from canprobe.scene import Scene
+from canprobe.session import LOCKSTEP, Say, resolve_scene
+from canprobe.touch.estimate import SurfaceEstimate
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedBridges:
+    """What became of a log.
+
+    Attributes:
+        result: of its estimators; None where the scene has none, or nothing was touched.
+        bridges: of each bridge what `summary.json` says of it.
+    """
+
+    result: ReplayResult | None
+    bridges: dict[str, dict[str, Any]]
+
+
+def replay_into(
+    log: Path | str,
+    bridge: Sequence[str],
+    *,
+    scene: Scene | str | Path | None = None,
+    method: str | Sequence[str] | None = None,
+    say: Say = lambda _: None,
+) -> RecordedBridges:
+    """Feed a recorded bus to bridges, as if the cell were running; those that show it live get it in real time.
+
+    Args:
+        log: folder of a run, or a candump file.
+        bridge: names of the bridges.
+        scene: what the nodes are; by default the ``scene.toml`` beside the log.
+        method: estimators, as for :func:`canprobe.replay`.
+        say: called with where each bridge is to be found.
+
+    Raises:
+        UsageError: as :func:`canprobe.replay`; or a bridge cannot be had.
+    """
+    path, folder = find_log(Path(log))
+    resolved = resolve_scene(scene_of(path, folder, scene), bridge=bridge)
+    plan = make_plan(resolved)
+    estimated = method is not None or (resolved.shape is not None and resolved.task.kind == "scan")
+    result = replay(log, scene=resolved, method=method) if estimated else None
+    observations = _Observations(plan, path, folder, result)
+    with Bridges(plan, path.parent, virtual=True, say=say) as bridges:
+        live = any(BRIDGES[name].live for name in bridge)
+        for observation in _in_real_time(observations) if live else observations:
+            for one in bridges.observers:
+                one.observe(observation)
+        return RecordedBridges(result, bridges.end(None) or {})
+
+
+def _in_real_time(observations: _Observations) -> Iterator[Observation]:
+    clock = MonotonicClock()
+    start_ns: int | None = None
+    for observation in observations:
+        if start_ns is None:
+            start_ns = clock.now_ns() - observation.t_ns
+        clock.sleep_until_ns(start_ns + observation.t_ns)
+        yield observation
+
+
+class _Observations:
+    """Iterates over what an observer would have seen of a recorded log.
+
+    Args:
+        plan: of the scene.
+        path: the candump file.
+        folder: of the run; None for a log from elsewhere.
+        result: of the estimators; None without.
+    """
+
+    def __init__(self, plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> None:
+        self._plan = plan
+        self._path = path
+        self._as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
+        self._ours = (result is None and folder is not None) or (
+            result is not None and result.summary["driven_by"] == "task"
+        )
+        self._recording = read_recording(path, plan, as_taken=self._as_taken)
+        self._drifts = folder is None
+        self._estimates = _estimates(result)
+        self._phases = _phases(folder) if self._ours else {}
+
+    def __iter__(self) -> Iterator[Observation]:
+        groups = _frames_by_sync(self._path, self._recording)
+        first_ns = self._first_ns()
+        before = next(groups)
+        if before:
+            yield Observation(before[-1][2], None, None, before)
+        cycles = LogCycles(
+            self._plan, self._recording, as_taken=self._as_taken, on_deadlines=self._ours, drifts=self._drifts
+        )
+        for cycle, frames in zip(cycles, groups, strict=True):
+            m = cycle.measurement
+            yield Observation(first_ns + m.t_ns, m, self._command(m), frames)
+
+    def _first_ns(self) -> int:
+        stamps = self._recording.sync_stamps
+        if not self._ours:
+            return int(stamps[0])
+        numbers, _ = find_deadlines(stamps, self._plan.sync.period_ns, None)
+        return int(np.min(stamps - self._wire_times() - numbers * self._plan.sync.period_ns))
+
+    def _wire_times(self) -> NDArray[np.int64]:
+        """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate has the ends of frames."""
+        bus, recording = self._plan.scene.bus, self._recording
+        if bus.interface != LOCKSTEP or not bus.timed or bus.fd is True:
+            return np.zeros(len(recording.syncs), np.int64)
+        syncs = (recording.frames[i] for i in recording.syncs.tolist())
+        bits = np.array([exact_bits(can_id, data) - INTERMISSION_BITS for can_id, data, _ in syncs])
+        return bits * 1_000_000_000 // bus.bitrate
+
+    def _command(self, m: Measurement) -> Command | None:
+        phase = self._phases.get(m.t_ns)
+        estimate = self._estimates.get(m.tactile.t_sample_ns) if m.tactile is not None else None
+        if phase is None and estimate is None:
+            return None
+        return Command(columns={} if phase is None else {"phase": phase}, estimate=estimate)
+
+
+def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
+    """What the scene's estimator said, by the instant of its last sample, ns."""
+    if result is None:
+        return {}
+    records = next(iter(result.estimates.values()))
+    return {round(record.t_s * 1e9): record.estimate for record in records}
+
+
+def _phases(folder: Path | None) -> dict[int, float]:
+    """The task's phase by the time of the cycle, ns, where the run logged it."""
+    if folder is None or not (folder / "log.npz").is_file():
+        return {}
+    with np.load(folder / "log.npz", allow_pickle=False) as log:
+        if "phase" not in log:
+            return {}
+        known = np.isfinite(log["phase"])
+        times = np.round(log["t_s"][known] * 1e9).astype(np.int64)
+        return dict(zip(times.tolist(), log["phase"][known].tolist(), strict=True))
+
+
+def _frames_by_sync(path: Path, recording: Recording) -> Iterator[list[TimedFrame]]:
+    """All frames of the cell's channel: those before the first SYNC, then from each SYNC to the next."""
+    frames: list[TimedFrame] = []
+    for t_ns, channel, can_id, data in read_candump(path):
+        if channel != recording.channel:
+            continue
+        if can_id == SYNC_ID and len(data) <= 1:
+            yield frames
+            frames = []
+        frames.append((can_id, data, t_ns))
+    yield frames

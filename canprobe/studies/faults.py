@@ -1,0 +1,120 @@
+"""Study `faults`: ten thousand short touches in lockstep, each with faults drawn from its seed, each scored.
+
+A run is a press or a short scan over emulated nodes that drop, delay, double, corrupt and swap frames, fall mute or
+deaf, reboot, freeze, babble or send wrong data, at random times in bring-up, approach, scan, retreat and stop. It fails
+where the true force stays above the limit for longer than the reaction may take, where anything moves or is powered
+after the stop, where it does not end, where the log is not whole, or where anything but a plain error comes out.
+`canprobe study faults --seed N` carries out one run again and tells what happens in it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from canprobe.emulator.faults import FaultKind
+from canprobe.studies.fault_runs import FORCE_MAX_N, PHASES, draw_case, run_seed
+from canprobe.studies.study import Column, Say, StudyResult
+from canprobe.studies.study_files import measuring_facts
+from canprobe.studies.sweep import Sweep
+
+RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 8, 20
+OUTCOMES = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
+COLUMNS = (
+    Column("fault", "fault"),
+    Column("runs", "runs", "d"),
+    *(Column(phase, phase, "d") for phase in PHASES),
+    *(Column(outcome, outcome, "d") for outcome in OUTCOMES),
+    Column("force_max_n", "highest force N", ".2f"),
+    Column("above_ms", "longest above limit ms", ".0f"),
+    Column("failures", "failures", "d"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Seeds:
+    """One cell of the sweep: some runs in a row, so that a process does not load everything for one."""
+
+    first: int
+    count: int
+
+
+def measure(seeds: Seeds) -> list[dict[str, Any]]:
+    """The runs of some seeds."""
+    return [run_seed(seed) for seed in range(seeds.first, seeds.first + seeds.count)]
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Carry out the campaign."""
+    total = QUICK_RUNS if quick else RUNS
+    size = min(total, SEEDS_A_CELL)
+    cells = [Seeds(first, min(size, total - first)) for first in range(0, total, size)]
+    runs = [one for answer in sweep.map(measure, cells) for one in answer]
+    return StudyResult(
+        "faults",
+        COLUMNS,
+        table_rows(runs),
+        findings(runs),
+        measuring_facts(quick, total),
+        lambda path: _draw(runs, path),
+    )
+
+
+def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """A row for each kind of fault (a run with two kinds is in both), and one for all."""
+    kinds = [(kind.value, [r for r in runs if kind.value in r["kinds"]]) for kind in FaultKind]
+    return [_row(name, some) for name, some in [*kinds, ("all", list(runs))]]
+
+
+def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    phases = Counter(one["phase"] for one in runs)
+    outcomes = Counter(one["outcome"] for one in runs)
+    return {
+        "fault": name,
+        "runs": len(runs),
+        **{phase: phases[phase] for phase in PHASES},
+        **{outcome: outcomes[outcome] for outcome in OUTCOMES},
+        "force_max_n": max((one["force_max_n"] for one in runs), default=0.0),
+        "above_ms": max((one["above_ms"] for one in runs), default=0.0),
+        "failures": sum(bool(one["failures"]) for one in runs),
+    }
+
+
+def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the campaign says, and every failure with the command that shows it again."""
+    failed = [one for one in runs if one["failures"]]
+    hit = sum(one["hits"] > 0 for one in runs)
+    above = sum(one["above_ms"] > 0 for one in runs)
+    lines = [
+        f"{len(runs)} runs, {hit} of them with at least one frame or node hit; {len(failed)} failed.",
+        f"True force above the limit of {FORCE_MAX_N:g} N in {above} runs,"
+        f" highest {max(one['force_max_n'] for one in runs):.2f} N.",
+    ]
+    lines += [
+        f"seed {one['seed']}: {'; '.join(one['failures'])} (canprobe study faults --seed {one['seed']})"
+        for one in failed[:20]
+    ]
+    return lines if len(failed) <= 20 else [*lines, f"… and {len(failed) - 20} more failures"]
+
+
+def replay(seed: int, say: Say) -> dict[str, Any]:
+    """Carry out the run of one seed again and tell what happens in it."""
+    case = draw_case(seed)
+    say(f"seed {seed}: {case.scenario}")
+    for fault in case.faults:
+        say(f"  {fault}")
+    outcome = run_seed(seed)
+    say(f"  {outcome['hits']} hits; {outcome['outcome']} at {outcome['end_s']:.3f} s {outcome['reason']}")
+    say(f"  highest force {outcome['force_max_n']:.2f} N, above the limit for {outcome['above_ms']:.0f} ms")
+    for failure in outcome["failures"]:
+        say(f"  FAILURE: {failure}")
+    return outcome
+
+
+def _draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
+    from canprobe.studies.faults_figure import draw_faults
+
+    draw_faults(runs, path)

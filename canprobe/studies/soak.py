@@ -1,0 +1,188 @@
+"""An hour on a real SocketCAN interface: does memory stay flat, do the clocks stay together, do the counters agree.
+
+The cell is held as `canprobe up` holds it, emulated nodes in their process, all PDOs on the bus. For a nightly run:
+`canprobe vcan --realtime -- canprobe study soak`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canprobe.api import ROWS_OF_UP
+from canprobe.bus.socketcan import check_interface
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.child import EmulatorChild
+from canprobe.scene_loader import load_scene
+from canprobe.session import Session, resolve_scene
+from canprobe.studies.realtime_cases import CHANNEL, PATIENT_SYNCS, served
+from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.study_files import measuring_facts
+from canprobe.studies.sweep import Sweep
+
+HOUR_S = 3600.0
+SAMPLES = 60
+SETTLED = 0.25
+"""Share of the run after which memory is expected to have stopped growing."""
+
+COLUMNS = (
+    Column("t_s", "t s", ".0f"),
+    Column("master_mib", "master MiB", ".2f"),
+    Column("nodes_mib", "nodes MiB", ".2f"),
+    Column("cycles", "cycles", ".0f"),
+    Column("overruns", "overruns", ".0f"),
+    Column("missed_pdos", "missed", ".0f"),
+    Column("dropped_frames", "dropped", ".0f"),
+    Column("latency_us", "SYNC→last TPDO µs", ".0f"),
+    Column("frames_counted", "frames counted", ".0f"),
+    Column("frames_on_bus", "on the bus", ".0f"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """One look at the running cell.
+
+    Attributes:
+        t_s: since the first SYNC.
+        master_mib, nodes_mib: resident memory of the two processes.
+        cycles, overruns, missed_pdos, dropped_frames: since the start.
+        latency_us: from SYNC to the last TPDO in this cycle, by the kernel's stamp.
+        frames_counted: sent and received by the master since the start.
+        frames_on_bus: counted by the interface since the start.
+    """
+
+    t_s: float
+    master_mib: float
+    nodes_mib: float
+    cycles: int
+    overruns: int
+    missed_pdos: int
+    dropped_frames: int
+    latency_us: float
+    frames_counted: int
+    frames_on_bus: int
+
+
+class Soaker:
+    """The controller: holds the joints, and looks at everything now and then."""
+
+    def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
+        self.samples: list[Sample] = []
+        self._session, self._nodes_pid, self._seconds = session, nodes_pid, seconds
+        self._next_s = 0.0
+        self._q: Any = None
+        self._first_packets = self._first_counted = 0
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        if self._q is None:
+            self._q = measurement.q
+        t_s = measurement.t_ns * 1e-9
+        if t_s >= self._next_s:
+            self._next_s += self._seconds / SAMPLES
+            self._look(t_s)
+        return Command(q_target=self._q, done=t_s >= self._seconds)
+
+    def _look(self, t_s: float) -> None:
+        cell = self._session.cell
+        cycle, drives, counters = cell.cycle, cell.drives, cell.counters
+        assert cycle is not None and drives is not None
+        counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
+        if not self.samples:
+            self._first_counted, self._first_packets = counted, packets
+        self.samples.append(
+            Sample(
+                t_s=t_s,
+                master_mib=resident_mib(os.getpid()),
+                nodes_mib=resident_mib(self._nodes_pid),
+                cycles=cycle.number,
+                overruns=cycle.statistics.overruns,
+                missed_pdos=drives.missed,
+                dropped_frames=counters.overruns,
+                latency_us=drives.answer_ns * 1e-3,
+                frames_counted=counted - self._first_counted,
+                frames_on_bus=packets - self._first_packets,
+            )
+        )
+
+
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Hold the cell for an hour, or for ten seconds with `quick`."""
+    check_interface(CHANNEL)
+    seconds = 10.0 if quick else HOUR_S
+    sweep.say(f"hold the cell for {seconds:g} s")
+    samples = soak(seconds)
+    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds}
+    rows = [asdict(sample) for sample in samples]
+    return StudyResult("soak", COLUMNS, rows, findings(samples), facts, _drawer(samples))
+
+
+def soak(seconds: float) -> list[Sample]:
+    """Hold the cell; a look every sixtieth of the time."""
+    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
+    assert scene.arm is not None and scene.sensor is not None
+    real = replace(
+        scene,
+        arm=replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS),
+        sensor=replace(scene.sensor, emulated=False),
+    )
+    child = EmulatorChild(scene, None, CHANNEL, truth=False)
+    with served(CHANNEL, child):
+        session = Session(real, rows_kept=ROWS_OF_UP)
+        soaker = Soaker(session, child.pid, seconds)
+        with session:
+            session.run(soaker)
+    return soaker.samples
+
+
+def resident_mib(pid: int) -> float:
+    """Resident memory of a process, MiB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
+
+
+def packets_on(channel: str) -> int:
+    """Frames that a network interface has counted."""
+    return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
+
+
+def findings(samples: Sequence[Sample]) -> list[str]:
+    """What an hour showed."""
+    first, last = samples[0], samples[-1]
+    settled = [s for s in samples if s.t_s >= SETTLED * last.t_s]
+    tenth = max(1, len(samples) // 10)
+    begin, end = (float(np.median([s.latency_us for s in part])) for part in (samples[:tenth], samples[-tenth:]))
+    gone = last.frames_on_bus - last.frames_counted
+    return [
+        f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
+        f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, after the first quarter",
+        f"SYNC → last TPDO by the kernel's stamps: {begin:.0f} µs in the first tenth, {end:.0f} µs in the last",
+        f"{last.frames_counted} frames counted by the master, {last.frames_on_bus} by the interface in the same time:"
+        f" {gone:+d} under way or lost, {last.dropped_frames - first.dropped_frames} dropped by the kernel",
+        f"{last.cycles - first.cycles} cycles, {last.overruns - first.overruns} overruns,"
+        f" {last.missed_pdos - first.missed_pdos} PDOs missed",
+    ]
+
+
+def _growth(samples: Sequence[Sample], name: str) -> float:
+    """Slope, MiB/h."""
+    if len(samples) < 2:
+        return 0.0
+    t_h = np.array([s.t_s for s in samples]) / 3600
+    slope = np.polyfit(t_h, [getattr(s, name) for s in samples], 1)[0]
+    return round(float(slope), 2) + 0.0  # no minus zero
+
+
+def _drawer(samples: Sequence[Sample]) -> Callable[[Path], None]:
+    def draw(path: Path) -> None:
+        from canprobe.studies.soak_figure import draw_soak
+
+        draw_soak(samples, path)
+
+    return draw

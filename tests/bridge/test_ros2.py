@@ -1,0 +1,186 @@
+"""ROS 2 without ROS: this process is a second DDS participant on loopback, and Cyclone's own serialiser the witness."""
+
+from __future__ import annotations
+
+import itertools
+import os
+
+import numpy as np
+import pytest
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import Policy
+
+from canprobe.bridge.cdr import Encoder, encode_can_frame
+from canprobe.bridge.codec import pack_observation, unpack_observation
+from canprobe.bridge.limits import refuse
+from canprobe.bridge.messages import Messages
+from canprobe.bridge.process import BridgeProcess
+from canprobe.bridge.ros2_dds import EMPTY, FLOAT64, FORCE, SPEED, STATUS, STOP, Ros2Node
+from canprobe.bridge.ros2_types import DdsTypes, dds_name
+from canprobe.bridge.sample import CanFrame
+from canprobe.bridge.source import SampleSource
+from canprobe.bridge.topics import JOINT_STATES, TAXELS, TF_STATIC, TOPICS
+from canprobe.planning import make_plan
+from canprobe.scene_loader import parse_scene
+from canprobe.scene_writer import dump_scene
+
+DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
+
+JAZZY = {  # as `ros2 topic info --verbose` of ROS 2 Jazzy prints them
+    "sensor_msgs/msg/JointState": "RIHS01_a13ee3a330e346c9d87b5aa18d24e11690752bd33a0350f11c5882bc9179260e",
+    "std_msgs/msg/String": "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18",
+}
+
+
+@pytest.fixture(scope="module")
+def encoder():
+    return Encoder()
+
+
+@pytest.fixture(scope="module")
+def messages(recorded, encoder):
+    """Every message of the shared run: (topic, CDR)."""
+    plan = recorded.result.plan
+    source, maker = SampleSource(plan), Messages(plan, encoder)
+    samples = (source.sample(unpack_observation(pack_observation(o))) for o in recorded.observations)
+    return [(topic, data) for sample in samples for topic, _, data in maker.of(sample)]
+
+
+@pytest.fixture
+def plan(recorded):
+    text = dump_scene(recorded.result.plan.scene)
+    text = text.replace("ros2_domain = 0", f"ros2_domain = {DOMAIN}").replace("commands = false", "commands = true")
+    return make_plan(parse_scene(text))
+
+
+def test_cyclone_itself_makes_the_same_bytes(messages, encoder):
+    """Decoded and encoded again by Cyclone's serialiser, which shares nothing with rosbags: every type of the run."""
+    types = DdsTypes(encoder)
+    seen = {}
+    for topic, data in messages:
+        if seen.setdefault(topic.name, 0) < 20:
+            seen[topic.name] += 1
+            message = types.of(topic.type_name).deserialize(data)
+            assert bytes(message.serialize(use_version_2=False)).rstrip(b"\0") == data.rstrip(b"\0"), topic.name
+            assert types.carry(topic.type_name, data).serialize(use_version_2=False) == data
+    assert seen.keys() == {topic.name for topic in TOPICS} - {"/can_fd_frames"}
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        CanFrame(0, 0x7FF, b""),
+        CanFrame(1_700_000_000_123_456_789, 0x1ABCDEF0, b"\x01\x02\x03", extended=True),
+        CanFrame(5, 0x181, b"12345678", remote=True),
+    ],
+)
+def test_a_can_frame_is_encoded_as_the_encoder_would(frame, encoder):
+    types = encoder.store.types
+    stamp = types["builtin_interfaces/msg/Time"](sec=frame.t_ns // 10**9, nanosec=frame.t_ns % 10**9)
+    data = np.frombuffer(frame.data.ljust(8, b"\0"), np.uint8)
+    message = types["can_msgs/msg/Frame"](
+        header=types["std_msgs/msg/Header"](stamp=stamp, frame_id=""),
+        id=frame.can_id,
+        is_rtr=frame.remote,
+        is_extended=frame.extended,
+        is_error=False,
+        dlc=len(frame.data),
+        data=data,
+    )
+    assert encode_can_frame(frame.t_ns, frame) == encoder.encode("can_msgs/msg/Frame", message)
+
+
+@pytest.mark.parametrize("name", JAZZY)
+def test_hashes_are_those_of_ros(name, encoder):
+    assert encoder.type_hash(name) == JAZZY[name]
+
+
+def until(condition, observations, bridge, most=4000):
+    """Feed the bridge until a condition holds; it is asked once a slice."""
+    for _, first in zip(range(most), itertools.cycle(range(0, len(observations), 16)), strict=False):
+        for observation in observations[first : first + 16]:
+            bridge.observe(observation)
+        if (found := condition()) is not None:
+            return found
+    pytest.fail("it did not come")
+
+
+def test_another_process_sees_ros_topics_and_commands_the_cell_within_its_limits(recorded, plan, messages):
+    bridge = BridgeProcess("ros2", plan, None, virtual=True)
+    try:
+        bridge.await_ready()
+        encoder = Encoder()
+        node = Ros2Node(DOMAIN, True, encoder)
+        builtin = BuiltinDataReader(node.participant, BuiltinTopicDcpsPublication)
+        joints, static, taxels = (node.reader(topic) for topic in (JOINT_STATES, TF_STATIC, TAXELS))
+        feed = recorded.observations
+        first = until(lambda: next(iter(joints.take(N=1)), None), feed, bridge)
+        logged = recorded.log("q_rad")
+        assert np.abs(logged[np.isfinite(logged).all(axis=1)] - np.array(first.position)).max(axis=1).min() == 0.0
+        fixed = until(lambda: next(iter(static.take(N=1)), None), feed, bridge)  # sent before we were there
+        assert [t.child_frame_id for t in fixed.transforms] == ["flange", "probe"]
+        image = until(lambda: next(iter(taxels.take(N=1)), None), feed, bridge)
+        assert len(image.data) == 256
+
+        offered = {one.topic_name: one for one in builtin.take(N=200)}
+        for topic in TOPICS:
+            endpoint = offered[f"rt{topic.name}"]
+            assert endpoint.type_name == dds_name(topic.type_name)
+            assert endpoint.qos[Policy.Userdata].data == f"typehash={encoder.type_hash(topic.type_name)};".encode()
+            assert (endpoint.qos[Policy.Reliability] == Policy.Reliability.BestEffort) == topic.best_effort
+            assert (endpoint.qos[Policy.Durability] == Policy.Durability.TransientLocal) == topic.transient
+
+        force, speed, stop = (node.writer(topic) for topic in (FORCE, SPEED, STOP))
+        status = node.reader(STATUS)
+        number, nothing = node.types.of(FLOAT64), node.types.of(EMPTY)
+        said = []
+
+        def answers(count):
+            said.extend(message.data for message in status.take(N=10))
+            return said if len(said) >= count else None
+
+        until(lambda: True if all(w.get_matched_subscriptions() for w in (force, speed, stop)) else None, feed, bridge)
+        force.write(number(data=3.0))
+        until(lambda: answers(1), feed, bridge)
+        force.write(number(data=50.0))
+        until(lambda: answers(2), feed, bridge)
+        speed.write(number(data=-0.01))
+        until(lambda: answers(3), feed, bridge)
+        stop.write(nothing(structure_needs_at_least_one_member=0))
+        until(lambda: answers(4), feed, bridge)
+        until(lambda: True if len(bridge.requests) >= 2 else None, feed, bridge)
+        assert said[0] == "target_force_n 3: taken"
+        assert said[1].startswith("target_force_n 50: refused: task.force_n: expected")
+        assert said[2].startswith("speed_m_s -0.01: refused: task.speed_mm_s: expected")
+        assert said[3] == "stop: taken"
+        assert list(bridge.requests) == [
+            {"kind": "target_force_n", "value": 3.0},
+            {"kind": "stop", "value": None},
+        ]
+        assert bridge.end("{}")["error"] is None
+    finally:
+        bridge.kill()
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "why"),
+    [
+        ("target_force_n", 3.0, None),
+        ("target_force_n", 5.0, "less than limits.force_max_n = 5"),
+        ("target_force_n", float("nan"), "expected a number"),
+        ("speed_m_s", 0.03, None),
+        ("speed_m_s", 0.3, "task.speed_mm_s"),
+        ("start", None, None),
+        ("stop", None, None),
+    ],
+)
+def test_limits_are_those_of_the_scene(recorded, kind, value, why):
+    refused = refuse(recorded.result.plan, kind, value)
+    assert refused is None if why is None else why in refused
+
+
+def test_a_speed_that_the_joints_cannot_follow_is_refused_with_the_joint(recorded):
+    """Within the range of the key, but not of the arm: the plan of the changed scene says so."""
+    text = dump_scene(recorded.result.plan.scene).replace("joint_speed_share = 1.0", "joint_speed_share = 0.5")
+    refused = refuse(make_plan(parse_scene(text)), "speed_m_s", 0.19)
+    assert refused is not None and "joint" in refused

@@ -1,0 +1,113 @@
+"""Tables of a run: every number where it was, every unit with it, to Parquet and back bit by bit."""
+
+from __future__ import annotations
+
+import runpy
+from importlib import resources
+
+import numpy as np
+import pandas as pd
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from canprobe.errors import UsageError
+from canprobe.tables import load_table, npz_to_parquet, parquet_to_npz, to_frame, unit_of, write_parquet
+
+
+@pytest.fixture
+def run(recorded):
+    return recorded.folder, recorded.result
+
+
+def test_every_number_of_the_log_is_in_the_table_under_its_time(run):
+    _, result = run
+    table = result.to_pandas()
+    assert len(table) == result.summary["cycle"]["cycles"] and table.index.name == "t_s"
+    np.testing.assert_array_equal(table.index, result.log["t_s"])
+    for axis in range(6):
+        np.testing.assert_array_equal(table[f"q_rad_{axis}"], result.log["q_rad"][:, axis])
+    np.testing.assert_array_equal(table["force_n"], result.log["force_n"])
+    assert table.shape[1] == sum(int(np.prod(column.shape[1:])) for column in result.log.values()) - 1
+
+
+def test_every_column_has_its_unit(run):
+    _, result = run
+    units = result.to_pandas().attrs["units"]
+    assert {name: units[name] for name in ("q_rad_3", "contact_mm_1", "force_n", "torque_permille_0", "phase")} == {
+        **{"q_rad_3": "rad", "contact_mm_1": "mm", "force_n": "N", "torque_permille_0": "permille", "phase": "1"}
+    }
+    assert result.to_pandas("truth").attrs["units"]["contact_point_2"] == "m"
+    assert result.to_pandas().attrs["scene"] == "cylinder"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [
+        ("t_s", "s"),
+        ("K_covariance_per_m2", "1/m^2"),
+        ("K_per_m", "1/m"),
+        ("speed_m_s", "m/s"),
+        ("T_base_contact_m", "m"),
+    ],
+)
+def test_units_are_read_off_the_names(name, unit):
+    assert unit_of(name) == unit
+
+
+@pytest.mark.parametrize("name", ["log.npz", "truth.npz"])
+def test_a_file_goes_to_parquet_and_back_bit_by_bit(run, tmp_path, name):
+    folder, _ = run
+    npz_to_parquet(folder / name, tmp_path / "table.parquet")
+    parquet_to_npz(tmp_path / "table.parquet", tmp_path / "back.npz")
+    with np.load(folder / name) as before, np.load(tmp_path / "back.npz") as after:
+        assert before.files == after.files
+        for column in before.files:
+            assert before[column].dtype == after[column].dtype
+            np.testing.assert_array_equal(before[column], after[column])
+    pd.testing.assert_frame_equal(load_table(tmp_path / "table.parquet"), load_table(folder / name))
+
+
+def test_other_readers_of_parquet_find_the_units_too(run, tmp_path):
+    """By pandas alone, which keeps them in attrs, and by pyarrow alone, field by field."""
+    _, result = run
+    result.to_parquet(tmp_path / "log.parquet")
+    assert pd.read_parquet(tmp_path / "log.parquet").attrs["units"]["force_n"] == "N"
+    schema = pq.read_schema(tmp_path / "log.parquet")
+    assert schema.field("q_rad_5").metadata[b"unit"] == b"rad"
+    assert {schema.field(name).type for name in ("t_s", "q_rad_5")} == {schema.field("force_n").type}
+
+
+@settings(max_examples=30)
+@given(st.lists(st.integers(1, 3), max_size=3), st.integers(0, 4), st.sampled_from(["f8", "i8", "u1", "?"]))
+def test_any_shape_and_type_survives(tmp_path_factory, shape, rows, kind):
+    path = tmp_path_factory.mktemp("any") / "a.parquet"
+    values = np.random.default_rng(7).integers(0, 2, (rows, *shape)).astype(kind)
+    write_parquet({"t_s": np.arange(float(rows)), "x_m": values}, path)
+    parquet_to_npz(path, path.with_suffix(".npz"))
+    with np.load(path.with_suffix(".npz")) as after:
+        assert after["x_m"].dtype == values.dtype and after["x_m"].shape == values.shape
+        np.testing.assert_array_equal(after["x_m"], values)
+
+
+def test_what_is_no_table_is_refused_in_a_line(tmp_path):
+    with pytest.raises(UsageError, match="columns of 2, 3 rows"):
+        to_frame({"a": np.zeros(2), "b": np.zeros(3)})
+    (tmp_path / "a.parquet").write_text("nothing")
+    for name in ("a.parquet", "b.parquet", "b.npz"):
+        with pytest.raises(UsageError, match=name):
+            load_table(tmp_path / name)
+    pd.DataFrame({"a": [1.0]}).to_parquet(tmp_path / "foreign.parquet")
+    with pytest.raises(UsageError, match="column a does not say of which array"):
+        load_table(tmp_path / "foreign.parquet")
+
+
+def test_the_example_runs_as_it_stands(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    example = resources.files("canprobe") / "examples" / "first_look.py"
+    names = runpy.run_path(str(example))
+    assert names["scan"].force_n.mean() == pytest.approx(2.0, abs=0.05)
+    assert names["truth"].force.mean() == pytest.approx(2.0, abs=0.1)
+    assert names["estimates"]["kappa_per_m_0"].iloc[-1] == pytest.approx(1 / 0.036, rel=0.05)
+    assert "'force_n': 'N', 'contact_mm_2': 'mm', 'q_rad_0': 'rad'" in capsys.readouterr().out

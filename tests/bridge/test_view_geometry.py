@@ -1,0 +1,249 @@
+"""The shapes of the 3-D view: links against forward kinematics, ghosts and patches against exact surfaces."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from canprobe.bridge.sample import SurfacePatch
+from canprobe.bridge.view import arm, colours, meshes, objects, patch, taxels
+from canprobe.emulator.plant.field import pad_coordinates
+from canprobe.robot.kinematics import chain, forward, tool_z_offset
+from canprobe.robot.puma260 import MODELS
+from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.objects import make_object
+
+MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
+QS = np.random.default_rng(2).uniform(-2.5, 2.5, (20, 6))
+
+
+def winding(mesh, point):
+    """How often a closed mesh goes round a point: 1 inside, 0 outside (van Oosterom and Strackee, 1983)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] - point for i in range(3))
+    la, lb, lc = (np.linalg.norm(x, axis=1) for x in (a, b, c))
+    dot = lambda x, y: np.einsum("ij,ij->i", x, y)  # noqa: E731
+    over = dot(a, np.cross(b, c))
+    under = la * lb * lc + dot(a, b) * lc + dot(b, c) * la + dot(c, a) * lb
+    return float(np.sum(2.0 * np.arctan2(over, under)) / (4.0 * math.pi))
+
+
+def normals(mesh):
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return np.cross(b - a, c - a)
+
+
+def face_middles(mesh):
+    return mesh.vertices[mesh.faces].mean(axis=1)
+
+
+# meshes
+
+
+def test_volumes_are_those_of_the_solids():
+    polygon = 0.5 * meshes.SECTORS * 0.05**2 * math.sin(2 * math.pi / meshes.SECTORS)
+    assert meshes.cylinder(0.05, (-0.1, 0.2)).volume == pytest.approx(0.3 * polygon, rel=1e-12)
+    stadium = math.pi * 0.02**2 + 0.04 * 0.1
+    link = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03))
+    assert link.volume == pytest.approx(0.03 * stadium, rel=2e-3)
+    assert meshes.dome(0.04, math.pi, rings=200, sectors=200).volume == pytest.approx(
+        4 / 3 * math.pi * 0.04**3, rel=1e-3
+    )
+    rounded = meshes.link(((0.0, 0.0), 0.02), ((0.06, 0.08), 0.02), (0.0, 0.03), 4e-3)
+    assert 0.9 * link.volume < rounded.volume < link.volume
+
+
+def test_a_link_between_unequal_circles_has_their_tangents():
+    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.1, 0.0), 0.01), 400)
+    apart = np.minimum(np.hypot(*outline.T) - 0.03, np.hypot(outline[:, 0] - 0.1, outline[:, 1]) - 0.01)
+    assert np.abs(apart).max() < 1e-12
+    edges = np.roll(outline, -1, axis=0) - outline
+    assert (
+        edges[:, 0] * np.roll(edges, -1, axis=0)[:, 1] - edges[:, 1] * np.roll(edges, -1, axis=0)[:, 0] > -1e-15
+    ).all()
+
+
+def test_a_circle_inside_the_other_leaves_the_larger():
+    outline = meshes.link_outline(((0.0, 0.0), 0.03), ((0.01, 0.0), 0.005))
+    assert np.hypot(*outline.T) == pytest.approx(0.03)
+
+
+def test_moving_keeps_faces_outside():
+    T = homogeneous(tangent_rotation(np.array([0.6, 0.0, 0.8])), np.array([0.1, 0.2, 0.3]))
+    mesh = meshes.cylinder(0.02, (0.0, 0.1), 2e-3)
+    assert mesh.moved(T).volume == pytest.approx(mesh.volume)
+    assert winding(mesh.moved(T), T[:3, 3] + 0.05 * T[:3, 2]) == pytest.approx(1.0)
+
+
+# the arm
+
+
+@MODEL
+@pytest.mark.parametrize("q", QS[:6])
+def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
+    frames = arm.link_frames(model, q)
+    assert frames[6] == pytest.approx(forward(model, q), abs=1e-14)
+    c = chain(model, q)
+    assert frames[4][:3, 3] == pytest.approx(c.wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(
+        c.wrist, abs=1e-14
+    )
+    assert frames[1][:3, 2] == pytest.approx(c.axis2, abs=1e-14) and frames[3][:3, 2] == pytest.approx(
+        c.axis4, abs=1e-14
+    )
+
+
+@MODEL
+def test_every_link_is_a_closed_body_the_right_way_out(model):
+    parts = arm.arm_parts(model)
+    assert len({part.name for part in parts}) == len(parts) and {part.frame for part in parts} == set(range(7))
+    assert all(part.mesh.volume > 0 for part in parts)
+    for part in parts:
+        edges = np.sort(part.mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+        places = np.unique(part.mesh.vertices.round(9), axis=0, return_inverse=True)[1].ravel()
+        at = np.sort(places[edges], axis=1)
+        at = at[at[:, 0] != at[:, 1]]  # triangles at a pole have an edge without length
+        _, uses = np.unique(at, axis=0, return_counts=True)
+        assert (uses % 2 == 0).all(), part.name
+
+
+@MODEL
+def test_joints_lie_in_the_bodies_that_they_join(model):
+    """Each joint's place by the closed form, looked for in the solids on both of its sides, in many postures."""
+    parts = {part.name: part for part in arm.arm_parts(model)}
+
+    def inside(name, frames, point):
+        part = parts[name]
+        return winding(part.mesh.moved(frames[part.frame]), point) > 0.5
+
+    for q in QS:
+        frames, c = arm.link_frames(model, q), chain(model, q)
+        axis, side = np.array(c.axis2), math.copysign(1.0, model.links[2])
+        shoulder = np.array([0.0, 0.0, c.d1])
+        beam = side * (abs(model.links[2]) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
+        assert inside("shoulder", frames, shoulder)
+        assert inside("upper_arm", frames, shoulder + beam * axis)  # round joint 2
+        assert inside("upper_arm", frames, np.array(c.elbow) + beam * axis)  # round joint 3
+        assert inside("forearm", frames, np.array(c.elbow) + model.links[2] * axis)
+        assert inside("wrist", frames, np.array(c.wrist)) and inside("hub", frames, np.array(c.wrist))
+        assert not inside("forearm", frames, np.array(c.wrist) + 0.04 * np.array(c.axis4))
+
+
+def test_the_two_published_arms_differ_where_their_numbers_do():
+    upenn, unimate = ({p.name: p.mesh for p in arm.arm_parts(MODELS[name])} for name in ("upenn", "unimate"))
+    length = lambda mesh: float(np.ptp(mesh.vertices[:, 0]))  # noqa: E731
+    assert length(upenn["upper_arm"]) - length(unimate["upper_arm"]) == pytest.approx(0.2 * 0.0254, abs=1e-6)
+
+
+def test_the_probe_is_a_ball_with_a_holder_from_the_flange():
+    tool = tool_z_offset(80.0)
+    holder, elastic = arm.probe_parts(0.04, tool)
+    assert np.linalg.norm(elastic.vertices, axis=1) == pytest.approx(0.04)
+    assert elastic.vertices[:, 2].max() == pytest.approx(0.04)
+    assert holder.volume > 0 and holder.vertices[:, 2].min() == pytest.approx(-0.08)
+    assert np.linalg.norm(holder.vertices[holder.vertices[:, 2] > -0.02], axis=1).max() < 0.04
+    assert np.einsum("ij,ij->i", normals(elastic), face_middles(elastic)).min() > -1e-15
+
+
+# the array
+
+
+def test_taxels_lie_where_the_plant_has_them():
+    radius, pitch = 0.04, 0.0254 / 16
+    places, turns = taxels.taxel_poses(radius)
+    for k, (place, (w, x, y, z)) in enumerate(zip(places, turns, strict=True)):
+        direction = place / np.linalg.norm(place)
+        u, v = pad_coordinates(tuple(direction), radius)
+        assert (u / pitch + 7.5, v / pitch + 7.5) == pytest.approx((k % 16, k // 16), abs=1e-9)
+        up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))  # where the quaternion takes z
+        assert up == pytest.approx(direction, abs=1e-12)
+    assert np.linalg.norm(places, axis=1) == pytest.approx(radius + taxels.LIFT_M)
+
+
+def test_the_image_has_u_to_the_right_and_v_upward():
+    counts = np.zeros((16, 16), np.uint8)
+    counts[0, 15] = 255  # lowest v, highest u
+    image = taxels.taxel_image(counts, pixels=2)
+    bright = np.argwhere(image.sum(axis=2) > 300)
+    assert bright.min(axis=0).tolist() == [30, 30] and bright.max(axis=0).tolist() == [31, 31]
+
+
+# objects
+
+POSE = homogeneous(tangent_rotation(np.array([0.36, -0.48, 0.8])), np.array([-0.12, 0.1, 0.37]))
+KINDS = {
+    "plane": {},
+    "sphere": {"radius": 0.03},
+    "large sphere": {"radius": 0.5},
+    "cylinder": {"radius": 0.036},
+    "large cylinder": {"radius": 0.4},
+    "saddle": {"radius_x": 0.05, "radius_y": -0.12},
+    "bowl": {"radius": 0.08},
+    "large bowl": {"radius": 0.6},
+    "quadric": {"matrix": np.array([[6, 2, 0, 0], [2, 9, 0, 0], [0, 0, 3, 0.5], [0, 0, 0.5, 0]], float)},
+}
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_ghosts_lie_on_the_exact_surface_with_their_front_outside(name):
+    shape = make_object(name.split()[-1], T_base_object=POSE, **KINDS[name])
+    mesh = objects.object_mesh(shape)
+    feet = [shape.closest(vertex) for vertex in mesh.vertices]
+    assert max(abs(foot.distance) for foot in feet) < 1e-9
+    flat = np.linalg.norm(normals(mesh), axis=1) < 1e-12
+    outward = np.array([shape.closest(p).normal for p in face_middles(mesh)[~flat]])
+    n = normals(mesh)[~flat]
+    assert np.einsum("ij,ij->i", n / np.linalg.norm(n, axis=1, keepdims=True), outward).min() > 0.9
+    assert np.linalg.norm(mesh.vertices - POSE[:3, 3], axis=1).min() < 0.006  # it is there where it is touched
+    lines = objects.object_lines(shape)
+    assert max(abs(shape.closest(p).distance) for p in lines.reshape(-1, 3)[::7]) < 1e-9
+
+
+# the patch
+
+
+def sphere_patch(radius=0.05, sigma=0.3, known=True):
+    covariance = np.diag([sigma**2, 0.5 * sigma**2, sigma**2])
+    if not known:
+        covariance[2] = covariance[:, 2] = np.nan
+    return SurfacePatch(0, POSE, np.eye(2) / radius, covariance, (True, known))
+
+
+def test_the_patch_of_a_ball_lies_on_the_ball():
+    xy = patch.disc_points()
+    shape = patch.patch_shape(sphere_patch(), xy)
+    r = np.hypot(*xy.T)
+    exact = 0.05 - np.sqrt(0.05**2 - r**2)
+    assert np.abs(shape.surface[:, 2] - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
+    mesh = meshes.Mesh(shape.surface, patch.disc_faces())
+    assert (normals(mesh)[:, 2] < 0).all()  # z is the inward normal
+    assert np.linalg.norm(normals(mesh), axis=1).sum() / 2 == pytest.approx(math.pi * patch.RADIUS_M**2, rel=0.04)
+
+
+def test_the_shells_are_two_deviations_away_twenty_times_over():
+    """Against curvatures drawn from the covariance."""
+    xy = patch.disc_points()
+    shape = patch.patch_shape(sphere_patch(), xy)
+    x, y = xy.T
+    draws = np.random.default_rng(1).multivariate_normal(np.zeros(3), sphere_patch().covariance, 20_000)
+    heights = 0.5 * draws[:, :1] * x**2 + draws[:, 1:2] * x * y + 0.5 * draws[:, 2:] * y**2
+    spread = heights.std(axis=0)
+    assert shape.surface[:, 2] - shape.above[:, 2] == pytest.approx(40 * spread, rel=0.03, abs=1e-12)
+    assert shape.below[:, 2] - shape.surface[:, 2] == pytest.approx(40 * spread, rel=0.03, abs=1e-12)
+
+
+def test_what_was_not_observed_stands_as_far_away_as_is_drawn():
+    shape = patch.patch_shape(sphere_patch(known=False), patch.disc_points())
+    gap = shape.surface[:, 2] - shape.above[:, 2]
+    assert gap[0] == 0.0 and gap[1:] == pytest.approx(patch.MOST_M)
+
+
+# colours
+
+
+def test_colours_rise_in_lightness_and_tell_what_is_unknown():
+    scale = colours.scale(np.linspace(-1.0, 3.0, 200), 0.0, 2.0).astype(float)
+    lightness = scale @ (0.2126, 0.7152, 0.0722)
+    assert (np.diff(lightness) >= -1.0).all() and lightness[-1] - lightness[0] > 150
+    assert (scale[:50] == scale[0]).all() and scale[0].tolist() == [68, 1, 84]
+    assert colours.scale([math.nan, math.inf], 0.0, 1.0).tolist() == [list(colours.UNKNOWN)] * 2

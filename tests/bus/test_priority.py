@@ -1,0 +1,69 @@
+"""Real-time scheduling: asked for, told where it is refused, and given back."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from canprobe.bus.priority import realtime
+
+SCRIPT = """
+import os, sys
+from canprobe.bus.priority import realtime
+def locked():
+    return int(next(line.split()[1] for line in open("/proc/self/status") if line.startswith("VmLck")))
+def state():
+    return os.sched_getscheduler(0), os.sched_getparam(0).sched_priority, len(os.sched_getaffinity(0)), locked() > 0
+said = []
+before = state()
+with realtime(7, said.append):
+    within = state()
+print(before == state(), within, said)
+"""
+
+
+def run(*prefix):
+    done = subprocess.run([*prefix, sys.executable, "-c", SCRIPT], capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
+def permitted():
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+        os.sched_setscheduler(0, *before)
+    except OSError:
+        return False
+    return True
+
+
+@pytest.mark.skipif(not permitted(), reason="SCHED_FIFO is not permitted here")
+def test_everything_is_had_and_given_back():
+    assert run() == f"True ({os.SCHED_FIFO}, 7, 1, True) []"
+
+
+def test_what_is_refused_is_told_with_the_way_to_it(monkeypatch):
+    def refuse(*_, **__):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "sched_setscheduler", refuse)
+    monkeypatch.setattr(os, "sched_setaffinity", refuse)
+    monkeypatch.setattr("canprobe.bus.priority.ctypes.CDLL", refuse)
+    before, said = os.sched_getaffinity(0), []
+    with realtime(40, said.append):
+        pass
+    assert said[0] == (
+        "real time: no SCHED_FIFO priority 40: Operation not permitted; run as root, or allow it: ulimit -r 50"
+    )
+    assert [line.split(":")[1] for line in said[-1:]] == [" no locked memory"]
+    assert os.sched_getaffinity(0) == before
+
+
+def test_an_error_within_gives_everything_back_too():
+    before = os.sched_getscheduler(0), os.sched_getaffinity(0)
+    with pytest.raises(ZeroDivisionError), realtime(1, lambda _: None):
+        raise ZeroDivisionError
+    assert (os.sched_getscheduler(0), os.sched_getaffinity(0)) == before

@@ -1,0 +1,186 @@
+"""Bring-up in lockstep: side by side, with retries, kept configurations, and a report of what failed where."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.cell.bringup import configuration_date
+from canprobe.cell.configuration import make_setups
+from canprobe.eds import eds_path
+from canprobe.emulator.faults import Fault, FaultKind
+from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.errors import NodeError
+from canprobe.session import Session
+
+MS = 1_000_000
+
+
+def open_session(tmp_path, *, faults=(), change=None, nodes=None, scene="free", rate_hz=400.0, **bring_up):
+    loaded = canprobe.load_scene(scene)
+    loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
+
+    def join(participant):
+        if hasattr(participant, "node_id"):
+            if nodes is not None:
+                if participant.node_id in nodes:
+                    participant.store.saved = nodes[participant.node_id]
+                nodes[participant.node_id] = participant
+            if change is not None:
+                change(participant)
+            return FaultyNode(participant, faults)
+        return participant
+
+    session.joins = join
+    return session
+
+
+def frames(tmp_path):
+    from canprobe.bus.candump import read_candump
+
+    return [(t, can_id, data) for t, _, can_id, data in read_candump(tmp_path / "bus.log")]
+
+
+def writes_to(log, node_id):
+    return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
+
+
+def test_the_nodes_are_configured_side_by_side(tmp_path):
+    with open_session(tmp_path) as session:
+        reports = session.cell.bring_up_reports
+    assert [str(r) for r in reports] == [f"node {i}: (joint {i}) configured, software 1.0" for i in range(1, 7)]
+    asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
+    for part in range(1, 6):
+        so_far = asked[: len(asked) * part // 6]
+        counts = [so_far.count(node_id) for node_id in range(1, 7)]
+        assert max(counts) - min(counts) <= 2
+
+
+def test_a_lost_answer_is_asked_for_again(tmp_path):
+    lost = Fault(FaultKind.DROP, 3, 300 * MS, 300 * MS)
+    with open_session(tmp_path, faults=[lost]) as session:
+        reports = session.cell.bring_up_reports
+    assert [report.repeated for report in reports] == [0, 0, 1, 0, 0, 0]
+    assert str(reports[2]) == "node 3: (joint 3) configured, software 1.0, 1 requests repeated"
+
+
+def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
+    mute = Fault(FaultKind.DROP, 3, 300 * MS, 9000 * MS)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) read of 1018h:01 failed: No SDO response") as failed:
+        open_session(tmp_path, faults=[replace(mute, incoming=True)]).__enter__()
+    assert failed.value.node_id == 3
+    times = [t for t, i, d in frames(tmp_path) if i == 0x603 and d[0] == 0x40]
+    assert [b - a for a, b in pairwise(times)] == [pytest.approx(500 * MS, rel=0.01)], "one retry"
+    others = [t for t, i, _ in frames(tmp_path) if i == 0x601]
+    assert len([t for t in others if t < times[1]]) > 20, "the others did not wait for node 3"
+
+
+def test_all_that_failed_is_told(tmp_path):
+    def refuse(node):
+        if node.node_id in (2, 5):
+            node.dictionary.entries.pop(0x606500)
+
+    with pytest.raises(NodeError) as failed:
+        open_session(tmp_path, change=refuse).__enter__()
+    text = str(failed.value)
+    assert text.startswith("node 2: (joint 2) write of 6065h:00 = ")
+    assert "; node 5: (joint 5) write of 6065h:00 = " in text and text.count("failed: Code 0x06090011") == 2
+
+
+def test_a_value_that_does_not_stay_is_told(tmp_path):
+    def forget(node):
+        if node.node_id == 4:
+            node.dictionary.on_write(0x6066, lambda sub, value: node.dictionary.put(0x6066, sub, 7))
+
+    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 6066h:00 reads back 0x7 after 0x32 was written"):
+        open_session(tmp_path, change=forget).__enter__()
+
+
+def test_a_kept_configuration_is_not_written_again(tmp_path):
+    nodes = {}
+    logs, kept = [], []
+    for run in range(2):
+        with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
+            kept.append([report.kept for report in session.cell.bring_up_reports])
+        nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
+        logs.append(frames(tmp_path))
+        assert session.cell.faults == [], run
+    assert kept == [[False] * 7, [True] * 7]
+    assert len(writes_to(logs[0], 2)) > 25 and writes_to(logs[1], 2) == [(0x1016, 1)]  # the heartbeat consumer's end
+    assert writes_to(logs[1], 16) == [(0x2003, 0), (0x1016, 1)]  # and the tare, which is a command
+
+
+def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed(tmp_path):
+    nodes = {}
+    with open_session(tmp_path, nodes=nodes, store=True):
+        pass
+    saved = {node_id: node.store.saved for node_id, node in nodes.items()}
+    nodes = dict(saved)
+    with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
+        assert not any(report.kept for report in session.cell.bring_up_reports)
+    saved[3] = {**saved[3], 0x102001: 0}
+    with open_session(tmp_path, nodes=dict(saved), store=True) as session:
+        assert [report.kept for report in session.cell.bring_up_reports] == [True, True, False, True, True, True]
+
+
+def test_any_write_over_sdo_takes_the_date_back():
+    nodes = {}
+    session = open_session(None, nodes=nodes, store=True)
+    with session:
+        drive = nodes[1]
+        date = configuration_date(make_setups(session.plan)[0])
+        assert {sub: drive.dictionary.number(0x1020, sub) for sub in (1, 2)} == date and min(date.values()) > 0
+        drive.receive(0x601, bytes.fromhex("2b6660001e000000"), drive.core.now_ns)
+        assert [drive.dictionary.number(0x1020, sub) for sub in (1, 2)] == [0, 0]
+
+
+def test_a_node_that_boots_late_is_reset_again(tmp_path):
+    dark = Fault(FaultKind.FREEZE, 2, 200 * MS, 400 * MS)
+    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3) as session:
+        assert all(report.failure is None for report in session.cell.bring_up_reports)
+    resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
+    assert [d[1] for d in resets].count(2) >= 2 and [d[1] for d in resets].count(1) == 1
+
+
+def other_make(tmp_path):
+    """The EDS of a drive of another make: other names and numbers, one RPDO and TPDO with mappings that are fixed, and
+    nothing that only our drive has."""
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    text = text.replace("0x0000CA5E", "0x000000AB").replace("0x00000260", "0x00001234")
+    sections = re.split(r"(?m)^(?=\[)", text)
+    optional = "1015|1019|1016|6007|605A|6065|6066|607D|1020|1010|1011|100A|(14|16|18|1A)0[123]|2[0-9A-F]{3}"
+    gone = re.compile(rf"\[({optional})(sub\w+)?\]", re.IGNORECASE)
+    kept = [section for section in sections if not gone.match(section)]
+    objects = {m[1].upper() for s in sections if (m := re.match(r"\[([0-9A-F]{4})\]", s)) and gone.match(s)}
+    lists = "".join(kept)
+    for index in objects:
+        lists = re.sub(rf"(?mi)^\d+=0x{index}\n", "", lists)
+    path = tmp_path / "other_make.eds"
+    path.write_text(renumbered(lists), encoding="ascii")
+    return path
+
+
+def renumbered(text):
+    """The lists of objects counted from 1 again."""
+
+    def again(match):
+        indices = re.findall(r"(?m)^\d+=(0x[0-9A-Fa-f]{4})$", match[2])
+        rows = "".join(f"{n}={index}\n" for n, index in enumerate(indices, start=1))
+        return f"[{match[1]}]\nSupportedObjects={len(indices)}\n{rows}\n"
+
+    return re.sub(r"\[(\w+Objects)\]\nSupportedObjects=\d+\n((?:\d+=0x[0-9A-Fa-f]{4}\n)+)\n?", again, text)
+
+
+def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
+    result = canprobe.run(scene, out=tmp_path / "out", duration_s=1.0)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert np.ptp(result.truth["q"][:, 5]) > 0.01
+    assert canprobe.run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB

@@ -1,0 +1,40 @@
+"""The run's log: whole, or only its last rows."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from canprobe.cell.cycle import CycleStatistics
+from canprobe.cell.log import LastRows, RunLog
+
+
+def rows(count):
+    for k in range(count):
+        yield {"t_s": 0.1 * k, "q_rad": np.full(6, float(k))} | ({"force_n": float(k)} if k % 3 == 0 else {})
+
+
+def filled(log, count):
+    for row in rows(count):
+        log.add(row)
+    return log
+
+
+def test_the_last_rows_are_those_of_the_whole_log():
+    whole, last = filled(RunLog(), 50).arrays(), filled(LastRows(7), 50)
+    assert len(last) == 7
+    for name, column in last.arrays().items():
+        np.testing.assert_array_equal(column, whole[name][-7:])
+
+
+def test_fewer_rows_than_are_kept():
+    assert filled(LastRows(7), 3).arrays()["q_rad"].shape == (3, 6)
+    assert LastRows(7).arrays() == {}
+
+
+def test_statistics_of_the_last_cycles():
+    kept, all_ = CycleStatistics.of_last(3), CycleStatistics.of_last(None)
+    for statistics in (kept, all_):
+        for k in range(5):
+            statistics.period_error_ns.append(k)
+    assert list(kept.period_error_ns) == [2, 3, 4]
+    assert len(all_.period_error_ns) == 5

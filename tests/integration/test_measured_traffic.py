@@ -1,0 +1,92 @@
+"""Measured = planned: a lockstep run's log counts what its plan lists, in time, and nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import pytest
+
+import canprobe
+from canprobe.cell.build import make_task
+from canprobe.cli import main
+from canprobe.errors import UsageError
+from canprobe.session import Session, resolve_scene
+
+
+def timed(scene, **fields):
+    return dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, **fields))
+
+
+@pytest.fixture(scope="module")
+def press(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("press")
+    scene = canprobe.load_scene("press")
+    return canprobe.run(scene, out=folder, duration_s=1.0), folder
+
+
+def test_a_touch_is_as_planned_to_the_frame(press):
+    result, folder = press
+    measured = canprobe.measure_traffic(folder, result.plan)
+    assert measured.as_planned and measured.exact
+    assert measured.unlisted == {} and measured.missing == ()
+    for one in measured.classes:
+        if one.planned_frames is not None:
+            assert one.frames == pytest.approx(one.planned_frames, rel=0.02), one.kind
+            assert one.bits <= one.planned_bits
+        assert one.late == 0, one.kind
+        assert one.slowest is None or 0.3 < one.slowest <= 1.0
+    assert measured.load < measured.planned_worst
+
+
+def test_the_summary_says_the_same(press):
+    result, folder = press
+    measured = canprobe.measure_traffic(folder / "bus.log", result.plan).as_dict()
+    summary = result.summary["traffic"]["can0"]
+    assert summary["as_planned"] is True and summary["stuff_bits_counted"] is False
+    for kind, one in summary["classes"].items():
+        assert one["frames"] == measured["classes"][kind]["frames"]
+        assert one["late"] == 0
+    assert summary["load"] < measured["load"] < summary["planned_worst"]
+
+
+def test_plan_measured_on_the_command_line(press, capsys):
+    _, folder = press
+    assert main(["plan", "press", "--measured", str(folder)]) == 0
+    assert "drive TPDO" in capsys.readouterr().out
+    assert main(["plan", "press", "--measured", str(folder / "bus.log"), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["can0"]["as_planned"] is True
+    assert main(["plan", "free", "--measured", str(folder)]) == 3
+    assert "not in the plan: 511h" in capsys.readouterr().out
+
+
+def test_logs_that_cannot_be_measured(press, tmp_path):
+    result, folder = press
+    with pytest.raises(UsageError, match="channel can1; name one that has it: can0"):
+        canprobe.measure_traffic(folder, result.plan, channel="can1")
+    empty = tmp_path / "empty.log"
+    empty.write_text("(0000000000.000000) can0 181#00\n")
+    with pytest.raises(UsageError, match="no SYNC"):
+        canprobe.measure_traffic(empty, result.plan)
+    two = tmp_path / "two.log"
+    two.write_text("(0000000000.000000) vcan1 080#01\n(0000000000.000000) vcan2 080#01\n")
+    with pytest.raises(UsageError, match="vcan1, vcan2"):
+        canprobe.measure_traffic(two, result.plan)
+
+
+def carry_out(scene):
+    session = Session(resolve_scene(scene, duration_s=0.3))
+    with session:
+        session.run(make_task(session.plan))
+    return session
+
+
+def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors():
+    """One bit in 10 000 fails: about one frame in 90 is sent again."""
+    scene = timed(canprobe.load_scene("free"), bit_error_rate=1e-4)
+    first, second = carry_out(scene), carry_out(scene)
+    buses = [session.lockstep for session in (first, second)]
+    assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
+    assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
+    assert first.meters["can0"].report().as_planned
+    assert first.cell.drives.missed == 0

@@ -1,0 +1,60 @@
+"""Each packaged object and stiffness, six seconds of scan in lockstep, scored against the plant's truth."""
+
+from dataclasses import replace
+
+import pytest
+
+import canprobe
+from canprobe.errors import PlanError
+from canprobe.planning import make_plan
+from canprobe.scene import ObjectSettings
+
+# scene: force RMS error and curvature RMS error that it stays below, percent
+TABLE = {
+    "ellipsoid": (5.0, 3.0),
+    "torus": (5.0, 13.0),  # the second curvature changes its sign within the estimator's memory
+    "fillet": (11.0, 90.0),  # no quadric fits over a jump of curvature
+    "bowl": (8.0, 1.5),
+    "wave": (5.0, 30.0),  # 7 1/m at most, and it changes within the memory
+    "steel": (13.0, 3.0),
+    "foam": (16.0, 10.0),
+    "miscalibrated": (28.0, 15.0),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLE)
+def test_scene_runs_completely_with_sensible_figures(name, tmp_path):
+    force_percent, kappa_percent = TABLE[name]
+    summary = canprobe.run(canprobe.load_scene(name), out=tmp_path, duration_s=6.0).summary
+    contact, shape = summary["contact"], summary["shape"]
+    assert summary["completed"], summary["stop_reason"]
+    assert contact["contact_fraction"] == 1.0
+    assert 0.0 < 100.0 * contact["force_rms_error_n"] / contact["force_target_n"] < force_percent
+    assert contact["force_max_n"] < 4.0
+    assert shape["observed"] == [True, True]
+    assert 0.0 < shape["kappa_rms_error_percent"] < kappa_percent
+    if name == "miscalibrated":  # what real calibration costs: the default has 1 % and 0.1 mm
+        assert shape["kappa_rms_error_percent"] > 4.0
+        assert shape["position_rms_mm"] > 0.5
+
+
+@pytest.mark.slow
+def test_a_dynamic_arm_is_as_deterministic_and_keeps_the_force(tmp_path):
+    scene = canprobe.load_scene("press")
+    scene = replace(scene, plant=replace(scene.plant, fidelity="dynamic"))
+    logs = []
+    for name in ("first", "second"):
+        result = canprobe.run(scene, out=tmp_path / name, duration_s=1.0)
+        logs.append((tmp_path / name / "bus.log").read_bytes())
+    assert logs[0] == logs[1]
+    assert result.summary["contact"]["force_rms_error_n"] < 0.2
+    assert result.summary["contact"]["contact_fraction"] == 1.0
+
+
+def test_a_bowl_as_tight_as_the_probe_is_refused_with_the_reason():
+    scene = canprobe.load_scene("bowl")
+    assert scene.object.kind == "bowl"
+    tight = replace(scene, object=ObjectSettings("bowl", radius_mm=40.0))
+    with pytest.raises(PlanError, match="hollow of radius 40 mm is tighter than the probe"):
+        make_plan(tight)

@@ -1,0 +1,586 @@
+"""Every row of the table of conditions: injected in lockstep, seen within its time, and answered as the table says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from struct import pack, unpack
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.bus.port import ControllerState
+from canprobe.cell.build import make_task
+from canprobe.cell.conditions import BY_KEY, CONDITIONS
+from canprobe.cell.limits import limits_of
+from canprobe.cell.measurement import Command
+from canprobe.cell.supervision import Reaction
+from canprobe.cell.tasks.touch import Phase
+from canprobe.emulator.faults import Fault, FaultKind
+from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.errors import CanprobeError, InterfaceError, NodeError, SafetyStop
+from canprobe.protocol.cia402 import POWERED_STATES, DriveState
+from canprobe.protocol.emcy import Emcy
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
+from canprobe.session import Session, resolve_scene
+
+LONG_NS = 10_000_000_000
+FREE_CYCLE = 80
+"""A cycle in which the arm of `free` moves."""
+HOLD_CYCLE = 700
+"""A cycle in which `press` holds its force."""
+
+
+class Injected:
+    """A run in which something happens at one cycle; what came of it, and when."""
+
+    def __init__(self, name, at, action, *, until=400, own=False, **changes):
+        scene = resolve_scene(canprobe.load_scene(name), duration_s=3.0)
+        if scene.task.kind in ("press", "scan"):
+            scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
+        scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
+        self.session = Session(scene)
+        self.limits = limits_of(self.session.plan)
+        self.nodes = {}
+        self.session.joins = self._join
+        self.task = make_task(self.session.plan)
+        self.at, self.action, self.until, self.own = at, action, at + until, own
+        self.injected_ns = self.answered_ns = self.error = None
+        self.held = 0
+        self._run()
+
+    def _join(self, participant):
+        if not hasattr(participant, "node_id"):
+            return participant
+        sensor = self.session.scene.sensor
+        of_sensor = sensor is not None and participant.node_id == sensor.node_id
+        ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(participant.node_id, "tpdo")] if of_sensor else ()
+        self.nodes[participant.node_id] = FaultyNode(participant, (), ids)
+        return self.nodes[participant.node_id]
+
+    def now(self):
+        return self.session.lockstep.clock.now_ns()
+
+    def fault(self, kind, node_id, **more):
+        self.nodes[node_id].add(Fault(kind, node_id, self.now(), more.pop("duration_ns", LONG_NS), **more))
+
+    def step(self, measurement):
+        if measurement.cycle == self.at:
+            self.injected_ns = self.now()
+            self.action(self)
+        if measurement.cycle > self.until:
+            return Command(done=True)
+        command = Command() if self.own else self.task.step(measurement)
+        if self.answered_ns is None and getattr(self.task, "phase", 0) == Phase.RETREAT and self.injected_ns:
+            self.answered_ns = self.now()
+        return self.command(measurement, command)
+
+    def command(self, measurement, command):
+        return command
+
+    def _run(self):
+        def step(measurement):
+            return self.step(measurement)
+
+        if not self.own and hasattr(self.task, "retreat"):
+            step.retreat = self.task.retreat
+            step.shape = self.task.shape
+        with self.session:
+            try:
+                self.session.run(step, progress=self._progress)
+            except (CanprobeError, KeyboardInterrupt, ZeroDivisionError) as error:
+                self.error = error
+                if self.answered_ns is None:
+                    self.answered_ns = self.now()
+
+    def _progress(self, measurement):
+        supervisor = self.session.cell.supervisor
+        self.held += supervisor.seen.controller_state is ControllerState.PASSIVE
+        self.after(measurement)
+
+    def after(self, measurement):
+        pass
+
+    def assert_within(self, key):
+        """The reaction came after the fault and within the time of the table."""
+        limit = BY_KEY[key].within(self.limits)
+        assert 0 <= self.answered_ns - self.injected_ns <= limit
+        return self
+
+    def assert_counted(self, key):
+        """The condition was counted within its time, and the run went on to its end."""
+        supervisor = self.session.cell.supervisor
+        assert self.error is None
+        assert supervisor.counts[key] > 0
+        waited = (supervisor.first[key] - self.at) * self.limits.period_ns
+        assert 0 <= waited <= BY_KEY[key].within(self.limits)
+        return self
+
+    def assert_drives_off(self, but=()):
+        for node_id in range(1, 7):
+            if node_id not in but:
+                word = self.nodes[node_id].node.dictionary.number(0x6041)
+                assert canprobe_state(word) not in POWERED_STATES
+
+
+def canprobe_state(word):
+    from canprobe.protocol.cia402 import state_of
+
+    return state_of(word)
+
+
+def send(run, frame):
+    """A frame from somebody who is no node of the cell."""
+    run.session.lockstep.port().send_batch([frame])
+
+
+def altered(node, can_id, change):
+    """Let a node send an identifier with other data; with None it does not send it."""
+    inner = node._sent
+
+    def sent(frames, t_ns):
+        changed = [(i, change(d) if i == can_id else d) for i, d in frames]
+        return inner([frame for frame in changed if frame[1] is not None], t_ns)
+
+    node._sent = sent
+
+
+# nodes
+
+
+def test_heartbeat_lost():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], HEARTBEAT_BASE + 3, lambda _: None))
+    run.assert_within("heartbeat").assert_drives_off()
+    assert isinstance(run.error, NodeError) and run.error.node_id == 3 and "heartbeat" in str(run.error)
+
+
+@pytest.mark.parametrize("node_id", [2, 6])
+def test_a_node_that_boots_again(node_id):
+    run = Injected("free", FREE_CYCLE, lambda r: r.fault(FaultKind.REBOOT, node_id, duration_ns=1_000_000))
+    run.assert_within("nmt_state").assert_drives_off()
+    assert isinstance(run.error, NodeError) and run.error.node_id == node_id
+    assert "INITIALISING" in str(run.error) or "PRE_OPERATIONAL" in str(run.error)
+
+
+def test_a_sensor_that_leaves_operation_in_contact():
+    run = Injected("press", HOLD_CYCLE, lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now()))
+    run.assert_within("nmt_state").assert_drives_off()
+    assert "node 16: left operation: NMT state STOPPED" in str(run.error)
+
+
+def test_a_drive_fault():
+    run = Injected("free", FREE_CYCLE, lambda r: r.nodes[2].node.application.inject_fault(0x4310))
+    run.assert_within("drive_fault").assert_drives_off()
+    assert run.error.node_id == 2 and "4310h" in str(run.error)
+
+
+def test_an_emcy_of_the_sensor():
+    def alarm(run):
+        run.nodes[16].node.emcy.report(0x5000)
+        send(run, (0x7A0, b""))  # a frame wakes the bus, which then carries the EMCY
+        run.session.lockstep._queue(run.session.lockstep._nodes[6], run.nodes[16].node._taken())
+
+    run = Injected("press", HOLD_CYCLE, alarm)
+    run.assert_within("emcy").assert_drives_off()
+    assert str(run.error) == "node 16: EMCY 5000h, device hardware"
+
+
+def test_an_emcy_about_communication_is_noted():
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
+    run.assert_counted("emcy_communication")
+    assert run.session.cell.faults == ["node 4: EMCY 8210h, PDO not processed due to length error"]
+
+
+def test_another_master():
+    run = Injected("free", FREE_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
+    run.assert_within("foreign_master")
+    assert isinstance(run.error, SafetyStop) and "another master" in str(run.error)
+
+
+# PDOs
+
+
+@pytest.mark.parametrize("kind", [FaultKind.DROP, FaultKind.DELAY, FaultKind.CORRUPT])
+def test_missed_pdos_are_lived_with(kind):
+    def lose(run):
+        if kind is FaultKind.CORRUPT:
+            altered(run.nodes[5], 0x185, lambda data: data[:5])
+            return
+        run.fault(kind, 5, duration_ns=8_000_000, amount_ns=2_000_000)
+
+    run = Injected("free", FREE_CYCLE, lose, until=2 if kind is FaultKind.CORRUPT else 20)
+    run.assert_counted("pdo_missed")
+    if kind is FaultKind.CORRUPT:
+        assert run.session.cell.drives.malformed > 0
+
+
+def test_a_silent_drive():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[5], 0x185, lambda _: None))
+    run.assert_within("drive_silent").assert_drives_off()
+    assert "node 5: lost: no TPDO for 6 cycles" in str(run.error)
+
+
+def test_torn_frames_are_dropped():
+    def lose(run):
+        node = run.nodes[16]
+        inner = node._sent
+        until = run.now() + 15_000_000
+        node._sent = lambda frames, t: inner([f for f in frames if f[0] != 0x515 or t > until], t)
+
+    Injected("press", HOLD_CYCLE, lose, until=40).assert_counted("torn_frame")
+
+
+def test_corrupt_frames_are_dropped():
+    def corrupt(run):
+        run.fault(FaultKind.CORRUPT, 16, duration_ns=15_000_000)
+
+    Injected("press", HOLD_CYCLE, corrupt, until=40).assert_counted("torn_frame")
+
+
+def test_a_frame_that_names_another_sync():
+    def shift(run):
+        run.fault(FaultKind.WRONG_DATA, 16, duration_ns=15_000_000, seed=4)
+
+    run = Injected("press", HOLD_CYCLE, shift, until=40)
+    run.assert_counted("sync_mismatch")
+    assert run.session.truth["force"].max() < 3.0
+
+
+def test_a_stale_sensor_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[16], 0x511, lambda _: None))
+    run.assert_within("sensor_stale").assert_drives_off()
+    assert "no tactile frame for 13 cycles" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+# the bus
+
+
+def test_error_frames_and_dropped_frames_are_noted():
+    def count(run):
+        run.session.cell._port.counters.error_frames += 3
+        run.session.cell._port.counters.overruns += 2
+
+    run = Injected("free", FREE_CYCLE, count, until=10)
+    run.assert_counted("error_frames").assert_counted("frames_dropped")
+    assert any("bus error frames: 3" in fault for fault in run.session.cell.faults)
+    assert any("dropped by the kernel: 2" in fault for fault in run.session.cell.faults)
+
+
+class Passive(Injected):
+    """Error-passive for a while."""
+
+    for_cycles = 40
+
+    def after(self, measurement):
+        if measurement.cycle == self.at + self.for_cycles:
+            self.session.cell._port.state = ControllerState.ACTIVE
+
+
+def passive(run):
+    run.session.cell._port.state = ControllerState.PASSIVE
+
+
+def test_error_passive_holds_until_it_is_over():
+    run = Passive("free", FREE_CYCLE, passive, until=100)
+    assert run.error is None
+    targets = run.session.cell.log.arrays()["q_target_rad"]
+    moved = np.isfinite(targets[:, 0])
+    held = ~moved[run.at + 1 : run.at + run.for_cycles + 1]
+    assert held.all() and moved[run.at] and moved[run.at + run.for_cycles + 1 : run.until].all()
+    assert any("error-passive: hold" in fault for fault in run.session.cell.faults)
+
+
+def test_error_passive_for_long_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, passive, until=1500)
+    assert "error-passive for 1.0 s" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def test_bus_off():
+    def off(run):
+        run.session.cell._port.state = ControllerState.BUS_OFF
+
+    run = Injected("free", FREE_CYCLE, off)
+    run.assert_within("bus_off").assert_drives_off()
+    assert isinstance(run.error, InterfaceError) and "bus-off" in str(run.error)
+
+
+@pytest.mark.parametrize("back_after_ns", [None, 100_000_000])
+def test_the_interface_is_removed_and_the_drives_stop_by_themselves(back_after_ns):
+    def remove(run):
+        port = run.session.cell._port
+        bus, counters = run.session.lockstep, port.counters
+        gone_ns = run.now()
+
+        class Gone:
+            stamps_arrival, clock, channel, state = True, bus.clock, bus.channel, ControllerState.ACTIVE
+
+            def __init__(self):
+                self.counters = counters
+
+            def check(self):
+                if back_after_ns is None or bus.clock.now_ns() < gone_ns + back_after_ns:
+                    raise InterfaceError("can0: interface lost: Network is down")
+
+            def send_batch(self, frames, t_ns=None):
+                self.check()
+                port.send_batch(frames)
+
+            def drain(self):
+                self.check()
+                return port.drain()
+
+            def wait(self, until_ns):
+                self.check()
+                port.wait(until_ns)
+
+            def close(self):
+                port.close()
+
+        cell = run.session.cell
+        cell._port = cell.cycle._port = cell._network.port = Gone()
+
+    run = Injected("free", FREE_CYCLE, remove)
+    run.assert_within("interface").assert_drives_off()
+    assert isinstance(run.error, InterfaceError) and "interface lost" in str(run.error)
+    assert any("while stopping" in fault for fault in run.session.cell.faults) is (back_after_ns is None)
+
+
+# time
+
+
+class Late(Injected):
+    """Every cycle comes late from one on."""
+
+    def command(self, measurement, command):
+        if measurement.cycle >= self.at:
+            clock = self.session.lockstep.clock
+            clock.sleep_until_ns(clock.now_ns() + 8 * self.limits.period_ns // 5)
+        return command
+
+
+def test_the_overrun_budget_makes_the_probe_retreat():
+    run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
+    assert "of the last second's cycles came more than half a period late" in str(run.error)
+    assert run.session.truth["force"][-1] == 0.0
+
+
+# the touch and the arm
+
+
+def test_force_above_the_limit_makes_the_probe_retreat():
+    def squeeze(run):
+        run.task._s = replace(run.task._s, target_force=4.0)
+
+    run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
+    assert "above the limit of 3.00 N" in str(run.error)
+    above = np.flatnonzero(run.session.truth["force"] > 1.03 * 3.0)[0]
+    retreat = np.flatnonzero(run.session.cell.log.arrays()["phase"] == Phase.RETREAT)[0]
+    assert 0 < (retreat - above) * run.limits.period_ns <= BY_KEY["force"].within(run.limits)
+    run.assert_drives_off()
+
+
+def vanish(run):
+    plant = run.session.world.plant
+    plant.config = replace(plant.config, object=None)
+    plant._solved = None
+
+
+def test_contact_lost_makes_the_probe_retreat():
+    run = Injected("press", HOLD_CYCLE, vanish)
+    run.assert_within("contact_lost")
+    assert str(run.error) == "contact lost"
+
+
+def own_target(change):
+    class Own(Injected):
+        def command(self, measurement, command):
+            if measurement.cycle < self.at:
+                return command
+            return Command(q_target=change(measurement.q))
+
+    return Own
+
+
+def test_an_own_controller_cannot_leave_the_joints_range():
+    run = own_target(lambda q: q + np.array([0, 0, 0, 0, 3.0, 0]))("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_within("joint_stop").assert_drives_off()
+    assert "joint 5 at" in str(run.error) and "its stop" in str(run.error)
+    q = run.session.truth["q"]
+    assert np.abs(q[-1] - q[FREE_CYCLE - 20]).max() < 1e-3
+
+
+@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(5)])
+def test_an_own_controllers_target_that_is_none(target):
+    run = own_target(lambda q: target)("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_within("joint_stop").assert_drives_off()
+    assert "expected 6 finite angles" in str(run.error)
+
+
+def test_an_own_controllers_jump_is_made_at_the_joints_speed():
+    run = own_target(lambda q: np.radians([90, 65, 15, 20, 100, 0.0]))("free", FREE_CYCLE, lambda _: None, own=True)
+    run.assert_counted("target_speed")
+    q = run.session.truth["q"]
+    speeds = np.abs(np.diff(q[:, 3])) / 2.5e-3
+    assert np.degrees(speeds.max()) < 1.2 * 675
+    assert np.degrees(q[-1, 3]) == pytest.approx(20, abs=1.0)
+
+
+def test_the_workspace_ends_a_press():
+    run = Injected("press", 5000, lambda _: None, limits={"workspace_min_mm": (-500.0, -500.0, 375.0)})
+    assert "the probe's tip at z =" in str(run.error) and "workspace ends at 375.0 mm" in str(run.error)
+    assert run.session.truth["force"].max() == 0.0
+
+
+def test_the_workspace_ends_an_own_controllers_motion():
+    scene = canprobe.load_scene("free")
+    tip_of = limits_of(Session(scene).plan).tip_of
+    start = 1e3 * tip_of(np.radians(scene.arm.start_deg))
+    up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
+    run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
+    assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
+    tips = np.array([tip_of(q) for q in run.session.truth["q"][::5]])
+    assert (1e3 * tips < start + 15.0 + 3.0).all()
+    run.assert_drives_off()
+
+
+def test_a_measured_jump_that_no_joint_can_make():
+    def lie(run):
+        altered(run.nodes[2], 0x182, lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:])
+
+    run = Injected("free", FREE_CYCLE, lie)
+    run.assert_within("joint_speed").assert_drives_off()
+    assert "joint 2 reports a motion of" in str(run.error)
+    q = run.session.truth["q"]
+    assert np.abs(np.diff(q, axis=0)).max() < 0.01
+
+
+def test_an_estimator_that_diverges_starts_afresh():
+    def diverge(run):
+        estimator = run.task.shape._estimator
+        original, done = estimator.estimate, []
+
+        def once():
+            if done:
+                return original()
+            estimate = original()
+            if estimate is not None and estimate.observed.all():
+                done.append(True)
+                return replace(estimate, kappa=np.array([5e3, 0.0]))
+            return estimate
+
+        estimator.estimate = once
+
+    run = Injected("cylinder", 620, diverge, until=200, shape={"also": ()})
+    assert run.error is None
+    assert run.session.cell.supervisor.counts["estimator"] == run.task.shape.restarts == 1
+    assert any("estimator diverges: 1" in fault for fault in run.session.cell.faults)
+    assert max(float(np.abs(r.estimate.kappa[0])) for r in run.task.shape.records if r.estimate.observed[0]) < 100
+
+
+def test_an_own_controller_is_stopped_at_the_force_limit():
+    class Pressing(Injected):
+        def command(self, measurement, command):
+            return self.task.step(measurement) if measurement.cycle < self.at else Command()
+
+    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 1.0})
+    assert "above the limit of 1.00 N" in str(run.error)
+    run.assert_drives_off()
+
+
+# outside
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt, ZeroDivisionError])
+def test_an_interrupt_or_an_exception(error):
+    def raise_it(run):
+        raise error
+
+    run = Injected("free", FREE_CYCLE, raise_it)
+    run.assert_within("interrupt").assert_drives_off()
+    assert isinstance(run.error, error)
+
+
+def test_the_drives_of_a_dead_master_stop_by_themselves():
+    seen = {}
+
+    def die(run):
+        clock, start = run.session.lockstep.clock, run.now()
+        limit = BY_KEY["master_dead"].within(run.limits)
+        clock.sleep_until_ns(start + limit - run.limits.period_ns)
+        seen["before"] = [canprobe_state(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+        clock.sleep_until_ns(start + limit + 1)
+        seen["after"] = [canprobe_state(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+
+    run = Injected("free", FREE_CYCLE, die)
+    assert seen["before"] == [DriveState.OPERATION_ENABLED] * 6
+    assert DriveState.OPERATION_ENABLED not in seen["after"]
+    assert isinstance(run.error, NodeError)
+
+
+def test_a_full_disk(tmp_path):
+    class OnDisk(Injected):
+        def _run(self):
+            self.session.out = tmp_path
+            super()._run()
+
+    def fill(run):
+        log = run.session._log
+
+        class Full:
+            closed = False
+
+            def __init__(self, file):
+                self.file, self.room = file, 3000
+
+            def write(self, data):
+                import errno
+
+                if self.room <= 0:
+                    raise OSError(errno.ENOSPC, "No space left on device")
+                part = data[: self.room]
+                self.room -= len(part)
+                return self.file.write(part)
+
+            def truncate(self, size):
+                return self.file.truncate(size)
+
+            def close(self):
+                self.file.close()
+
+        log.flush()
+        log._file = Full(log._file)
+
+        def flushed_each_time(write=log.write):
+            def written(can_id, data, t_ns):
+                write(can_id, data, t_ns)
+                log.flush()
+
+            return written
+
+        run.session.lockstep.recorder = flushed_each_time()
+
+    run = OnDisk("press", HOLD_CYCLE, fill)
+    assert "the log cannot be written" in str(run.error) and "No space left" in str(run.error)
+    run.assert_drives_off()
+    assert run.session.truth["force"][-1] == 0.0
+    text = (tmp_path / "bus.log").read_text()
+    assert text.endswith("\n") and len(list(canprobe_lines(tmp_path / "bus.log"))) > 1000
+
+
+def canprobe_lines(path):
+    from canprobe.bus.candump import read_candump
+
+    return read_candump(path)
+
+
+def test_every_row_is_tested_here():
+    source = Path(__file__).read_text(encoding="utf-8")
+    special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
+    special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
+    special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk"}
+    for condition in CONDITIONS:
+        assert special.get(condition.key, f'("{condition.key}")') in source, condition.key
+    assert {c.reaction for c in CONDITIONS} == set(Reaction)

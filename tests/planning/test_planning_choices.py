@@ -1,0 +1,155 @@
+"""What a scene leaves open ("auto") is chosen so that it fits; what it writes is kept."""
+
+import dataclasses
+import json
+
+import pytest
+
+from canprobe.cli import main
+from canprobe.errors import PlanError, SceneError
+from canprobe.planning import make_plan
+from canprobe.planning.identifiers import order_by_deadline
+from canprobe.planning.open_keys import opened, second_channel
+from canprobe.protocol.frames import is_restricted
+from canprobe.protocol.timing import Message, worst_case_response
+from canprobe.scene_loader import dump_scene, load_scene, parse_scene
+
+
+def change(scene, **sections):
+    for name, values in sections.items():
+        scene = dataclasses.replace(scene, **{name: dataclasses.replace(getattr(scene, name), **values)})
+    return scene
+
+
+@pytest.fixture(scope="module")
+def cylinder():
+    return load_scene("cylinder")
+
+
+def chosen(plan):
+    return {choice.key: choice.value for choice in plan.choices}
+
+
+def test_what_fits_is_left_as_the_contract_has_it(cylinder):
+    plan = make_plan(opened(cylinder))
+    assert plan.pdos == make_plan(cylinder).pdos
+    assert chosen(plan) == {
+        "sensor.channel": '"can0"', "bus.fd": "false", "arm.grouped_rpdo": "false", "bus.cob_ids": '"default"',
+    }  # fmt: skip
+    assert not make_plan(cylinder).choices
+
+
+def test_the_packaged_scenes_leave_nothing_open(cylinder):
+    assert '"auto"' not in dump_scene(cylinder)
+    assert make_plan(cylinder).scene == cylinder
+
+
+def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
+    """Neither alone is enough: the planner finds the pair, which costs no hardware."""
+    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+    for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
+        with pytest.raises(PlanError):
+            make_plan(change(scene, **half))
+    plan = make_plan(opened(scene))
+    assert chosen(plan)["arm.grouped_rpdo"] == "true" and chosen(plan)["bus.cob_ids"] == '"by_deadline"'
+    assert plan.traffic.budget.slack_ns > 0
+    assert len(plan.buses) == 1
+
+
+def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
+    image = change(cylinder, sensor={"mode": "image"})
+    split = make_plan(opened(image))
+    assert [(bus.channel, bus.node_ids) for bus in split.buses] == [("can0", (1, 2, 3, 4, 5, 6)), ("can1", (16,))]
+    assert {pdo.channel for pdo in split.pdos if pdo.kind == "tactile"} == {"can1"}
+    assert all(bus.traffic.load < 1 for bus in split.buses)
+    fd = make_plan(opened(change(image, sensor={"eds": "tactile_array_fd.eds"})))
+    assert len(fd.buses) == 1 and fd.scene.bus.fd is True and chosen(fd)["bus.fd"] == "true"
+
+
+def test_what_is_written_is_kept(cylinder):
+    scene = change(cylinder, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
+    assert make_plan(scene).scene.arm.grouped_rpdo is False
+    with pytest.raises(PlanError, match="none of 2 ways"):
+        make_plan(change(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
+
+
+def test_the_sensor_gives_less_last_of_all(cylinder):
+    assert make_plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
+    fast = change(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
+    assert make_plan(fast).scene.sensor.mode == "features"
+    assert make_plan(opened(fast)).scene.sensor.mode == "window"
+    assert make_plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
+
+
+def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
+    with pytest.raises(PlanError) as refused:
+        make_plan(opened(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"})))
+    first, *_, last = refused.value.problems
+    assert first.startswith("none of 32 ways to fill what is left open fits; the nearest: sensor.mode = ")
+    assert "1280 µs of the 1000 µs" in last and "ways out: cycle.rate_hz = " in last
+
+
+def test_priorities_follow_the_deadlines_and_are_never_restricted(cylinder):
+    grouped = change(cylinder, arm={"grouped_rpdo": True})
+    default, ordered = make_plan(grouped), make_plan(change(grouped, bus={"cob_ids": "by_deadline"}))
+    by_id = sorted(ordered.pdos, key=lambda pdo: pdo.cob_id)
+    assert [pdo.deadline_ns for pdo in by_id] == sorted(pdo.deadline_ns for pdo in ordered.pdos)
+    assert not any(is_restricted(pdo.cob_id) for pdo in ordered.pdos)
+    assert len({pdo.cob_id for pdo in ordered.pdos}) == len({pdo.cob_id for pdo in default.pdos})
+    shared = [pdo for pdo in ordered.pdos if pdo.direction == "rpdo" and pdo.number == 2]
+    assert len({pdo.cob_id for pdo in shared}) == 3  # two drives each
+    assert {pdo.layout.mapping_words() for pdo in shared} == {
+        pdo.layout.mapping_words() for pdo in default.pdos if pdo.direction == "rpdo" and pdo.number == 2
+    }
+
+
+def test_deadline_order_fits_where_the_default_order_does_not():
+    """An urgent message below a patient one: the response-time analysis itself is the witness."""
+
+    def late(order):
+        messages = [
+            Message(name, 0x181 + rank, 8, period, deadline_ns=deadline)
+            for rank, (name, period, deadline) in enumerate(order)
+        ]
+        return [response.message.name for response in worst_case_response(messages).responses if not response.fits]
+
+    patient = [(f"patient {i}", 5_000_000, 5_000_000) for i in range(4)]
+    urgent = ("urgent", 1_000_000, 400_000)
+    assert late([*patient, urgent]) == ["urgent"] and not late([urgent, *patient])
+
+
+def test_order_by_deadline_twice_changes_nothing(cylinder):
+    once = order_by_deadline(make_plan(cylinder).pdos)
+    assert order_by_deadline(once) == once
+
+
+@pytest.mark.parametrize(
+    ("channel", "second"), [("can0", "can1"), ("vcan9", "vcan10"), ("PCAN_USBBUS1", "PCAN_USBBUS2"), ("a", "a2")]
+)
+def test_second_channel(channel, second):
+    assert second_channel(channel) == second
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [("arm.grouped_rpdo = 'atuo'", 'true or false or "auto"'), ("bus.fd = 1", 'true or false or "auto"'),
+     ("bus.cob_ids = 'x'", "one of default, by_deadline, auto")],
+)  # fmt: skip
+def test_open_keys_in_the_file(line, complaint):
+    section, _, text = line.partition(".")
+    document = f'[scene]\nname = "x"\n[task]\nkind = "free"\n[arm]\n{text if section == "arm" else ""}\n'
+    document += f"[bus]\n{text}\n" if section == "bus" else ""
+    with pytest.raises(SceneError, match=complaint):
+        parse_scene(document)
+    key = text.partition(" ")[0]
+    scene = parse_scene(document.replace(text, f'{key} = "auto"'))
+    assert getattr(getattr(scene, section), key) == "auto"
+    assert parse_scene(dump_scene(scene)) == scene
+
+
+def test_the_command_opens_what_stands_at_its_default(capsys):
+    assert main(["plan", "cylinder", "--auto", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert {"key": "bus.fd", "value": "false", "why": "classical frames do"} in document["choices"]
+    assert main(["plan", "cylinder", "--auto"]) == 0
+    assert "chosen by the plan:" in capsys.readouterr().out

@@ -1,0 +1,67 @@
+"""The arithmetic of study `realtime`; the study itself runs on vcan0 only."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from canprobe.bus.socketcan import has_socketcan
+from canprobe.cli import main
+from canprobe.studies.cycle_times import CycleTimes, answer_latencies
+from canprobe.studies.realtime import findings
+from canprobe.studies.realtime_cases import Measured
+
+
+def log_of(tmp_path, *lines):
+    path = tmp_path / "bus.log"
+    path.write_text("".join(f"(0000000000.{us:06d}) vcan0 {text}\n" for us, text in lines))
+    return path
+
+
+def test_latency_is_that_of_the_last_answer_and_only_where_all_answered(tmp_path):
+    path = log_of(
+        tmp_path,
+        (0, "080#01"), (300, "182#00"), (410, "181#00"),
+        (2500, "080#02"), (2600, "181#00"),  # 182h of this cycle never came
+        (5000, "080#03"), (5900, "182#00"), (5100, "181#00"), (5000, "201#00"),
+    )  # fmt: skip
+    assert answer_latencies(path, frozenset({0x181, 0x182}), 2_500_000).tolist() == [410_000, 900_000]
+
+
+def test_no_sync_no_latency(tmp_path):
+    assert len(answer_latencies(log_of(tmp_path, (0, "181#00")), frozenset({0x181}), 2_500_000)) == 0
+
+
+def times(cycles, overruns, seconds, compute_us=()):
+    return CycleTimes(
+        period_ns=2_500_000,
+        lateness_ns=np.zeros(cycles, np.int64),
+        compute_ns=np.array(compute_us, np.int64) * 1000,
+        latency_ns=np.zeros(0, np.int64),
+        overruns=overruns,
+        missed=0,
+        seconds=seconds,
+        processor_share=None,
+    )
+
+
+def test_findings_tell_rates_and_shares():
+    measured = [
+        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [750])),
+        Measured("plain canopen", "window", 400.0, times(1001, 900, 10.0)),
+        Measured("hold", "features", 400.0, times(4001, 0, 10.0)),
+        Measured("hold", "features", 500.0, times(4001, 40, 10.0)),
+        Measured("hold", "image", 400.0, times(401, 0, 1.0), ended="node 1: lost"),
+    ]
+    text = "\n".join(findings(measured))
+    assert "whole controller at 400 Hz for 10 s: 5.0 overruns in 10 000 cycles (goal 1), 400.0 cycles" in text
+    assert "100.0 cycles a second held" in text
+    assert "p99 is 30 % of the period" in text
+    assert "features: 400 Hz held without overruns of 400, 500 Hz" in text
+    assert "image: no rate held" in text
+
+
+@pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCAN")
+def test_without_socketcan_the_way_is_told(capsys, tmp_path):
+    assert main(["study", "realtime", "--quick", "--out", str(tmp_path)]) == 3
+    assert "canprobe vcan -- COMMAND" in capsys.readouterr().err

@@ -1,0 +1,68 @@
+"""Participants that say what they are told, on a bus with a bit rate."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.port import Frame
+from canprobe.bus.timed import TimedBus
+
+BIT = 1000  # ns, at 1 Mbit/s
+INTERMISSION = 3 * BIT
+
+
+class Scripted:
+    """Says fixed frames at fixed times and fixed answers to fixed identifiers; remembers what it heard."""
+
+    def __init__(
+        self, timed: dict[int, Sequence[Frame]] | None = None, answers: dict[int, Sequence[Frame]] | None = None
+    ):
+        self.timed = dict(timed or {})
+        self.answers = answers or {}
+        self.heard: list[tuple[int, bytes, int]] = []
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        return min(self.timed, default=None)
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        return ()
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        self.heard.append((can_id, data, t_ns))
+        return self.answers.get(can_id, ())
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        return self.timed.pop(min(self.timed))
+
+
+def make_bus(*participants, **options):
+    bus = TimedBus(VirtualClock(), "can7", **options)
+    seen = []
+    bus.recorder = lambda *frame: seen.append(frame)
+    for participant in participants:
+        bus.attach(participant)
+    return bus, seen
+
+
+class Source:
+    """Sends one message: queues a frame of its own at given times."""
+
+    def __init__(self, frame: Frame, times: Sequence[int]):
+        self.frame = frame
+        self.times = sorted(times)
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        return self.times[0] if self.times else None
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        return ()
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        return ()
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        self.times.pop(0)
+        return [self.frame]
