@@ -17,6 +17,8 @@ from canprobe.touch.quadric import UNIT, Design, linear_rows, rows
 from canprobe.touch.rank import Decision, decide, spread_of
 
 CHI2_999 = 16.27
+DIFFUSE = 1e-2
+"""Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
 _MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
@@ -37,6 +39,8 @@ class Fit(NamedTuple):
         c: (9,) parameters.
         root: (9, 9) upper triangular information root, prior included.
         decision: rank decision on the data.
+        free: (9,) parameters with nothing held, and
+        free_root: (9, 9) root of their information, kept regular by next to nothing (`DIFFUSE`).
         innovation: weighted χ² per degree of freedom.
         outliers: samples with less than full weight.
         converged: the last step was below the tolerance.
@@ -45,6 +49,8 @@ class Fit(NamedTuple):
     c: Array
     root: Array
     decision: Decision
+    free: Array
+    free_root: Array
     innovation: float
     outliers: int
     converged: bool
@@ -95,8 +101,17 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
                 break
             decision = final[2]
     c = c if converged else best
+    has_prior = bool(prior[0][3:].any())
+    free, free_root = (c, root) if has_prior else _freed(best, rows_of_J, rows_of_r, root, prior)
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
-    return Fit(c, root, decision, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
+    return Fit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
+
+
+def _freed(c: Array, J: Array, r: Array, root: Array, prior: tuple[Array, Array]) -> tuple[Array, Array]:
+    """One more step with nothing held."""
+    regular = upper_root(np.concatenate([root, DIFFUSE * np.eye(9)]))
+    gradient = J.T @ r + prior[0].T @ (prior[0] @ c - prior[1])
+    return c - solved(regular, solved(regular.T, gradient)), regular
 
 
 def linear_start(

@@ -93,6 +93,25 @@ def _axes(spread: Array) -> tuple[float, float, Array]:
     return mean - radius, mean + radius, turned(angle).T
 
 
+def spread_share(spread: Array) -> Array:
+    """How far each combination may be believed that the points were hardly spread for.
+
+    The noise of the points spreads them as well, and what it says about curvature is false. Where a share s of the
+    spread is noise the information counts (1 − s)²: nothing at s = 1, 0.81 at the threshold of the rank decision. A
+    fusion needs that without a jump.
+
+    Args:
+        spread: as for `decide`.
+
+    Returns:
+        (3, 3) symmetric F; information I becomes F I F.
+    """
+    small, large, axes = _axes(spread)
+    true = [max(0.0, 1.0 - 1.0 / max(s, 1e-300)) for s in (large, 0.5 * (small + large), small)]
+    result: Array = (axes * true) @ axes.T
+    return result
+
+
 def turned(angle: float) -> Array:
     """The (3, 3) orthogonal matrix that takes q = (K11, √2 K12, K22) to axes turned by an angle in rad."""
     c, s = math.cos(angle), math.sin(angle)

@@ -44,14 +44,19 @@ class ChangeTest:
         """The innovation in the long term, within `USUAL`."""
         return _bounded(self._all)
 
-    def take(self, square: float) -> bool:
-        """Take the squared innovation, χ² of 3, of a sample; whether the surface now looks changed."""
+    def take(self, square: float, caution: float = 1.0) -> bool:
+        """Take the squared innovation, χ² of 3, of a sample; whether the surface now looks changed.
+
+        Args:
+            square: of the sample.
+            caution: factor of both thresholds.
+        """
         now = min(square, CHI2_999) / 3.0
         self._last.append(now)
         best = sum(sorted(self._last)[:BEST]) / BEST if len(self._last) == LAST_FEW else 0.0
         self.innovation += RUNNING * (now - self.innovation)
         usual_best = BEST_SHARE * _bounded(self._of_best / BEST_SHARE)
-        if self.innovation >= ALARM * self.usual and best >= ALARM_OF_BEST * usual_best:
+        if self.innovation >= caution * ALARM * self.usual and best >= caution * ALARM_OF_BEST * usual_best:
             return True
         self._all += LONG_TERM * (now - self._all)
         if len(self._last) == LAST_FEW:

@@ -10,6 +10,7 @@ from canprobe.touch._arrays import Array, inverted, solved, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
+from canprobe.touch.evidence import evidence_of
 from canprobe.touch.quadric import UNIT, curvature_jacobian
 from canprobe.touch.rank import Decision, decide
 
@@ -38,12 +39,16 @@ def filter_estimate(
     tangent = a.T_frame_contact[:3, :2]
     size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
     q = a.M[6:] @ state.inverse / UNIT[:, None]
-    decision = decide(inverted(upper_root(q.T)).T, tangent.T @ spread @ tangent, size)
+    flat = tangent.T @ spread @ tangent
+    decision = decide(inverted(upper_root(q.T)).T, flat, size)
+    noise = state.inverse.T @ state.score.matrix @ state.inverse
+    noise_root = np.asarray(np.linalg.cholesky(noise), dtype=np.float64)
+    evidence = evidence_of(a.c, a.M @ state.inverse @ noise_root, flat, L)
     known = decision.vectors[:, decision.passed]
     a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
     singular = np.linalg.svd(state.root, compute_uv=False)
     return build_estimate(
-        _solution(state, a, decision),
+        _solution(state, a, decision, noise_root),
         length=L,
         T_frame_contact=a.T_frame_contact,
         condition_number=float(singular[0] / singular[-1]),
@@ -53,15 +58,14 @@ def filter_estimate(
         method="recursive",
         prior=prior,
         notes=notes,
+        evidence=evidence,
     )
 
 
-def _solution(state: InformationFilter, a: Anchor, decision: Decision) -> Solution:
+def _solution(state: InformationFilter, a: Anchor, decision: Decision, noise_root: Array) -> Solution:
     """With the sandwich covariance where all is observed."""
     root = solved(a.M.T, state.root.T).T
     if decision.rank < 3:
         return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
-    noise = state.inverse.T @ state.score.matrix @ state.inverse
-    D = curvature_jacobian(a.c) @ a.M @ state.inverse
-    sandwich = solved(np.asarray(np.linalg.cholesky(noise), dtype=np.float64), root)
-    return Solution(a.c, D @ noise @ D.T, decision, has_prior=False, root=sandwich)
+    D = curvature_jacobian(a.c) @ a.M @ state.inverse @ noise_root
+    return Solution(a.c, D @ D.T, decision, has_prior=False, root=solved(noise_root, root))

@@ -11,11 +11,10 @@ from canprobe.touch.anchor import foot
 from canprobe.touch.estimators.score import Score
 from canprobe.touch.frames import homogeneous, transported_rotation
 from canprobe.touch.noise import Correlation
+from canprobe.touch.nonlinear import DIFFUSE
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import transport
 
-DIFFUSE = 1e-2
-"""Root of the information, in units of the memory, that keeps an untouched filter regular: K known to ±200/memory."""
 ANCHOR = 0.05
 """Travel between two changes of the working frame over the memory."""
 

@@ -35,16 +35,22 @@ CROWD = 2.0
 """Most samples per metre that count in full, over the nominal `window / memory`."""
 MOST_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
+STARTING = 1.6
+"""How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
 AGREEING = 11.34
 """Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
 
 class _Pending(NamedTuple):
-    """A contact that waits for the end of its step, with its equations (3, 10) and innovation; None during a start."""
+    """A contact that waits for the end of its step, with its equations (3, 10), squared innovation and weight.
+
+    The equations are None while there is nothing to compare it with.
+    """
 
     touch: Touch
     rows: Array | None
     square: float
+    weight: float
 
 
 class RecursiveEstimator:
@@ -96,8 +102,8 @@ class RecursiveEstimator:
         if not self._gate.passes(sample, self.dropped):
             return
         touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample))
-        self._pending.append(self._compared(touch))
         moved = self._travel.add(sample.p_base)
+        self._pending.append(self._compared(touch, self._travel.weight))
         if moved > 0.0:
             self._step(moved)
             self._pending.clear()
@@ -121,23 +127,26 @@ class RecursiveEstimator:
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
-        notes = (f"the surface changed {changes} times: memory shortened",) if changes else ()
-        return (*notes, f"{doubtful} samples with reduced weight") if doubtful else notes
+        notes = [f"the surface changed {changes} times: memory shortened"] if changes else []
+        notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
+        return (*notes, *self._gate.notes())
 
-    def _compared(self, touch: Touch) -> _Pending:
-        """A contact with its equations and innovation."""
+    def _compared(self, touch: Touch, weight: float) -> _Pending:
+        """A contact with its equations, innovation and weight."""
         if not self._settled:
             self._last = touch
-            return _Pending(touch, None, 0.0)
+            return _Pending(touch, None, 0.0, weight)
         rows = equations(self._filter.c, self._filter.T, self._memory, touch)
         square = squared_innovation(rows, self._filter.inverse)
-        if weight_of(square) == 1.0:
+        weight *= weight_of(square)
+        if weight == 1.0:
             self._last = touch
-        return _Pending(touch, rows, square)
+        return _Pending(touch, rows, square, weight)
 
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
-        if any([self._change.take(p.square) for p in self._pending if p.rows is not None]):
+        caution = 1.0 if self._start is None else STARTING
+        if any([self._change.take(p.square, caution) for p in self._pending if p.rows is not None]):
             self._change.alarm()
             self._drop_agreeing()
             self._spread.fade(0.0)
@@ -149,7 +158,7 @@ class RecursiveEstimator:
 
     def _absorb(self, moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array([weight_of(p.square) for p in self._pending])
+        weight = np.array([p.weight for p in self._pending])
         crowd = self._weigh(moved, weight)
         rows = np.concatenate([p.rows for p in self._pending if p.rows is not None])
         self._filter.take(rows * np.sqrt(crowd * weight).repeat(3)[:, None], moved)
