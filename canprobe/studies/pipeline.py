@@ -59,7 +59,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Scan the scenes."""
     scenes = SCENES[:1] if quick else SCENES
     groups = {"verification": VERIFICATION[:1]} if quick else {"calibration": CALIBRATION, "verification": VERIFICATION}
-    duration = 2.5 if quick else DURATION_S
+    duration = 1.8 if quick else DURATION_S
     cells = [(scene, seed, duration) for seeds in groups.values() for seed in seeds for scene in scenes]
     sweep.say(f"{len(cells)} scans of {duration:g} s")
     found = dict(zip(cells, sweep.map(measure, cells, model=MODEL), strict=True))
