@@ -50,6 +50,11 @@ class Decision(NamedTuple):
         return int(np.count_nonzero(self.passed))
 
 
+def nothing_observed() -> Decision:
+    """The decision where a model does not hold."""
+    return Decision(np.zeros(3), np.eye(3), np.zeros(3, dtype=bool))
+
+
 def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
     """Rank decision.
 
