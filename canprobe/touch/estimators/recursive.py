@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,13 +43,16 @@ AGREEING = 11.34
 
 
 class _Pending(NamedTuple):
-    """A contact that waits for the end of its step, with its equations (3, 10), squared innovation and weight.
-
-    The equations are None while there is nothing to compare it with.
-    """
+    """A contact that waits for the end of its step, and its weight by its place alone (`Travel`)."""
 
     touch: Touch
-    rows: Array | None
+    weight: float
+
+
+class _Compared(NamedTuple):
+    """A contact against what the filter says: its equations (3, 10), squared innovation and weight."""
+
+    rows: Array
     square: float
     weight: float
 
@@ -103,7 +107,9 @@ class RecursiveEstimator:
             return
         touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample))
         moved = self._travel.add(sample.p_base)
-        self._pending.append(self._compared(touch, self._travel.weight))
+        self._pending.append(_Pending(touch, self._travel.weight))
+        if self._last is None or self._travel.weight == 1.0:
+            self._last = touch
         if moved > 0.0:
             self._step(moved)
             self._pending.clear()
@@ -131,36 +137,30 @@ class RecursiveEstimator:
         notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
         return (*notes, *self._gate.notes())
 
-    def _compared(self, touch: Touch, weight: float) -> _Pending:
-        """A contact with its equations, innovation and weight."""
-        if not self._settled:
-            self._last = touch
-            return _Pending(touch, None, 0.0, weight)
-        rows = equations(self._filter.c, self._filter.T, self._memory, touch)
-        square = squared_innovation(rows, self._filter.inverse)
-        weight *= weight_of(square)
-        if weight == 1.0:
-            self._last = touch
-        return _Pending(touch, rows, square, weight)
-
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
+        compared = [self._compared(p) for p in self._pending] if self._settled else []
         caution = 1.0 if self._start is None else STARTING
-        if any([self._change.take(p.square, caution) for p in self._pending if p.rows is not None]):
+        if any([self._change.take(c.square, caution) for c in compared]):
             self._change.alarm()
-            self._drop_agreeing()
+            self._drop_agreeing(compared)
             self._spread.fade(0.0)
             self._start = Start(self._memory, self._prior)
         if self._start is None:
-            self._absorb(moved)
+            self._absorb(compared, moved)
         else:
             self._begin_with(self._start, moved)
 
-    def _absorb(self, moved: float) -> None:
+    def _compared(self, pending: _Pending) -> _Compared:
+        rows = equations(self._filter.c, self._filter.T, self._memory, pending.touch)
+        square = squared_innovation(rows, self._filter.inverse)
+        return _Compared(rows, square, pending.weight * weight_of(square))
+
+    def _absorb(self, compared: Sequence[_Compared], moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array([p.weight for p in self._pending])
+        weight = np.array([c.weight for c in compared])
         crowd = self._weigh(moved, weight)
-        rows = np.concatenate([p.rows for p in self._pending if p.rows is not None])
+        rows = np.concatenate([c.rows for c in compared])
         self._filter.take(rows * np.sqrt(crowd * weight).repeat(3)[:, None], moved)
         if self._last is not None:
             self._filter.follow(self._last.point)
@@ -193,9 +193,9 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self) -> None:
+    def _drop_agreeing(self, compared: Sequence[_Compared]) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
         limit = AGREEING * self._change.usual
-        agree = [i for i, p in enumerate(self._pending) if p.square <= limit and p is not self._pending[-1]]
+        agree = [i for i, c in enumerate(compared[:-1]) if c.square <= limit]
         for _ in range(agree[-1] + 1 if agree else 0):
             self._pending.popleft()
