@@ -77,6 +77,21 @@ def test_sensor_falls_silent_but_lives():
     assert truth["force"][-1] == 0.0
 
 
+def test_sensor_lives_but_never_sends_a_frame():
+    session = press_session()
+
+    def mute(participant):
+        if getattr(participant, "node_id", None) == 16:
+            original = participant.receive
+            participant.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] < 0x511]
+        return participant
+
+    session.joins = mute
+    reason, truth = run_until_stopped(session)
+    assert "no tactile frame for" in reason
+    assert truth["force"].max() == 0.0
+
+
 def test_joint_at_its_stop():
     session = press_session()
     controller = make_task(session.plan)
