@@ -79,11 +79,14 @@ def test_sensor_falls_silent_but_lives():
 
 def test_sensor_lives_but_never_sends_a_frame():
     session = press_session()
+    frames = {pdo.cob_id for pdo in session.plan.pdos_of(16, "tpdo")}
 
     def mute(participant):
         if getattr(participant, "node_id", None) == 16:
             original = participant.receive
-            participant.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] < 0x511]
+            participant.receive = lambda can_id, data, t_ns: [
+                f for f in original(can_id, data, t_ns) if f[0] not in frames
+            ]
         return participant
 
     session.joins = mute
