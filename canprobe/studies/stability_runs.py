@@ -33,7 +33,7 @@ from canprobe.studies.stability_loop import ForceLoop
 from canprobe.touch.contact import indentation_from_force
 
 LOOK_NS = 1_250_000
-HUNTING = 0.15
+HUNTING = 0.2
 """Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
 SENSOR_HZ = 200.0
 
