@@ -78,8 +78,7 @@ class Intake:
         """
         drives, tactile, times = self.drives, self.tactile, self._sync_times
         sample = tactile.take(self.number, counter, times, self._sync_stamps) if tactile is not None else None
-        newest = tactile.newest_cycle if tactile is not None else None
-        age = self.number - newest if newest is not None else None
+        age = self.number - (tactile.newest_cycle or 0) if tactile is not None else None
         if drives is None:
             return Measurement(self.number, times[-1], enabled=True, tactile=sample, tactile_age=age)
         return Measurement(

@@ -45,7 +45,8 @@ class Measurement:
         enabled: every drive is in operation enabled.
         tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
             cycle k + 1 at the earliest, on every bus.
-        tactile_age: cycles since the trigger of the newest tactile sample; None before the first.
+        tactile_age: cycles since the trigger of the newest tactile sample, or since the first SYNC where none has come;
+            None without a sensor.
     """
 
     cycle: int

@@ -121,7 +121,8 @@ class Contact:
     Attributes:
         limits: of the plan.
         force: as measured last, N.
-        tactile_age: cycles since the trigger of the newest sample; None before the first.
+        tactile_age: cycles since the trigger of the newest sample, or since the first SYNC where none has come; None
+            without a sensor.
         lost_s: how long the force has been below that of a contact, where there must be one.
         limit: what a joint or the workspace forbids; None where all is well.
     """

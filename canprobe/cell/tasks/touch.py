@@ -16,6 +16,7 @@ from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
+from canprobe.touch.at_rest import AtRest
 from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
@@ -33,6 +34,8 @@ LONGEST_GAP_S = 0.02
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
+AT_REST = 0.7
+"""Share of the settling time after which nothing is asked to change any more."""
 TOUCH_FORCE = 0.15
 """N; contact is made above it."""
 
@@ -133,6 +136,7 @@ class TouchTask:
         self._depth0 = 0.0
         self._push = PushFit()
         self._push_from: tuple[Vector, Vector] | None = None
+        self._at_rest = AtRest()
         self._pole0: Vector = np.zeros(3)
         self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
@@ -221,6 +225,8 @@ class TouchTask:
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
                 self._feel_stiffness(contact)
+                if self._t > AT_REST * self._s.settle_s:
+                    self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self._take_shape(contact)
         self._columns = self._columns_of(measurement, patch, contact)
@@ -354,6 +360,9 @@ class TouchTask:
         if self._t >= self._s.settle_s:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle
+            doubt = self._at_rest.doubt(self._s.target_force, self._push.certain(CERTAIN))
+            if doubt is not None:
+                self._leave(doubt)
         pole = self._pole0 + share * (pose.pole - self._pole0)
         return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 

@@ -1,0 +1,113 @@
+"""The force loop as a linear sampled system, and the eigenvalues that tell whether it settles.
+
+Along the contact's normal, about the wanted indentation, all is linear: measured force and wanted force become depths
+by the same law, so the depth that is measured is the true one times `g`, the true slope of √F over the depth divided by
+the one that the controller reckons with. With heights outward, 0 on the object, `a` of the servo's surface model and
+`p` of the probe's tip less the wanted indentation:
+
+    a ← (1 − H) a + H (1 − g) p of the sample's instant,   H = 1 − exp(−2π height_hz dt)
+
+`p` follows `a` as the cycle has it: a target is latched at the SYNC after the cycle that made it and reached by a ramp
+at the next, with the second-order drive behind; an image is sampled at a trigger, sent at the next one and taken in a
+cycle later. Frames that are late by more than a period make both later by whole cycles. The state's map over one period
+of the sensor is one matrix. Stops being true where contact is lost, at encoder counts and joint limits, where the array
+is saturated, and while the stiffness is still being felt. Damping of the layer (Hunt–Crossley) is left out.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ForceLoop:
+    """What decides whether the force settles.
+
+    Attributes:
+        depth_ratio: g, measured over true depth.
+        period_s: of the cycle.
+        sample_cycles: cycles between two tactile images.
+        height_hz: bandwidth of the surface's height correction, the force gain.
+        late_s: by how much targets and tactile frames come late on the bus.
+        omega: undamped frequency of the drives, rad/s.
+        damping: their damping ratio.
+    """
+
+    depth_ratio: float
+    period_s: float
+    sample_cycles: int
+    height_hz: float
+    late_s: float
+    omega: float
+    damping: float = 1.0
+
+    @property
+    def late_cycles(self) -> int:
+        """Whole cycles by which late frames delay what they say."""
+        return math.floor(self.late_s / self.period_s + 1e-9)
+
+
+def drive_step(loop: ForceLoop) -> Array:
+    """Map (3, 4) of position, rate, reference and the target that is latched to the first three a cycle later."""
+    T, w, z = loop.period_s, loop.omega, loop.damping
+    rates = np.zeros((4, 4))  # of position, rate, reference, slope
+    rates[0, 1] = 1.0
+    rates[1, :3] = -w * w, -2.0 * z * w, w * w
+    rates[2, 3] = 1.0
+    ramp = np.eye(4)
+    ramp[3] = 0.0, 0.0, -1.0 / T, 1.0 / T
+    step: Array = (expm(rates * T) @ ramp)[:3]
+    return step
+
+
+def sample_map(loop: ForceLoop) -> Array:
+    """Map of the whole state over one period of the sensor.
+
+    The state at a SYNC: position, rate, reference, a, the last targets, newest first, and the positions at the SYNCs
+    before, newest first.
+    """
+    drive = drive_step(loop)
+    delay = 1 + loop.late_cycles
+    oldest = delay + loop.sample_cycles
+    size = 4 + delay + oldest
+    share = 1.0 - math.exp(-2.0 * math.pi * loop.height_hz * loop.sample_cycles * loop.period_s)
+    whole = np.eye(size)
+    for cycle in range(loop.sample_cycles):
+        sense = np.eye(size)
+        if (cycle - delay) % loop.sample_cycles == 0:
+            sense[3, 3] = 1.0 - share
+            sense[3, 4 + delay + oldest - 1] = share * (1.0 - loop.depth_ratio)
+        move = np.zeros((size, size))
+        move[:3, :3] = drive[:, :3]
+        move[:3, 4 + delay - 1] = drive[:, 3]  # the target that is latched now
+        move[3, 3] = move[4, 3] = 1.0  # this cycle's target is a
+        for i in range(1, delay):
+            move[4 + i, 4 + i - 1] = 1.0
+        move[4 + delay, 0] = 1.0
+        for i in range(1, oldest):
+            move[4 + delay + i, 4 + delay + i - 1] = 1.0
+        whole = move @ sense @ whole
+    return whole
+
+
+def spectral_radius(loop: ForceLoop) -> float:
+    """Largest modulus of the eigenvalues over one period of the sensor; below 1 the force settles."""
+    return float(np.abs(np.linalg.eigvals(sample_map(loop))).max())
+
+
+def steepest_ratio(loop: ForceLoop, most: float = 1e6) -> float:
+    """The largest `depth_ratio` up to which the loop settles, by bisection of its logarithm; inf beyond `most`."""
+    low, high = 1.0, most
+    if spectral_radius(replace(loop, depth_ratio=most)) < 1.0:
+        return math.inf
+    while high / low > 1.0 + 1e-4:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if spectral_radius(replace(loop, depth_ratio=middle)) < 1.0 else (low, middle)
+    return low

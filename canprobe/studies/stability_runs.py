@@ -1,0 +1,280 @@
+"""One cell of the stability map: a short touch in lockstep, watched by a witness, and how it ended.
+
+`stable`: carried out to its end. `stopped`: let go and stopped, with the reason. `refused`: by the plan, with the
+reason. `hunting`: carried out, but the force did not settle. `failed`: what must never be (a hang, a NaN, an exception
+of ours, a force above the limit for longer than the stated reaction time and the retreat).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from canprobe.cell.build import make_task
+from canprobe.cell.conditions import BY_KEY
+from canprobe.cell.limits import limits_of
+from canprobe.cell.supervision import Limits
+from canprobe.cell.tasks.calibration import array_calibration
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.emulator.plant.arm import natural_frequency
+from canprobe.errors import CanprobeError, PlanError, SafetyStop
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene import ObjectSettings, PlantSettings, Scene, ServoSettings
+from canprobe.scene_geometry import T_flange_probe, true_object
+from canprobe.scene_loader import load_scene
+from canprobe.session import Session, resolve_scene
+from canprobe.studies.fault_runs import RELEASE_NS, HangError, Witness
+from canprobe.studies.late_node import LateNode
+from canprobe.studies.stability_loop import ForceLoop
+from canprobe.touch.contact import indentation_from_force
+
+LOOK_NS = 1_250_000
+HUNTING = 0.2
+"""Standard deviation of the force over the second half of the hold, over the target, above which it did not settle."""
+SENSOR_HZ = 200.0
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """A cell of the map.
+
+    Attributes:
+        view: the part of the map that it belongs to.
+        contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
+        rate_hz: of the servo.
+        late_ms: by how much targets and tactile frames come late.
+        height_hz: the force gain.
+        feels: the servo learns the stiffness from the touch; else it believes what it was told.
+        told: the controller is told the true stiffness, not that of the default pad.
+        bandwidth_hz: of the drives.
+        fidelity: of the plant.
+        probe_mm: radius of the probe.
+        kind, radius_mm: of the object.
+        speed_mm_s: of a scan; 0 presses.
+        at_mm: where the object is touched, base frame.
+        posture_deg: selects the branch of the inverse kinematics.
+        force_n: target.
+        hold_s: of the press or scan.
+    """
+
+    view: str
+    contact_n_m: float
+    rate_hz: float = 400.0
+    late_ms: float = 0.0
+    height_hz: float = 8.0
+    feels: bool = True
+    told: bool = False
+    bandwidth_hz: float = 30.0
+    fidelity: str = "ideal"
+    probe_mm: float = 40.0
+    kind: str = "cylinder"
+    radius_mm: float = 36.0
+    speed_mm_s: float = 0.0
+    at_mm: tuple[float, float, float] = (-120.0, -122.5, 374.0)
+    posture_deg: tuple[float, ...] = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
+    force_n: float = 2.0
+    hold_s: float = 0.4
+
+
+class StatedSensing(ContactSensing):
+    """Believes the stiffness that it was told, whatever is felt."""
+
+    def set_slope(self, slope: float) -> None:
+        """Leave it."""
+
+
+def layer_stiffness(case: Case) -> float:
+    """K/h (N/m³) with which the contact has its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
+    depth = 2.0 * case.force_n / case.contact_n_m
+    return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
+
+
+def _kappa(case: Case) -> np.ndarray[Any, np.dtype[np.float64]]:
+    place = true_object(_object(case))
+    return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
+
+
+def _object(case: Case) -> ObjectSettings:
+    radius = None if case.kind == "plane" else case.radius_mm
+    return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=(0.0, 0.0, 20.0))  # type: ignore[arg-type]
+
+
+def scene_of(case: Case) -> Scene:
+    """The scene that a case stands for; its layer may be harder and its radii wider than a file may say."""
+    scene = resolve_scene(load_scene("press" if case.speed_mm_s == 0.0 else "cylinder"), duration_s=case.hold_s)
+    assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
+    stiffness = layer_stiffness(case)
+    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm)
+    if case.speed_mm_s > 0.0:
+        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight")
+    return replace(
+        scene,
+        bus=replace(scene.bus, timed=False),
+        cycle=replace(scene.cycle, rate_hz=case.rate_hz),
+        limits=replace(scene.limits, joint_margin_deg=0.5),
+        arm=replace(scene.arm, start_deg=case.posture_deg),  # type: ignore[arg-type]
+        sensor=replace(scene.sensor, rate_hz=min(SENSOR_HZ, case.rate_hz), mode="features"),
+        probe=replace(
+            scene.probe,
+            radius_mm=case.probe_mm,
+            stiffness_n_m3=stiffness if case.told else scene.probe.stiffness_n_m3,
+        ),
+        object=_object(case),
+        servo=replace(scene.servo or ServoSettings(), surface_height_hz=case.height_hz),
+        plant=replace(
+            scene.plant or PlantSettings(),
+            stiffness_n_m3=stiffness,
+            drive_bandwidth_hz=case.bandwidth_hz,
+            fidelity=case.fidelity,  # type: ignore[arg-type]
+        ),
+        shape=replace(scene.shape, also=(), patch=False) if scene.shape is not None and case.speed_mm_s > 0 else None,
+        task=task,
+    )
+
+
+def loop_of(case: Case) -> ForceLoop:
+    """The linear loop of a case, with the stiffness that the servo ends up with."""
+    scene = scene_of(case)
+    assert scene.probe is not None
+    radius, kappa = case.probe_mm * 1e-3, _kappa(case)
+    slope = 1.0 / float(indentation_from_force(1.0, layer_stiffness(case), radius, kappa))
+    told = 1.0 / float(indentation_from_force(1.0, scene.probe.stiffness_n_m3, radius, np.zeros(2)))
+    if case.feels:
+        sensing = stated_sensing(scene, ContactSensing)
+        sensing.set_slope(slope)
+        told = 1.0 / sensing.depth(1.0)
+    return ForceLoop(
+        depth_ratio=slope / told,
+        period_s=1.0 / case.rate_hz,
+        sample_cycles=max(1, round(case.rate_hz / SENSOR_HZ)),
+        height_hz=case.height_hz,
+        late_s=case.late_ms * 1e-3,
+        omega=natural_frequency(case.bandwidth_hz, 1.0),
+    )
+
+
+def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> ContactSensing:
+    """The scene's sensing, of another kind."""
+    assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
+    radius = scene.probe.radius_mm * 1e-3
+    return kind(
+        MODELS[scene.arm.model],
+        T_flange_probe(scene.probe),
+        array_calibration(scene.sensor.full_scale_kpa * 1e3, radius),
+        radius,
+        scene.probe.stiffness_n_m3,
+    )
+
+
+def carry_out(case: Case) -> dict[str, Any]:
+    """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
+    try:
+        return _Run(case).result()
+    except PlanError as error:
+        return {"ended": "refused", "reason": str(error).splitlines()[0], **_NO_FORCE}
+
+
+_NO_FORCE: dict[str, Any] = {"force_max_n": None, "above_ms": None, "allowed_ms": None, "error_percent": None,
+                             "spread_percent": None}  # fmt: skip
+
+
+class _Run:
+    """One case being carried out."""
+
+    def __init__(self, case: Case) -> None:
+        self.case = case
+        self.session = Session(scene_of(case))
+        self.limits = limits_of(self.session.plan)
+        task = make_task(self.session.plan)
+        assert isinstance(task, TouchTask)
+        if not case.feels:
+            task.sensing = stated_sensing(self.session.plan.scene)
+        self.task = task
+        self.witness: Witness | None = None
+        late_ids = {pdo.cob_id for pdo in self.session.plan.pdos if pdo.direction == "rpdo"}
+        assert self.session.scene.sensor is not None
+        late_ids |= {pdo.cob_id for pdo in self.session.plan.pdos_of(self.session.scene.sensor.node_id, "tpdo")}
+        self._late_ids = late_ids
+        self.session.joins = self._join
+
+    def _join(self, participant: Any) -> Any:
+        if self.witness is None:
+            assert self.session.world is not None and self.session.lockstep is not None
+            self.witness = Witness(self.session.world.plant, LOOK_NS)
+            self.session.lockstep.attach(self.witness)
+        if not hasattr(participant, "node_id") or self.case.late_ms == 0.0:
+            return participant
+        return LateNode(participant, self._late_ids, round(self.case.late_ms * 1e6))
+
+    def result(self) -> dict[str, Any]:
+        ended, reason = self._drive()
+        assert self.witness is not None
+        times, forces = (np.array(column) for column in zip(*self.witness.rows, strict=True))
+        longest_ns = longest_above(times, forces, self.limits.force_max)
+        allowed_ns = allowed_above(self.limits, self.case.late_ms)
+        error, spread = self._error_and_spread()
+        if not np.isfinite(forces).all():
+            ended, reason = "failed", "the force is not finite"
+        elif longest_ns > allowed_ns:
+            ended, reason = "failed", f"force above the limit for {longest_ns * 1e-6:.0f} ms; ended: {reason}"
+        elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
+            ended = "hunting"
+        return {
+            "ended": ended,
+            "reason": reason,
+            "force_max_n": float(forces.max()),
+            "above_ms": longest_ns * 1e-6,
+            "allowed_ms": allowed_ns * 1e-6,
+            "error_percent": error,
+            "spread_percent": spread,
+        }
+
+    def _drive(self) -> tuple[str, str]:
+        try:
+            with self.session:
+                self.session.run(self.task)
+        except SafetyStop as stop:
+            return "stopped", str(stop)
+        except PlanError:  # what the plant needs of the arm beyond the plan: to stand above the approach
+            raise
+        except CanprobeError as error:
+            return "stopped", f"{type(error).__name__}: {error}"
+        except HangError as hang:
+            return "failed", f"hang: {hang}"
+        except Exception as error:  # whatever it is, it is a failure of ours, and the map goes on
+            return "failed", f"{type(error).__name__}: {error}"
+        return "stable", ""
+
+    def _error_and_spread(self) -> tuple[float | None, float | None]:
+        """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
+        cycles, truth = self.task.scan_cycles, self.session.truth
+        if cycles is None or "force" not in truth:
+            return None, None
+        half = truth["force"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / self.case.force_n
+        if not half.size:
+            return None, None
+        return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
+
+
+def longest_above(times_ns: Any, forces: Any, limit: float) -> int:
+    """Longest time without a break for which the force is above the limit, ns."""
+    longest, since = 0, None
+    for t_ns, force in zip(times_ns.tolist(), forces.tolist(), strict=True):
+        if force <= limit:
+            since = None
+            continue
+        since = t_ns if since is None else since
+        longest = max(longest, t_ns - since)
+    return int(longest)
+
+
+def allowed_above(limits: Limits, late_ms: float) -> int:
+    """How long a force may be above the limit: the stated reaction, what is late on the bus both ways, the retreat."""
+    within = BY_KEY["force"].within
+    assert within is not None
+    late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
+    return within(limits) + late + RELEASE_NS
