@@ -213,3 +213,44 @@ def test_channels_of_a_scene_with_two_buses(bare):
         target(("can2", "x"))
     with pytest.raises(UsageError, match="given 2 times, but the scene has the channels can0 and can1"):
         target(("can0", "x"), (None, "y"))
+
+
+class Speaking(Socketcand):
+    """Puts one frame on its bus when a client has opened it, and answers none."""
+
+    def __init__(self, frame=""):
+        super().__init__()
+        self.frame = frame
+        self.heard = threading.Event()
+
+    def answer(self, connection, words):
+        self.said.append(words)
+        if words[0] == "send":
+            self.heard.set()
+            return
+        connection.sendall(b"< ok >")
+        if words[0] == "rawmode" and self.frame:
+            connection.sendall(f"< frame {self.frame} >".encode())
+
+
+def test_can_bridge_joins_two_buses_over_the_network(tmp_path):
+    """python-can's own program, as the README has it; what it cannot do is join multicast, which hears itself."""
+    near, far = Speaking("701 12.5 05"), Speaking()
+    for server in (near, far):
+        server.start()
+    words = [sys.executable, "-m", "can.bridge"]
+    for number, server in ((1, near), (2, far)):
+        words += [f"--bus{number}-interface", "socketcand", f"--bus{number}-channel", "can0"]
+        words += [f"--bus{number}-bus-kwargs", "host=127.0.0.1", f"port={server.port}"]
+    with (tmp_path / "said").open("w+") as said:
+        bridge = subprocess.Popen(words, stdout=said, stderr=said)
+        try:
+            assert far.heard.wait(20), (tmp_path / "said").read_text()
+        finally:
+            bridge.send_signal(signal.SIGINT)
+            bridge.wait(20)
+            for server in (near, far):
+                server.listener.close()
+                server.join(10)
+    assert [words for words in far.said if words[0] == "send"] == [["send", "701", "1", "5"]]
+    assert not near.heard.is_set()
