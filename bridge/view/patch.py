@@ -13,6 +13,8 @@ from canprobe.bridge.view.meshes import Array, Faces
 RADIUS_M, RINGS, SECTORS = 0.012, 6, 36
 EXAGGERATION = 20.0
 """The shells stand this many times too far apart: 0.5 1/m is 36 µm at the disc's rim."""
+LIFT_M = 3e-4
+"""Off the true surface, outward, so that the two do not flicker through each other."""
 MOST_M = 0.006
 """Farthest that a shell is drawn from the patch: where curvature was not observed it would be nowhere."""
 
@@ -22,8 +24,8 @@ class PatchShape:
     """One estimate to draw, in the contact frame.
 
     Attributes:
-        surface: (n, 3) points of the disc, m.
-        above, below: (n, 3) the shells outside and inside the object, exaggerated and cut off, m.
+        surface: (n, 3) points of the disc, m, lifted by `LIFT_M`.
+        above, below: (n, 3) the shells outside and inside the object, exaggerated and cut off, m, lifted too.
         sigma: (n,) standard deviation of the height, m, as stated; infinite where not observed.
     """
 
@@ -61,5 +63,6 @@ def patch_shape(patch: SurfacePatch, xy: Array) -> PatchShape:
     x, y = xy.T
     height, sigma = patch.heights(x, y)
     shift = np.minimum(2.0 * EXAGGERATION * sigma, MOST_M)
-    surface, above, below = (np.column_stack([x, y, z]) for z in (height, height - shift, height + shift))
+    drawn = height - LIFT_M
+    surface, above, below = (np.column_stack([x, y, z]) for z in (drawn, drawn - shift, drawn + shift))
     return PatchShape(surface, above, below, sigma)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from canprobe.bridge.view.colours import linear_light
 from canprobe.bridge.view.trail import ErrorScale, Trail
 
 THICKNESS_M = 1.5e-3
@@ -66,7 +67,7 @@ class GrowingPath:
 
 
 def _add(api: Any, name: str, trail: Trail, chunk: slice, scale: ErrorScale, *, visible: bool) -> Any:
-    colours = scale.colours(np.array(trail.values[chunk]))
+    colours = linear_light(scale.colours(np.array(trail.values[chunk])))
     return api.add_line_segments(
         name, np.array(trail.segments[chunk], np.float32), np.repeat(colours[:, None], 2, axis=1),
         thickness=THICKNESS_M, thickness_units="world", visible=visible,

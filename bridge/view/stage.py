@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from canprobe.bridge.transforms import quaternion_of
 from canprobe.bridge.view.arm import arm_parts, link_frames, probe_parts
-from canprobe.bridge.view.colours import UNKNOWN
+from canprobe.bridge.view.colours import UNKNOWN, linear_light
 from canprobe.bridge.view.meshes import Array, Mesh
 from canprobe.bridge.view.moments import Moment
 from canprobe.bridge.view.objects import object_lines, object_mesh
@@ -96,7 +96,7 @@ class Stage:
             blank = np.zeros(len(places), np.uint8)
             self._taxels = self._api.add_batched_meshes_simple(
                 "/probe/taxels", vertices.astype(np.float32), faces.astype(np.uint32), turns, places,
-                batched_colors=taxel_colours(blank), batched_opacities=_opacities(blank), side="double",
+                batched_colors=linear_light(taxel_colours(blank)), batched_opacities=_opacities(blank), side="double",
                 cast_shadow=False, lod="off",
             )  # fmt: skip
         else:
@@ -142,7 +142,7 @@ class Stage:
             self._move_arm(moment.q)
         if moment.taxels is not None and self._taxels is not None:
             counts = moment.taxels.reshape(-1)
-            self._taxels.batched_colors = taxel_colours(counts)
+            self._taxels.batched_colors = linear_light(taxel_colours(counts))
             self._taxels.batched_opacities = _opacities(counts)
         self._show_contact(moment)
         self._show_patch(moment)

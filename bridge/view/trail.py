@@ -14,7 +14,7 @@ from canprobe.touch.objects import PlacedShape
 
 SPACING_M = 4e-4
 """Path between two points that are drawn."""
-LIFT_M = 8e-4
+LIFT_M = 1e-3
 """Off the surface, along the normal, so that the ghost does not hide the path."""
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""

@@ -129,8 +129,9 @@ class TimedBus(LockstepBus):
         Whoever calls for the next deadline lets time move on. What still comes before the start is taken in by then.
         """
         start = self._next_start()
-        unsure = self._controllers.troubled or self.errors is not None or len(self._nodes) < 2
-        if unsure or (first_due is not None and first_due <= start):
+        if first_due is not None and first_due <= start:
+            return start
+        if self.errors is not None or self._controllers.troubled or len(self._nodes) < 2:
             return start
         entry = self._ready[0]
         if entry is not self._planned:
@@ -143,7 +144,8 @@ class TimedBus(LockstepBus):
         if self._settling:
             return
         t_ns = self.clock.now_ns()
-        self._catch_up(t_ns)
+        if self._flying is None and self._ready:
+            self._catch_up(t_ns)
         self._settling = True
         if self._stale:
             self.next_deadline_ns()
@@ -194,7 +196,7 @@ class TimedBus(LockstepBus):
     # queues and arbitration
 
     def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
-        if not frames or self._controllers.is_off(node):
+        if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
             return  # a controller that is bus off takes no part
         if not self._settling:
             self._catch_up(self.clock.now_ns())
@@ -262,7 +264,7 @@ class TimedBus(LockstepBus):
 
     def _next_start(self) -> int:
         """When the next frame can start."""
-        start = max(self._free_ns, self._since_ns)
+        start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
         if self._controllers.suspended:
             start = max(start, min(self._controllers.suspended.get(entry[2], 0) for entry in self._ready))
         return start

@@ -5,6 +5,7 @@ The drives hold *motor* positions; the wrist's coupling is undone here and nowhe
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -101,6 +102,7 @@ class DriveGroup:
         self._deadline_ns = 0
         self._heard = [-1] * len(axes)
         self._targets: list[int] | None = None
+        self._aimed: tuple[int, ...] | None = None
         self._words = [0] * len(axes)
         self._steady: tuple[object, ...] | None = None
         self._frames = command_frames(axes)
@@ -193,12 +195,17 @@ class DriveGroup:
 
     def set_target(self, q: Vector | None) -> None:
         """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
-        if q is None:
-            return
-        before = self._targets if self._targets is not None else [track.counts for track in self._tracks]
-        self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
-        for track, target, last in zip(self._tracks, self._targets, before, strict=True):
+        if q is not None:
+            self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
+        if self._targets is not None:
+            self.aim(self._targets)
+
+    def aim(self, targets: Sequence[int]) -> None:
+        """The drives are told ``targets`` (counts) in this cycle: what they may do next follows from it."""
+        before = self._aimed if self._aimed is not None else [track.counts for track in self._tracks]
+        for track, target, last in zip(self._tracks, targets, before, strict=True):
             track.aim(abs(target - last))
+        self._aimed = tuple(targets)
 
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""

@@ -15,7 +15,7 @@ from canprobe.cell.deadlines import find_deadlines
 from canprobe.cell.drives import CommandFrame, command_frames
 from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Measurement
-from canprobe.cell.recording import Recording
+from canprobe.cell.recording import STAMP_JITTER_NS, Recording
 from canprobe.planning.model import Plan
 
 DRIFT_BLOCK = 400
@@ -76,7 +76,8 @@ class LogCycles:
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
         looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
-        on_time = stamps - deadlines <= (plan.traffic.budget.sync_ns or 0)  # it may have waited for the bus
+        waited = (plan.traffic.budget.sync_ns or 0) + STAMP_JITTER_NS  # for the bus, or so its stamp says
+        on_time = stamps - deadlines <= waited
         self._looks = _looks(recording, np.where(on_time, deadlines, stamps), looks)
         axes = self.drives.axes if self.drives is not None else ()
         self._commands = {frame.cob_id: frame for frame in command_frames(axes)}
@@ -101,7 +102,10 @@ class LogCycles:
                 intake.route(frames[seen:last])
             position = seen
             self._follow(frames[first:last])
-            yield LogCycle(measurement, self._known_targets(), self._enabled_by_master())
+            targets = self._known_targets()
+            if self.drives is not None and targets is not None:
+                self.drives.aim(targets)
+            yield LogCycle(measurement, targets, self._enabled_by_master())
 
     def _begin(self, t_ns: int, stamp_ns: int) -> None:
         self._intake.begin(self._intake.number + 1, t_ns, stamp_ns)

@@ -57,7 +57,7 @@ class ShapeScore:
         normal_rms_deg, position_rms_mm: of the estimated contact frame.
         estimates: how many were scored.
         observed_fraction: share of the answers after the run-in that observed all curvature.
-        patch_fraction: share of the scored answers to which the contact patch contributed.
+        patch_fraction: share of the scored answers of which the contact patch gave a tenth or more.
     """
 
     kappa_true: tuple[float, float] | None

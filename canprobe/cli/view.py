@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 _EXAMPLE = """\
 A scene is run and shown live, in the pace of real time, and afterwards as a replay. The page stays until Ctrl-C.
+Where a folder is called like a packaged scene, ./NAME is the folder.
 
 examples:
   canprobe view cylinder
@@ -47,10 +48,10 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.planning.bridges import check_bridges
 
     check_bridges(["view"])
-    folder, browser = Path(args.what), _Browser(quiet=args.no_open)
+    folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
     ends = () if args.html is not None else (KeyboardInterrupt,)  # how to leave a page, but not to write a file
     with contextlib.suppress(*ends), termination_interrupts():
-        if not folder.is_dir():
+        if _is_scene(args.what):
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.page import write_page
         from canprobe.bridge.view.recorded import read_run
@@ -61,8 +62,15 @@ def run(args: argparse.Namespace) -> int:
             write_page(recorded, args.html)
             print(args.html)
         else:
-            serve_run(recorded, port=args.port, host=args.host, ready=browser.show)
+            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show)
     return 0
+
+
+def _is_scene(what: str) -> bool:
+    """A packaged scene's name goes before a folder that is called like it; `./cylinder` is the folder."""
+    from canprobe.scene_loader import packaged_scenes
+
+    return not Path(what).is_dir() or what in dict(packaged_scenes())
 
 
 def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
@@ -97,15 +105,21 @@ class _Browser:
     """Says where it is to be seen, and opens that in the user's browser, once.
 
     Args:
+        port: that was asked for.
         quiet: only say it.
+
+    Attributes:
+        port: where it was last, so that a page that is open finds the next one there.
     """
 
-    def __init__(self, *, quiet: bool) -> None:
+    def __init__(self, port: int, *, quiet: bool) -> None:
+        self.port = port
         self._quiet = quiet or not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
     def show(self, address: str) -> None:
         """The page is there."""
         print(f"{address} (Ctrl-C ends it)", flush=True)
+        self.port = int(address.rpartition(":")[2])
         if not self._quiet:
             self._quiet = True
             webbrowser.open(address)

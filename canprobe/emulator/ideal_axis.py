@@ -1,6 +1,7 @@
 """An axis for a drive that has no plant: the motor is exactly where its reference is.
 
-It has no inertia, friction, load or torque; a following error never arises.
+Nothing loads it: there is no torque, and a following error never arises. Only a drive that controls torque asks how
+the motor would answer to it; it is told an inertia and a viscous damping, without Coulomb friction.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ class IdealAxis:
         return 0
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """Of a motor of its own: 100 permille give 10⁵ counts/s²."""
+        """Of a motor of its own: from rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
         return MotorDynamics(gain=1000.0, coulomb=0.0, damping=1.0)
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:

@@ -112,6 +112,12 @@ def opened(scene: Scene) -> Scene:
     return scene
 
 
+def written_value(scene: Scene, path: str) -> str:
+    """A key's value as a scene file writes it; a sensor without a channel of its own is on the scene's."""
+    value = _value(scene, path)
+    return _written(scene.bus.channel if path == "sensor.channel" and value is None else value)
+
+
 def _value(scene: Scene, path: str) -> Any:
     section, _, key = path.partition(".")
     return getattr(getattr(scene, section), key, None)

@@ -29,8 +29,13 @@ def plan_text(plan: Plan) -> str:
 def _lines(plan: Plan) -> Iterator[str]:
     bus, sync = plan.scene.bus, plan.sync
     yield f"{plan.scene.name}: {plan.scene.title}" if plan.scene.title else plan.scene.name
-    fd = f", CAN FD above 8 bytes, its data at {bus.data_bitrate} bit/s" if bus.fd else ""
-    yield f"bus {bus.channel} ({bus.interface}), {bus.bitrate} bit/s{fd}"
+    channels = " and ".join(one.channel for one in plan.buses)
+    yield f"bus {channels} ({bus.interface}), {bus.bitrate} bit/s"
+    if bus.fd:
+        yield (
+            f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s, everything else classical; every "
+            "controller on the bus must tolerate CAN FD, which no EDS tells"
+        )
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 
 from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.model import Traffic
-from canprobe.planning.open_keys import second_channel
+from canprobe.planning.open_keys import candidates, opened, second_channel, written_value
 from canprobe.scene import Scene, TactileModeName
 
 FD_ARRAY = "tactile_array_fd.eds"
@@ -18,7 +18,7 @@ Fit = Callable[[Scene], Traffic | None]
 def ways_out(scene: Scene, fit: Fit) -> str:
     """Changes that make the scene fit, with the load that they leave, in one line."""
     found = []
-    for text, changed in (*_changes(scene), *_slower(scene, fit)):
+    for text, changed in (*_changes(scene), *_together(scene, fit), *_slower(scene, fit)):
         traffic = fit(changed)
         if traffic is not None:
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
@@ -53,6 +53,16 @@ def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
         yield "bus.fd = true", fd
         sensor = dataclasses.replace(scene.sensor, eds=FD_ARRAY)
         yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', dataclasses.replace(fd, sensor=sensor)
+
+
+def _together(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
+    """The cheapest of what the plan could choose by itself, where it takes more than one change."""
+    for changed, choices in candidates(opened(scene)):
+        differing = [choice for choice in choices if choice.value != written_value(scene, choice.key)]
+        if fit(changed) is not None:
+            if len(differing) > 1:
+                yield " and ".join(f"{choice.key} = {choice.value}" for choice in differing), changed
+            return
 
 
 def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:

@@ -12,16 +12,16 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from canprobe.studies.ground import FROBENIUS, PATHS, SURFACES, Array, Ground, make_ground
+from canprobe.studies.bound_cases import Case, all_cases, quick_cases, reasons_outside
+from canprobe.studies.bound_scores import METHODS, Answer, answer_of, findings, length, score, verdict
+from canprobe.studies.ground import FROBENIUS
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import SIGMA_COLUMNS, measuring_facts, sigma_values
 from canprobe.studies.sweep import Sweep
@@ -30,15 +30,9 @@ from canprobe.touch.bound import cramer_rao
 from canprobe.touch.fit import fit_surface
 from canprobe.touch.prior import Prior
 
-SEEDS = 200
-SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
-NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
-METHODS = ("ml", "recursive")
-MODEL = ("touch", "studies/bound.py", "studies/ground.py")
-CHI2_95_OF_3 = 7.815
-# the region in which a local quadratic bound means something
-LARGEST_BOUND, LEAST_SIZE, LARGEST_TILT, LARGEST_BIAS = 0.2, 50.0, 5e-3, 1.0 / 3.0
-POOLED_RATIO, CASE_RATIO = {"ml": 1.1, "recursive": 1.25}, {"ml": 1.25, "recursive": 1.4}
+SEEDS, BLOCK = 200, 20
+"""Seeds a case, and how many of them make a cell of the sweep."""
+MODEL = ("touch", "studies/bound.py", "studies/bound_cases.py", "studies/bound_scores.py", "studies/ground.py")
 COLUMNS = (
     Column("surface", "surface"),
     Column("path", "path"),
@@ -58,47 +52,20 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Case:
-    """One row of the study, m and rad."""
-
-    surface: str
-    path: str
-    size: float
-    length: float
-    sigma_point: float
-    sigma_normal: float
-
-    @property
-    def ground(self) -> Ground:
-        """The path over the exact surface."""
-        return make_ground(self.surface, self.size, self.path, self.length, SAMPLES)
-
-
-def all_cases() -> Iterator[Case]:
-    """Weaves and circles over every surface and size with every noise, and weaves of 1.5 radii."""
-    for surface in SURFACES:
-        for size in SIZES_M[:2] if surface == "plane" else SIZES_M:
-            for path, noise in product(PATHS, NOISES):
-                yield Case(surface, path, size, min(size, LONGEST_M), *noise)
-        if surface != "plane":
-            for noise in NOISES[1:]:
-                yield Case(surface, "weave", SIZES_M[0], 1.5 * SIZES_M[0], *noise)
-
-
-def quick_cases() -> Iterator[Case]:
-    """Every surface once, and sizes, paths and noises in turn."""
-    for i, surface in enumerate(SURFACES):
-        size = SIZES_M[i % 2]
-        yield Case(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
-
-
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     """Measure all cases."""
-    seeds = 10 if quick else SEEDS
-    cases = list(quick_cases() if quick else all_cases())
+    return measure_all(list(quick_cases() if quick else all_cases()), 10 if quick else SEEDS, sweep, quick=quick)
+
+
+def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
+    """The study of some cases with so many seeds each."""
     sweep.say(f"{len(cases)} cases, {seeds} seeds each")
-    rows = [row for rows in sweep.map(measure, [(case, seeds) for case in cases], model=MODEL) for row in rows]
+    blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
+    cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
+    answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
+    for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
+        answers[case, method] += found
+    rows = [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
 
     def draw(path: Path) -> None:
         from canprobe.studies.bound_figure import draw_bound
@@ -108,19 +75,28 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     return StudyResult("bound", COLUMNS, rows, findings(rows), measuring_facts(quick, seeds, MODEL), draw)
 
 
-def measure(cell: tuple[Case, int]) -> list[dict[str, Any]]:
-    """One row for each method, of a case with so many seeds."""
-    case, seeds = cell
-    ground = case.ground
-    prior = Prior.weak(float(np.linalg.norm(ground.points - ground.points[-1], axis=1).max()))
-    C = cramer_rao(
-        ground.points, ground.normals, ground.surface,
-        sigma_point=case.sigma_point, sigma_normal=case.sigma_normal, prior=prior,
-    )  # fmt: skip
-    fit = partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
+def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
+    """Answers of a method to a case, with so many seeds from the first one on."""
+    case, method, first, count = cell
+    ground, fit, own = case.ground, _fitter(case), zlib.crc32(as_json(case).encode())
+    generators = [np.random.default_rng([own, seed]) for seed in range(first, first + count)]
+    felt = [ground.felt(case.sigma_point, case.sigma_normal, rng) for rng in generators]
+    return [answer_of(ground, fit(points, normals, method=method)) for points, normals in felt]
+
+
+def _fitter(case: Case) -> partial[Any]:
+    points = case.ground.points
+    prior = Prior.weak(float(np.linalg.norm(points - points[-1], axis=1).max()))
+    return partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
+
+
+def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[dict[str, Any]]:
+    """One row for each method."""
+    ground, fit = case.ground, _fitter(case)
+    C = cramer_rao(ground.points, ground.normals, ground.surface, **fit.keywords)
     bound = math.sqrt(float(FROBENIUS @ np.diag(C)))
-    exact = fit(ground.points, ground.normals)
-    model_bias = _length(ground.error(exact.T_frame_contact, exact.K)) / bound
+    exact = fit(ground.points, ground.normals, quadric=True)
+    model_bias = length(ground.error(exact.T_frame_contact, exact.K)) / bound
     why = reasons_outside(case, ground, C, model_bias)
     shared = {
         "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
@@ -128,96 +104,6 @@ def measure(cell: tuple[Case, int]) -> list[dict[str, Any]]:
         "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)), "model_bias": model_bias,
         "inside": not why, "outside_for": ", ".join(why) or "–",
     }  # fmt: skip
-    own = zlib.crc32(as_json(case).encode())
-    generators = [np.random.default_rng([own, seed]) for seed in range(seeds)]
-    felt = [ground.felt(case.sigma_point, case.sigma_normal, rng) for rng in generators]
-    rows = [shared | {"method": m} | _score(ground, [fit(p, n, method=m) for p, n in felt], bound) for m in METHODS]
-    for row in rows:
-        row["verdict"] = verdict(row, seeds)
-    return rows
-
-
-def reasons_outside(case: Case, ground: Ground, C: Array, model_bias: float) -> list[str]:
-    """Why a local quadratic bound means little in a case; empty inside the region."""
-    size = float(np.linalg.norm(ground.K))
-    tightest = float(np.abs(np.linalg.eigvalsh(ground.K)).max())
-    entry = math.sqrt(float(np.diag(C).max()))
-    tests = {
-        "path": case.surface != "plane" and case.length > case.size * (1.0 + 1e-9),
-        "bound": not entry <= LARGEST_BOUND * max(size, LEAST_SIZE),
-        "κσ": tightest * case.sigma_point > LARGEST_TILT * (1.0 + 1e-9),
-        "cubic": not model_bias <= LARGEST_BIAS,
-    }
-    return [name for name, outside in tests.items() if outside]
-
-
-def _score(ground: Ground, answers: Sequence[Any], bound: float) -> dict[str, Any]:
-    seen = [a for a in answers if a.rank == 3]
-    if not seen:
-        return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
-    errors = np.array([ground.error(a.T_frame_contact, a.K) for a in seen])
-    squares = [float(e @ np.linalg.solve(a.covariance, e)) for e, a in zip(errors, seen, strict=True)]
-    mean, scatter = errors.mean(axis=0), float(errors.var(axis=0) @ FROBENIUS) / len(errors)  # the mean's own scatter
-    claimed = float(np.median([FROBENIUS @ np.diag(a.covariance) for a in seen]))
-    return {
-        "ratio": math.sqrt(float(np.mean(errors**2 @ FROBENIUS))) / bound,
-        "claimed": math.sqrt(claimed) / bound,
-        "bias": math.sqrt(max(_length(mean) ** 2 - scatter, 0.0)) / bound,
-        "coverage": float(np.mean(np.array(squares) < CHI2_95_OF_3)),
-        "observed": len(seen) / len(answers),
-    }
-
-
-def _length(error: Array) -> float:
-    return math.sqrt(float(FROBENIUS @ error**2))
-
-
-def verdict(row: dict[str, Any], seeds: int) -> str:
-    """What a row shows: `good`, or what is wrong with it.
-
-    With few seeds the limits are wider by what that many leave open: three standard deviations of the coverage
-    (where that is more than 5 %), one of the mean error and two of its size (1/√(6n): three entries, sum of squares).
-    """
-    if row["ratio"] is None:
-        return "not observed" if row["inside"] else "good"
-    open_cover = max(0.05, 3.0 * math.sqrt(0.95 * 0.05 / seeds))
-    wrong = []
-    if row["inside"]:
-        if row["ratio"] > CASE_RATIO[row["method"]] * (1.0 + (0.0 if seeds >= 200 else 2.0 / math.sqrt(6.0 * seeds))):
-            wrong.append("error")
-        if row["bias"] > LARGEST_BIAS + row["ratio"] / math.sqrt(seeds):
-            wrong.append("bias")
-        if row["observed"] < 1.0:
-            wrong.append("not observed")
-    if row["coverage"] < 0.95 - open_cover:
-        wrong.append("overconfident")
-    elif row["inside"] and row["coverage"] > min(0.99, 0.95 + open_cover) and seeds >= 200:
-        wrong.append("covers too much")
-    return ", ".join(wrong) or "good"
-
-
-def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Pooled figures inside the region, what is wrong there, and what is outside."""
-    said = []
-    for method in METHODS:
-        mine = [r for r in rows if r["method"] == method]
-        inside = [r for r in mine if r["inside"] and r["ratio"] is not None]
-        outside = [r for r in mine if not r["inside"]]
-        pooled = math.sqrt(float(np.mean([r["ratio"] ** 2 for r in inside])))
-        cover = float(np.mean([r["coverage"] for r in inside]))
-        bad = [r for r in inside if r["verdict"] != "good"]
-        honest = [r for r in outside if r["verdict"] == "good"]
-        said.append(
-            f"{method}: inside the region {len(inside)} cases, error pooled {pooled:.3f} × bound (asked for: at most "
-            f"{POOLED_RATIO[method]}), 95 % regions cover {100 * cover:.1f} % pooled (asked for: 94–96 %), "
-            f"{len(bad)} cases out of line; outside {len(outside)} cases, {len(honest)} with honest covariance."
-        )
-        said += [f"  out of line: {_named(r)}: {r['verdict']}" for r in bad]
-    return said
-
-
-def _named(row: dict[str, Any]) -> str:
-    return (
-        f"{row['surface']} {row['size_mm']:.0f} mm, {row['path']}, {row['sigma_point_um']:.0f} µm "
-        f"(error {row['ratio']:.2f}, bias {row['bias']:.2f}, cover {row['coverage']:.3f})"
-    )
+    for method, mine in answers.items():
+        row = shared | {"method": method} | score(mine, bound)
+        yield row | {"verdict": verdict(row, len(mine))}

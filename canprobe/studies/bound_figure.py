@@ -30,11 +30,11 @@ def draw_bound(rows: Sequence[dict[str, Any]], path: Path) -> None:
         limit = 1.1 if method == "ml" else 1.25
         _draw(grid[0][j], mine, surfaces, "ratio", (0.0, CLIP))
         grid[0][j].axhline(1.0, color=INK, linewidth=1.0)
-        grid[0][j].axhspan(0.0, limit, color=FAINT, alpha=0.5, linewidth=0)
+        grid[0][j].axhspan(0.0, limit, color=FAINT, alpha=0.5, linewidth=0, zorder=0)
         grid[0][j].set_title(f"{method}: error / bound (above {CLIP:g}: at the edge)", loc="left", fontsize=10)
         _draw(grid[1][j], mine, surfaces, "coverage", (0.0, 1.02))
         grid[1][j].axhline(0.95, color=INK, linewidth=1.0)
-        grid[1][j].axhspan(0.90, 0.99, color=FAINT, alpha=0.5, linewidth=0)
+        grid[1][j].axhspan(0.90, 0.99, color=FAINT, alpha=0.5, linewidth=0, zorder=0)
         grid[1][j].set_title(f"{method}: coverage of 95 % regions", loc="left", fontsize=10)
     handles, labels = grid[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
@@ -51,10 +51,11 @@ def _draw(
             y = np.clip([r[key] for r in mine], *limits) if mine else []
             axes.scatter(
                 x, y, s=26, marker=marker, linewidths=1.0, edgecolors=colour,
-                facecolors=colour if inside else "none", label=f"{path}, {'inside' if inside else 'outside'}",
+                facecolors=colour if inside else "none", label=f"{path}, {'inside' if inside else 'outside'}", zorder=3,
             )  # fmt: skip
     axes.set_xticks(range(len(surfaces)), surfaces)
-    axes.set_ylim(limits[0], 1.03 * limits[1])
+    axes.set_xlim(-0.6, len(surfaces) - 0.4)
+    axes.set_ylim(limits[0] - 0.02 * limits[1], 1.03 * limits[1])
     axes.grid(color=FAINT, linewidth=0.6, axis="y")
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)

@@ -45,14 +45,17 @@ def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 
 def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
+    named: set[str] = set()
     for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
         line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
         x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
         y = [r["error_percent"] for r in line]
-        first = lag is None or lag == 1
         axes.plot(x, y, color=COLOURS[method], linewidth=1.0, alpha=0.8)
         sizes = [12.0 * r["window_samples"] / 40 for r in line]
-        axes.scatter(x, y, s=sizes, color=COLOURS[method], label=method if first else None, zorder=3, linewidths=0)
+        axes.scatter(
+            x, y, s=sizes, color=COLOURS[method], label=None if method in named else method, zorder=3, linewidths=0
+        )
+        named.add(method)
         if lag is not None and x:
             axes.annotate(
                 f"lag {lag}", (x[-1], y[-1]), textcoords="offset points", xytext=(7, -2), fontsize=7, color=BOUND

@@ -1,4 +1,4 @@
-"""Calibrate the second moments of the array's images: press known curvatures, roll or stand, fit eight numbers.
+"""Calibrate the second moments of the array's images: press known curvatures, roll or stand, fit the sensor's model.
 
 Every press has an array of its own (gains), principal curvatures, a direction on the pad, a force and a place by
 chance, and lasts some seconds under a force that is a little restless; half of them stand still, half roll slowly over
@@ -8,6 +8,7 @@ so it holds gains, hysteresis, creep and the form of the model, and no averaging
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -20,7 +21,8 @@ from canprobe.emulator.plant.taxels import Image, TaxelArray, TaxelConfig
 from canprobe.emulator.tactile_image import follow
 from canprobe.touch.patch import compute_patch
 from canprobe.touch.patch_image import MomentImage
-from canprobe.touch.patch_moments import MomentFit, MomentModel
+from canprobe.touch.patch_memory import PadMemory
+from canprobe.touch.patch_moments import MomentFit, MomentModel, terms
 
 Array = NDArray[np.float64]
 KAPPA = (-12.0, 60.0)
@@ -37,7 +39,10 @@ UNREST, UNREST_S = 0.03, 0.1
 FRAME_S = 0.04
 LONGEST = {True: 3.2, False: 5.0}
 """Largest ideal moment over the squared pitch that is used, with the 8×8 window and with the whole pad."""
-_FLAT = MomentFit((0.0,) * 8, 1.0, tuple(map(tuple, np.eye(4).tolist())), 0.0, (0.0, np.inf), (0.0, np.inf))
+CHI2_95_OF_4 = 9.488
+_FLAT = MomentFit(
+    (0.0,) * len(terms(0.0, 0.0, 0.0)), 1.0, tuple(map(tuple, np.eye(4).tolist())), 0.0, (0.0, np.inf), (0.0, np.inf)
+)
 
 
 class Press(NamedTuple):
@@ -47,6 +52,7 @@ class Press(NamedTuple):
         kappa: (2,) principal curvatures, 1/m.
         force: N.
         moments: (2, 2) mean of the second moments in the principal axes, m².
+        remembered: (2, 2) mean of the ways to where the patch was before (`patch_memory`), in the same axes, m².
         measured_force: mean, N.
         frame_sigma: relative standard deviation of the moments of single frames.
     """
@@ -54,6 +60,7 @@ class Press(NamedTuple):
     kappa: Array
     force: float
     moments: Array
+    remembered: Array
     measured_force: float
     frame_sigma: float
 
@@ -76,17 +83,22 @@ def random_presses(n: int, seed: int, full_scale_pa: float, *, windowed: bool) -
         axes = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
         array = TaxelArray(TaxelConfig(full_scale_pa=full_scale_pa), rng)
         pressed = list(_images(array, rng, kappa, force, axes, full_scale_pa, rolling=bool(i % 2), windowed=windowed))
-        images, forces = zip(*pressed, strict=True)
+        times, images, forces = zip(*pressed, strict=True)
         patches = [compute_patch(image, calibration) for image in images]
-        if any(p.saturated or p.cut_by_pad for p in patches):
+        last = int(np.searchsorted(times, times[-1] + FRAME_S - AVERAGE_S - 1e-9))
+        if any(p.saturated or p.cut_by_pad for p in patches[last:]):
             continue
-        seen = np.array([moment_image.moments(image) for image in images])
-        V = axes @ seen[:, [[0, 1], [1, 2]]] @ axes.T
+        memory = PadMemory()
+        ways = [memory.add(t, p.u, p.v) for t, p in zip(times, patches, strict=True) if p.n_active]
+        seen = np.array([moment_image.moments(image) for image in images[last:]])
+        V, D = (axes @ np.asarray(x)[:, [[0, 1], [1, 2]]] @ axes.T for x in (seen, ways[-len(seen) :]))
+        patches, forces = patches[last:], forces[last:]
         spread = np.diagonal(np.diff(V, axis=0), axis1=1, axis2=2) / np.diagonal(V.mean(axis=0))
         yield Press(
             kappa,
             float(np.mean(forces)),
             V.mean(axis=0),
+            D.mean(axis=0),
             float(np.mean([p.force for p in patches])),
             float(spread.std() / np.sqrt(2.0)),
         )
@@ -102,8 +114,8 @@ def _images(  # noqa: PLR0917
     *,
     rolling: bool,
     windowed: bool,
-) -> Iterator[tuple[Image, float]]:
-    """Images of the last second of one press, each with the force (N)."""
+) -> Iterator[tuple[float, Image, float]]:
+    """Time (s), image and force (N) through one press."""
     calibration = array_calibration(full_scale_pa)
     k = (float(kappa[0]), float(kappa[1]))
     depth = depth_for_force(force, k, calibration.radius_m, 1.27e8)
@@ -124,8 +136,7 @@ def _images(  # noqa: PLR0917
             part = np.s_[origin[0] : origin[0] + 8, origin[1] : origin[1] + 8]
             seen[part] = image[part]
             image = seen
-        if t >= duration - AVERAGE_S:
-            yield image, now
+        yield t, image, now
 
 
 def sensor(full_scale_pa: float, fit: MomentFit = _FLAT) -> MomentModel:
@@ -148,32 +159,39 @@ def fit_moments(presses: Sequence[Press], full_scale_pa: float, *, windowed: boo
     m, t = m[used], t[used]
     V = np.array([p.moments for p in presses])[used] / model.pitch**2
     seen = np.diagonal(V, axis1=1, axis2=2)
+    D = np.array([p.remembered for p in presses])[used] / model.pitch**2
     basis = np.stack([_basis(m[:, 0], m[:, 1], t), _basis(m[:, 1], m[:, 0], t)], axis=1)
-    rows = (basis / seen[:, :, None]).reshape(-1, 8)
+    basis = np.concatenate([basis, np.diagonal(D, axis1=1, axis2=2)[:, :, None]], axis=2)
+    rows = (basis / seen[:, :, None]).reshape(-1, basis.shape[2])
     c, *_ = np.linalg.lstsq(rows, np.ones(len(rows)), rcond=None)
     errors = seen / (basis @ c) - 1.0
-    shear = V[:, 0, 1] / np.sqrt(seen.prod(axis=1))
+    shear = (V - c[-1] * D)[:, 0, 1] / np.sqrt(seen.prod(axis=1))
     ratio = np.array([p.measured_force / p.force for p in presses])[used]
     return MomentFit(
-        tuple(c.tolist()),
+        tuple(c[:-1].tolist()),
         float(ratio.mean()),
-        tuple(map(tuple, _floor(errors, shear, ratio / ratio.mean() - 1.0).tolist())),
+        tuple(map(tuple, _floor(np.column_stack([errors, shear, ratio / ratio.mean() - 1.0]), t).tolist())),
         float(np.median([p.frame_sigma for p in presses])),
         (float(m.min()), float(m.max())),
         (float(t.min()), float(t.max())),
+        float(c[-1]),
     )
 
 
 def _basis(mi: Array, mj: Array, t: Array) -> Array:
-    return np.stack([np.ones_like(t), mi, mj, t, mi * mi, mi * mj, t * mi, mj * mj], axis=1)
+    return np.stack(terms(mi, mj, t), axis=1)
 
 
-def _floor(errors: Array, shear: Array, force: Array) -> Array:
-    """(4, 4) covariance, the same for both axes of the patch."""
-    C = np.zeros((4, 4))
-    C[0, 0] = C[1, 1] = np.mean(errors**2)
-    C[0, 1] = C[1, 0] = np.mean(errors[:, 0] * errors[:, 1])
-    C[2, 2] = np.mean(shear**2)
-    C[3, 3] = np.mean(force**2)
-    C[0, 3] = C[3, 0] = C[1, 3] = C[3, 1] = np.mean(errors * force[:, None])
-    return C
+def _floor(errors: Array, t: Array) -> Array:
+    """(4, 4) covariance, the same for both axes of the patch, of errors (n, 4) whose variance grows with t (n,).
+
+    Their tails are longer than a normal distribution's: it is made so large that its 95 % region holds 95 % of them.
+    """
+    scaled = errors * np.sqrt(math.sqrt(float(t.min() * t.max())) / t)[:, None]
+    C = scaled.T @ scaled / len(scaled)
+    C[0, 0] = C[1, 1] = 0.5 * (C[0, 0] + C[1, 1])
+    C[0, 3] = C[3, 0] = C[1, 3] = C[3, 1] = 0.5 * (C[0, 3] + C[1, 3])
+    C[2, [0, 1, 3]] = C[[0, 1, 3], 2] = 0.0
+    squares = np.einsum("ij,ij->i", scaled, np.linalg.solve(C, scaled.T).T)
+    result: Array = C * max(1.0, float(np.quantile(squares, 0.95)) / CHI2_95_OF_4)
+    return result

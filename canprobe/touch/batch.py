@@ -9,19 +9,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, checked
+from canprobe.touch._arrays import Array, checked, solved
 from canprobe.touch.anchor import anchor, solution
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
+from canprobe.touch.evidence import evidence_of
 from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.misfit import correct
 from canprobe.touch.noise import Correlation, Noise
-from canprobe.touch.nonlinear import fit
+from canprobe.touch.nonlinear import DIFFUSE, fit
 from canprobe.touch.prior import Prior, path_extent
 from canprobe.touch.quadric import design
+from canprobe.touch.rank import nothing_observed, spread_of
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 
 _MEAN_OF = 8
+_CERTAIN = 0.99
+"""Probability of a misfit from which an estimate mentions it."""
 
 
 class Touches(NamedTuple):
@@ -89,12 +94,13 @@ def working_frame(touches: Touches) -> Array:
     return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
 
 
-def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
+def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> SurfaceEstimate:
     """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point.
 
     Args:
         touches: checked input.
         prior: None for `Prior.weak` over the extent of the path.
+        quadric: the surface is one exactly; else its cubic and quartic terms are allowed for (`misfit`).
     """
     length = touches.extent
     stated = Prior.weak(length) if prior is None else prior
@@ -102,13 +108,26 @@ def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
     result = fit(d, stated.rows(length), touches.whitener())
-    a = anchor(result.c, T, np.zeros(3), length)
     singular = np.linalg.svd(result.root, compute_uv=False)
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
+    if result.decision.rank == 3 and not quadric:
+        corrected = correct(result.c, result.root, d, touches.whitener())
+        certain = corrected.misfit > _CERTAIN
+        if corrected.trusted and (result.converged or not certain):
+            c, root = corrected.c, corrected.root
+            result = result._replace(c=c, root=root, free=c, free_root=root)
+            notes += ("no quadric: corrected for cubic and quartic terms",) if certain else ()
+        else:
+            result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
+            notes += ("no quadric: K varies too much along the path to be observed",)
+    has_prior = math.isfinite(stated.sigma_curvature)
+    a = anchor(result.c, T, np.zeros(3), length)
+    free = anchor(result.free, T, np.zeros(3), length)
+    spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
-        solution(a, result.root, result.decision, math.isfinite(stated.sigma_curvature)),
+        solution(a, result.root, result.decision, has_prior),
         length=length,
         T_frame_contact=a.T_frame_contact,
         condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf,
@@ -118,4 +137,13 @@ def fit_ml(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
         method="ml",
         prior=stated.name,
         notes=notes,
+        evidence=evidence_of(free.c, solved(result.free_root.T, free.M.T).T, spread, length),
     )
+
+
+def _turned_spread(spread: Array, angle: float) -> Array:
+    """A covariance (2, 2) in axes turned by an angle (rad)."""
+    c, s = math.cos(angle), math.sin(angle)
+    R = np.array([[c, -s], [s, c]])
+    result: Array = R.T @ spread @ R
+    return result

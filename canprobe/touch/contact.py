@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +23,15 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.frames import cross, homogeneous, inverse_transform, tangent_rotation
+
+
+class Doubt(Enum):
+    """Why a contact's place is worth less than others."""
+
+    SATURATED = "a saturated patch"
+    CUT = "a patch cut by the pad's edge"
+    SMALL = "hardly a patch"
+    DEAD = "a dead taxel in the patch"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,6 +48,7 @@ class ContactSample:
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
         moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch_image`); None for none.
+        doubts: about the image; estimators give the contact less weight and say so.
     """
 
     t_s: float
@@ -49,6 +60,7 @@ class ContactSample:
     sigma_point: float | None = None
     sigma_normal: float | None = None
     moments: tuple[float, float, float] | None = None
+    doubts: tuple[Doubt, ...] = ()
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Array:
@@ -106,6 +118,7 @@ def contact_sample(
     radius: float,
     force_n: float,
     moments: tuple[float, float, float] | None = None,
+    doubts: tuple[Doubt, ...] = (),
 ) -> ContactSample:
     """A sample from the centroid on the pad: the whole way from taxels to base.
 
@@ -117,12 +130,13 @@ def contact_sample(
         radius: R_p, m.
         force_n: N.
         moments: of the patch, m².
+        doubts: about the image.
     """
     u, v = np.asarray(uv, dtype=np.float64).tolist()
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
     arm = (radius - depth) * direction
-    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments)
+    return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments, doubts=doubts)
 
 
 def point_in_object(T_base_object: Array, p_base: Array) -> Array:

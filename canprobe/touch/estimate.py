@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch._arrays import Array, read_only
+from canprobe.touch.evidence import CurvatureInformation
 from canprobe.touch.quadric import matrix_of
 from canprobe.touch.rank import Decision, outside, tensor
 from canprobe.touch.surface import SurfaceMatrix
@@ -57,6 +58,8 @@ class SurfaceEstimate:
         model_root: (9, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
             contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
             known of place and normal. None from the methods of differences, which do not know it.
+        evidence: what the data (and a prior on curvature) say about K before the rank decision, to be fused with
+            another source. None from the methods of differences.
     """
 
     S: Array
@@ -78,6 +81,7 @@ class SurfaceEstimate:
     prior: str
     notes: tuple[str, ...] = ()
     model_root: Array | None = None
+    evidence: CurvatureInformation | None = None
 
     def __post_init__(self) -> None:
         for name in _ARRAYS:
@@ -160,6 +164,7 @@ def build_estimate(
     method: str,
     prior: str,
     notes: tuple[str, ...] = (),
+    evidence: CurvatureInformation | None = None,
 ) -> SurfaceEstimate:
     """An estimate from a solution in units of `length` (m)."""
     S = matrix_of(solution.c)
@@ -196,6 +201,7 @@ def build_estimate(
         prior=prior,
         notes=notes,
         model_root=None if solution.root is None else solution.root * _units(length),
+        evidence=evidence,
     )
 
 

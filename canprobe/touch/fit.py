@@ -30,6 +30,7 @@ def fit_surface(
     prior: Prior | None = None,
     lag: int = 10,
     correlation: Correlation | None = None,
+    quadric: bool = False,
 ) -> SurfaceEstimate:
     """Local shape at the last of a series of contact points.
 
@@ -47,6 +48,8 @@ def fit_surface(
         lag: for "chen1996".
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
             covariance grows by it; None for independent samples.
+        quadric: for "ml": the surface is known to be one. Otherwise its cubic and quartic terms are corrected for
+            where they show and allowed for in the covariance where they could hide (`misfit`).
 
     Returns:
         The estimate; what the points did not observe is marked, not guessed.
@@ -67,7 +70,7 @@ def fit_surface(
     p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal), correlation)
     if method == "ml":
-        return fit_ml(touches, prior)
+        return fit_ml(touches, prior, quadric=quadric)
     if method == "recursive":
         return _run_filter(touches, prior)
     if correlation is not None:

@@ -1,8 +1,8 @@
 """Batch Gauss–Newton on the nine-parameter local model, robust, with the rank decided on curvature.
 
 Source: ESTIMATION of local shape as an errors-in-variables problem; the whitening `σ_n² I + K² σ_p²` keeps it at the
-Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom residuals
-lose weight with their square, measured against the median residual where that is larger than expected.
+Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom samples lose
+weight (`robust`), measured against the median residual where that is larger than expected.
 """
 
 from __future__ import annotations
@@ -17,10 +17,15 @@ from canprobe.touch.quadric import UNIT, Design, linear_rows, rows
 from canprobe.touch.rank import Decision, decide, spread_of
 
 CHI2_999 = 16.27
+DIFFUSE = 1e-2
+"""Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
 _MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
 _START_ROUNDS = 8
+_UPHILL = 0.05
+"""Rise of the cost that a step may bring: the steps end where the residuals balance, which is not quite where the cost
+is least, since the whitening changes with K and wrong samples pull."""
 _PINNED = 10.0
 """How much narrower the linear start takes the prior on c13, c23, c33."""
 _GROSS = 60.0
@@ -34,6 +39,8 @@ class Fit(NamedTuple):
         c: (9,) parameters.
         root: (9, 9) upper triangular information root, prior included.
         decision: rank decision on the data.
+        free: (9,) parameters with nothing held, and
+        free_root: (9, 9) root of their information, kept regular by next to nothing (`DIFFUSE`).
         innovation: weighted χ² per degree of freedom.
         outliers: samples with less than full weight.
         converged: the last step was below the tolerance.
@@ -42,6 +49,8 @@ class Fit(NamedTuple):
     c: Array
     root: Array
     decision: Decision
+    free: Array
+    free_root: Array
     innovation: float
     outliers: int
     converged: bool
@@ -56,11 +65,11 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
         independent: (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
     """
     spread = spread_of(d.X, d.point_variance)
-    c, root, decision = _start(d, prior, spread)
+    c, root, decision = linear_start(d, prior, spread)
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
     for _ in range(_ITERATIONS):
-        r, J, log_det = rows(c, d)
+        r, J, _ = rows(c, d)
         square = np.einsum("ij,ij->i", r, r)
         weight, cost = robust(square)
         w = np.sqrt(weight)[:, None]
@@ -69,44 +78,68 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             beyond = cost - float(weight @ square)
             rw, Jw = mixed(independent, rw[:, :, None])[:, :, 0], mixed(independent, Jw)
             cost = float(np.sum(rw * rw)) + beyond
-        # without log_det a large K, which explains any residual by noise of the points, would look good; without the
-        # prior's part a large c33 on a short path, which flattens f/|∇f|, would
+        # without the prior's part a large c33 on a short path, which flattens f/|∇f|, would look good. The noise's
+        # log-determinant has no place here: with the feet as unknowns it does not belong to the likelihood, and on
+        # tight curvature it draws K down by a tenth
         assumed = prior[0] @ c - prior[1]
-        cost += log_det + float(assumed @ assumed)
-        if cost > best_cost + 1e-3 * len(square) and halvings < 12:
+        cost += float(assumed @ assumed)
+        if cost > (1.0 + _UPHILL) * best_cost and halvings < 12:
             step, halvings = 0.5 * step, halvings + 1
             c = best + step
             continue
         best, best_cost, halvings = c, cost, 0
         chi2, rows_of_r, rows_of_J = float(np.sum(rw * rw)), rw.reshape(-1), Jw.reshape(-1, 9)
-        target, root, decision = _solve(rows_of_J, rows_of_J @ c - rows_of_r, prior, spread, _size(c), known=decision)
+        b = rows_of_J @ c - rows_of_r
+        target, root, decision = solve_rows(rows_of_J, b, prior, spread, size_of(c), known=decision)
         step = target - best
         c = target
         if np.abs(step).max() < _TOLERANCE:
-            final = _solve(rows_of_J, rows_of_J @ best - rows_of_r, prior, spread, _size(c))
+            final = solve_rows(rows_of_J, rows_of_J @ best - rows_of_r, prior, spread, size_of(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
                 converged = True
                 break
             decision = final[2]
     c = c if converged else best
+    has_prior = bool(prior[0][3:].any())
+    free, free_root = (c, root) if has_prior else _freed(best, rows_of_J, rows_of_r, root, prior)
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
-    return Fit(c, root, decision, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
+    return Fit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
 
 
-def _start(d: Design, prior: tuple[Array, Array], spread: Array) -> tuple[Array, Array, Decision]:
-    """The linear solution; where some samples are far off, again with weights that fall with the square."""
+def _freed(c: Array, J: Array, r: Array, root: Array, prior: tuple[Array, Array]) -> tuple[Array, Array]:
+    """One more step with nothing held."""
+    regular = upper_root(np.concatenate([root, DIFFUSE * np.eye(9)]))
+    gradient = J.T @ r + prior[0].T @ (prior[0] @ c - prior[1])
+    return c - solved(regular, solved(regular.T, gradient)), regular
+
+
+def linear_start(
+    d: Design, prior: tuple[Array, Array], spread: Array, weight: Array | None = None
+) -> tuple[Array, Array, Decision]:
+    """The linear solution; where some samples are far off, again with weights that fall with the square.
+
+    Args:
+        d: constant parts.
+        prior: rows and right-hand side.
+        spread: of the points (`rank.spread_of`).
+        weight: (n,) to begin with; None for 1.
+
+    Returns:
+        Parameters (9,), root (9, 9) and rank decision.
+    """
     A, b = linear_rows(d)
     # the points' noise in z² and its kin would draw c13, c23, c33 far off, from where there is no way back
     prior = np.concatenate([_PINNED * prior[0][:3], prior[0][3:]]), prior[1]
-    answer = _solve(A, b, prior, spread, 0.0)
+    w = np.ones(len(b)) if weight is None else np.sqrt(weight).repeat(3)
+    answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)
     for _ in range(_START_ROUNDS):
         square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)
         scale = _median(square) / _MEDIAN_CHI2
         if float(square.max()) < _GROSS * scale:
             break
         w = np.sqrt(1.0 / (1.0 + square / (9.0 * max(scale, 1e-300)))).repeat(3)
-        answer = _solve(A * w[:, None], b * w, prior, spread, 0.0)
+        answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)
     return answer
 
 
@@ -116,20 +149,21 @@ def _median(values: Array) -> float:
 
 
 def robust(square: Array) -> tuple[Array, float]:
-    """Weights (n,) and robust cost of squared whitened residuals (n,); far off, the pull falls with the distance."""
+    """Weights (n,) and robust cost of squared whitened residuals (n,); far off, a sample costs no more and pulls by
+    the inverse cube of its distance: at the end of a long lever even a little would be too much."""
     limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
     ratio = limit / np.maximum(square, limit)
-    # d² inside, k (1 + ln(d²/k)) outside
-    return ratio, float(np.sum(np.where(ratio < 1.0, limit * (1.0 - np.log(ratio)), square)))
+    # d² inside, k (2 − k/d²) outside
+    return ratio * ratio, float(np.sum(np.where(ratio < 1.0, limit * (2.0 - ratio), square)))
 
 
-def _size(c: Array) -> float:
+def size_of(c: Array) -> float:
     """‖K‖, Frobenius."""
     c11, c12, c22 = c[6:].tolist()
     return float(2.0 * np.sqrt(c11 * c11 + 2.0 * c12 * c12 + c22 * c22))
 
 
-def _solve(
+def solve_rows(
     A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float, *, known: Decision | None = None
 ) -> tuple[Array, Array, Decision]:
     """Least squares by QR; combinations of K that were not observed are held at the value nearest to flat.

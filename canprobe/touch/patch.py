@@ -18,6 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, positive, read_only
+from canprobe.touch.contact import Doubt
+from canprobe.touch.patch_mending import mended
 
 SIDE = 16
 """Rows and columns of the array."""
@@ -61,6 +63,7 @@ class Patch(NamedTuple):
         cut_by_window: the patch reaches an edge of the window inside the pad.
         cut_by_pad: the patch reaches the pad's edge.
         too_few: fewer than four active taxels: no moments to speak of.
+        dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`patch_mending`).
     """
 
     force: float
@@ -75,11 +78,23 @@ class Patch(NamedTuple):
     cut_by_window: bool
     cut_by_pad: bool
     too_few: bool
+    dead: int = 0
 
     @property
     def good(self) -> bool:
         """Nothing makes the centroid doubtful."""
-        return not (self.saturated or self.cut_by_window or self.cut_by_pad or self.too_few)
+        return not (self.saturated or self.cut_by_window or self.cut_by_pad or self.too_few or self.dead)
+
+    @property
+    def doubts(self) -> tuple[Doubt, ...]:
+        """What an estimator should know of."""
+        said = (
+            (Doubt.SATURATED, self.saturated),
+            (Doubt.CUT, self.cut_by_pad),
+            (Doubt.SMALL, self.too_few),
+            (Doubt.DEAD, self.dead > 0),
+        )
+        return tuple([doubt for doubt, holds in said if holds])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -152,6 +167,7 @@ def compute_patch(
     """
     if taxels.shape != (SIDE, SIDE) or taxels.dtype != np.uint8:
         raise UsageError(f"taxels: expected (16, 16) uint8, got {taxels.shape} {taxels.dtype}")
+    taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
     active = pressure > 0.0
@@ -166,7 +182,7 @@ def compute_patch(
         saturated=peak >= calibration.counts_max,
         cut_by_window=cut_by_window,
         cut_by_pad=cut_by_pad,
-    )
+    )._replace(dead=dead)
 
 
 def _patch(

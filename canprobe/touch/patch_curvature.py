@@ -4,8 +4,10 @@ The moments are averaged over the last frames, in axes that follow the contact n
 model of the sensor (`patch_moments`). What gains, hysteresis and blur do to them is common to all images of a contact:
 however many are averaged, the patch never knows more than the calibration's floor.
 
-In the fusion the patch speaks where it knows more than the motion does, combination by combination of K; elsewhere it
-is not asked. A point-and-normal estimate along a path that excites all of K is better than any image.
+The fusion is that of two measurements: the informations of motion and patch are added, each with its whole
+covariance, so the patch fades where a path excites all of K and speaks where it does not. Two things bound what it can
+do: outside the calibrated range it counts less and less, and so it does the further it is from what the motion
+knows, by the weight of an outlier.
 
 The layer's model is stated in `patch_moments`.
 """
@@ -18,9 +20,12 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch._arrays import Array, solved
-from canprobe.touch.contact import ContactSample
+from canprobe.touch.contact import ContactSample, direction_to_pad
+from canprobe.touch.evidence import TO_Q, CurvatureInformation
 from canprobe.touch.frames import tangent_rotation
+from canprobe.touch.nonlinear import CHI2_999
 from canprobe.touch.patch_image import Moments
+from canprobe.touch.patch_memory import PadMemory
 from canprobe.touch.patch_moments import MomentModel
 from canprobe.touch.rank import turned
 
@@ -35,19 +40,20 @@ MOST_ROUNDS = 6
 SETTLED, UNSETTLED = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
 _ROOT2 = math.sqrt(2.0)
-_TO_Q = np.array([1.0, _ROOT2, 1.0])
 
 
-class CurvatureInformation(NamedTuple):
-    """What a source says about q = (K11, √2 K12, K22) in some contact frame.
+class Fused(NamedTuple):
+    """What patch and motion say together about q in a contact frame.
 
     Attributes:
-        q: (3,) its own value, 1/m; counts only where there is information.
-        information: (3, 3) inverse covariance, m².
+        q: (3,) 1/m.
+        patch: (3, 3) the patch's part of the information, m².
+        weight: of the patch, 1 unless it is far from what the motion knows.
     """
 
     q: Array
-    information: Array
+    patch: Array
+    weight: float
 
 
 class PatchCurvature:
@@ -70,19 +76,23 @@ class PatchCurvature:
         """Forget all images: contact was lost."""
         self.frames = 0
         self.force = 0.0
+        self._memory = PadMemory()
         self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
         self._last: tuple[float, float, float] | None = None
         self._xx = self._xy = self._yy = 0.0
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
+        r = sample.r_probe
+        was = self._memory.add(sample.t_s, *direction_to_pad(r / math.sqrt(float(r @ r)), self.model.radius))
         if sample.moments is None:
             self.refused += 1
             return
         self._carry(*(-sample.n_base).tolist())
         self.frames = min(self.frames + 1, MOST_FRAMES)
         share = 1.0 / self.frames
-        xx, xy, yy = _turned(*sample.moments, *self._pad_axis(sample))
+        uu, uv, vv = (m - self.model.fit.memory * w for m, w in zip(sample.moments, was, strict=True))
+        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(sample))
         dxx, dxy, dyy = xx - self._xx, xy - self._xy, yy - self._yy
         if self.frames > LEAST_FRAMES:
             share *= min(1.0, GROSS * (self._xx + self._yy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
@@ -119,17 +129,15 @@ class PatchCurvature:
         size = 1.0 / math.hypot(cx, cy)
         return cx * size, cy * size
 
-    def information(
-        self, T_base_contact: Array, motion: CurvatureInformation | None = None
-    ) -> CurvatureInformation | None:
-        """What the patch adds in a contact frame, linearised where patch and motion together put K.
+    def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
+        """Patch and motion together in a contact frame.
 
         Args:
             T_base_contact: (4, 4) contact frame, z inward.
-            motion: what else is known about q there; combinations that it knows better are left to it.
+            motion: what else is known about q there.
 
         Returns:
-            Value and information; None from too few frames, or where the patch is outside the calibration.
+            None from too few frames, and where the patch has nothing to say.
         """
         if self.frames < LEAST_FRAMES:
             return None
@@ -138,38 +146,52 @@ class PatchCurvature:
         angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
-        known = None if motion is None else CurvatureInformation(turn @ motion.q, turn @ motion.information @ turn.T)
+        known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
+        known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
         found = self._solve((mean + half, 0.0, mean - half), known)
-        return None if found is None else CurvatureInformation(turn.T @ found.q, turn.T @ found.information @ turn)
+        return None if found is None else Fused(turn.T @ found.q, turn.T @ found.patch @ turn, found.weight)
 
-    def _solve(self, v: Moments, motion: CurvatureInformation | None) -> CurvatureInformation | None:
-        """From the last answer, and where that fails from the ideal layer."""
+    def _solve(self, v: Moments, motion: CurvatureInformation) -> Fused | None:
+        """From the last answer, and where that fails from the ideal layer; again where patch and motion disagree."""
         last, self._last = self._last, None
-        found = None if last is None else self._iterated(last, v, motion)
+        found = None if last is None else self._iterated(last, v, motion, 1.0)
         if found is None and (start := self.model.start(v, self.force)) is not None:
-            found = self._iterated(start, v, motion)
-        return found
+            found = self._iterated(start, v, motion, 1.0)
+        if found is None:
+            return None
+        k, patch, cost = found
+        self._last = k
+        ratio = CHI2_999 / max(cost, CHI2_999)
+        weight = ratio * ratio
+        if weight < 1.0:
+            found = self._iterated(k, v, motion, weight)
+            if found is None:
+                return None
+            k, patch, _ = found
+        return Fused(TO_Q * k, patch, weight)
 
-    def _iterated(self, k: Moments, v: Moments, motion: CurvatureInformation | None) -> CurvatureInformation | None:
-        """Gauss–Newton from K; None where it does not settle inside the calibration."""
+    def _iterated(
+        self, k: Moments, v: Moments, motion: CurvatureInformation, weight: float
+    ) -> tuple[Moments, Array, float] | None:
+        """Gauss–Newton from K: K, the patch's information and the cost; None where it does not settle."""
         step = math.inf
         try:
             for _ in range(MOST_ROUNDS):
                 J, r, W = self.model.linearised(v, self.force, self.frames, k)
-                used = CurvatureInformation(_TO_Q * k + solved(J, r), J.T @ W @ J)
-                if motion is not None:
-                    used = CurvatureInformation(used.q, _better(used.information, motion.information))
-                q = used.q if motion is None else mean_of(motion, used)
-                before, k = k, _entries(q)
-                step = max(abs(a - b) for a, b in zip(k, before, strict=True))
+                W *= weight * self.model.trust(k, self.force)
+                off = motion.q - TO_Q * k
+                patch = J.T @ W @ J
+                way = solved(patch + motion.information, J.T @ W @ r + motion.information @ off)
+                cost = float(r @ W @ r + off @ motion.information @ off)
+                k = _entries(TO_Q * k + way)
+                step = float(np.abs(way).max())
                 if step < SETTLED / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
             return None
-        if step > UNSETTLED / self.model.radius or not self.model.covers(k, self.force):
+        if step > UNSETTLED / self.model.radius or not patch.any():
             return None
-        self._last = k
-        return used
+        return k, patch, cost
 
 
 def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:
@@ -181,18 +203,3 @@ def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float,
 def _entries(q: Array) -> tuple[float, float, float]:
     q1, q2, q3 = q.tolist()
     return q1, q2 / _ROOT2, q3
-
-
-def _better(own: Array, motion: Array) -> Array:
-    """The part of a definite information (3, 3) about combinations that the motion knows less well."""
-    L: Array = np.linalg.cholesky(own).astype(np.float64, copy=False)
-    inverse = solved(L, np.eye(3))
-    ratio, W = np.linalg.eigh(inverse @ motion @ inverse.T)
-    kept = L @ W[:, ratio < 1.0]
-    result: Array = kept @ kept.T
-    return result
-
-
-def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
-    """(3,) the mean weighted with the information of both, which together must be definite."""
-    return solved(a.information + b.information, a.information @ a.q + b.information @ b.q)

@@ -6,15 +6,19 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, solved
+from canprobe.touch._arrays import Array, solved, upper_root
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
+from canprobe.touch.evidence import TO_Q
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.patch_curvature import CurvatureInformation, PatchCurvature, mean_of
+from canprobe.touch.patch_curvature import Fused, PatchCurvature
 from canprobe.touch.quadric import UNIT, parameters_of
 from canprobe.touch.rank import SIGMA_LIMIT, Decision
 
-_TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
+NAMED = 0.1
+"""Share of the information about K that the patch gives from which on the estimate's method names it."""
+DOUBTED = 0.5
+"""Weight of the patch below which the estimate says that it contradicts the motion."""
 
 
 def fuse(motion: SurfaceEstimate, patch: PatchCurvature, length: float) -> SurfaceEstimate:
@@ -23,32 +27,33 @@ def fuse(motion: SurfaceEstimate, patch: PatchCurvature, length: float) -> Surfa
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them.
 
     Args:
-        motion: of any estimator, at the last contact that the patch was given.
+        motion: of an estimator that gives its `evidence`, at the last contact that the patch was given.
         patch: the images.
         length: m, `rank` takes curvatures below 1/length for flat; the memory of the estimator.
 
     Returns:
-        An estimate whose `method` ends in "+patch", or `motion`.
+        The estimate; its `method` ends in "+patch" where the patch gave at least `NAMED`, and a note says how much.
     """
-    data = _observed_part(motion)
-    known = _known(motion, data)
-    found = patch.information(motion.T_frame_contact, known)
-    if found is None or not found.information.any():
+    found = None if motion.evidence is None else patch.fuse(motion.T_frame_contact, motion.evidence)
+    if found is None or motion.evidence is None:
         return motion
-    q = mean_of(known, found)
-    decision = _decide(data + found.information, q, length)
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
+    data = motion.information if has_prior else motion.evidence.information
+    decision = _decide(data + found.patch, found.q, length)
+    root = None if motion.model_root is None else _joined(motion.model_root, found.patch)
+    total = motion.evidence.information + found.patch
+    share = float(np.trace(solved(total, found.patch))) / 3.0
     return build_estimate(
-        _solution(motion.S, q, known.information + found.information, decision, has_prior),
+        _solution(motion.S, found.q, total, decision, has_prior=has_prior, root=root),
         length=1.0,
         T_frame_contact=motion.T_frame_contact,
         condition_number=motion.condition_number,
         innovation=motion.innovation,
         distance=motion.distance,
         samples=motion.samples,
-        method=motion.method + "+patch",
+        method=motion.method + "+patch" if share >= NAMED else motion.method,
         prior=motion.prior,
-        notes=motion.notes,
+        notes=(*motion.notes, *_notes(found, share)),
     )
 
 
@@ -61,16 +66,16 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
         length: m, see `fuse`.
     """
     T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
-    found = patch.information(T)
+    found = patch.fuse(T)
     if found is None:
         return None
     plane = np.zeros((4, 4))
     plane[2, 3] = plane[3, 2] = -0.5
     return build_estimate(
-        _solution(plane, found.q, found.information, _decide(found.information, found.q, length), False),
+        _solution(plane, found.q, found.patch, _decide(found.patch, found.q, length)),
         length=1.0,
         T_frame_contact=T,
-        condition_number=math.sqrt(float(np.linalg.cond(found.information))),
+        condition_number=math.sqrt(float(np.linalg.cond(found.patch))),
         innovation=1.0,
         distance=0.0,
         samples=float(patch.frames),
@@ -79,19 +84,17 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
     )
 
 
-def _observed_part(motion: SurfaceEstimate) -> Array:
-    """(3, 3) information of the data about q, in the observed combinations alone."""
-    inside = motion.combinations.T @ motion.combinations
-    result: Array = inside @ motion.information @ inside
-    return result
+def _notes(found: Fused, share: float) -> tuple[str, ...]:
+    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
+    return said if found.weight >= DOUBTED else (*said, "the patch contradicts the motion")
 
 
-def _known(motion: SurfaceEstimate, data: Array) -> CurvatureInformation:
-    """Everything that the motion estimate says about q, its prior included."""
-    q = 2.0 * _TO_Q * motion.S[[0, 0, 1], [0, 1, 1]]
-    if np.isfinite(motion.covariance).all():
-        return CurvatureInformation(q, solved(motion.covariance * np.outer(_TO_Q, _TO_Q), np.eye(3)))
-    return CurvatureInformation(q, data)
+def _joined(model_root: Array, patch: Array) -> Array:
+    """(9, 9) root of the information about the entries of S with the patch's part about K."""
+    rows = np.zeros((3, 9))
+    values, vectors = np.linalg.eigh(patch)
+    rows[:, 6:] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / UNIT
+    return upper_root(np.concatenate([model_root, rows]))
 
 
 def _decide(information: Array, q: Array, length: float) -> Decision:
@@ -101,10 +104,12 @@ def _decide(information: Array, q: Array, length: float) -> Decision:
     return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
 
 
-def _solution(S: Array, q: Array, information: Array, decision: Decision, has_prior: bool) -> Solution:
+def _solution(
+    S: Array, q: Array, information: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+) -> Solution:
     c = parameters_of(S)
     V = decision.vectors[:, decision.passed]
     c[6:] = UNIT * (q if has_prior else V @ (V.T @ q))
     if decision.rank < 3 and not has_prior:
-        return Solution(c, np.full((3, 3), math.nan), decision, has_prior)
-    return Solution(c, solved(information, np.eye(3)) / np.outer(_TO_Q, _TO_Q), decision, has_prior)
+        return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)
+    return Solution(c, solved(information, np.eye(3)) / np.outer(TO_Q, TO_Q), decision, has_prior, root)

@@ -3,13 +3,14 @@
 On a Winkler layer of stiffness k a probe of radius R_p leaves an elliptic patch on a surface with shape operator K:
 with `A = ½ (I/R_p + K)` and `F = π k δ² / (2 √det A)` its second moments are `M = (δ/6) A⁻¹`. A real sensor blurs them,
 loses the rim under the level that is taken off and the ends outside its window, so its moments are a fitted function of
-the ideal ones. That function is isotropic and quadratic in M, hence by Cayley and Hamilton `V = α I + β M`.
+the ideal ones. That function is isotropic, a polynomial of third degree, hence by Cayley and Hamilton `V = α I + β M`.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,8 +19,24 @@ from canprobe.touch._arrays import Array, positive, solved
 from canprobe.touch.patch_image import Moments
 
 _ROOT2 = math.sqrt(2.0)
+TAPER = 0.1
+"""How far beyond the calibrated range a patch still counts, as a share of the range's end."""
+_APART = 1e-4
+"""Least difference of the principal moments, over their mean, that a slope is taken over; a round patch has none."""
 _STEP = 1e-5
 """Relative step of the difference quotients, in units of 1/R_p and of the force."""
+
+
+def terms(a: Any, b: Any, t: Any) -> tuple[Any, ...]:
+    """What the moment along an axis is a sum of; numbers or arrays.
+
+    Args:
+        a, b: ideal moments along the axis and across it, over the squared pitch.
+        t: level over peak pressure.
+    """
+    square = a * a
+    return (1.0 + 0.0 * a, a, b, t, square, a * b, t * a, b * b,
+            square * a, square * b, a * b * b, b * b * b, t * b, t * t, t * square)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,16 +44,17 @@ class MomentFit:
     """What a calibration found, free of units: `canprobe.studies.patch_calibration` makes it.
 
     With i, j the principal axes of the patch, m the ideal moments over the squared pitch and t the level over
-    the peak pressure, the image's moment over the squared pitch is
-    `V_i = c0 + c1 m_i + c2 m_j + c3 t + c4 m_i² + c5 m_i m_j + c6 t m_i + c7 m_j²`.
+    the peak pressure, the image's moment V_i over the squared pitch is the sum of the coefficients times `terms`.
 
     Attributes:
-        coefficients: c0 … c7.
+        coefficients: as many as there are terms.
         force_ratio: mean of the measured force over the true one.
         floor: (4, 4) covariance, as rows, of the relative errors that no averaging removes (gains, hysteresis, creep,
-            the form of the model) of V_1, V_2, of V_12 over √(V_1 V_2), and of the force.
+            the form of the model) of V_1, V_2, of V_12 over √(V_1 V_2), and of the force; at the middle of `t_range`
+            (geometric mean), growing in proportion to t: light touches cover few taxels above the level.
         frame_sigma: relative standard deviation of a moment from one frame to the next.
         m_range, t_range: least and largest m and t that were pressed.
+        memory: share of the patch's past ways on the pad (`patch_memory`) in the moments; taken off before all else.
     """
 
     coefficients: tuple[float, ...]
@@ -45,10 +63,16 @@ class MomentFit:
     frame_sigma: float
     m_range: tuple[float, float]
     t_range: tuple[float, float]
+    memory: float = 0.0
+
+    @property
+    def middle_t(self) -> float:
+        """The geometric mean of `t_range`."""
+        return math.sqrt(self.t_range[0] * self.t_range[1])
 
     def __post_init__(self) -> None:
-        if len(self.coefficients) != 8:
-            raise UsageError(f"coefficients: expected 8, got {len(self.coefficients)}")
+        if len(self.coefficients) != len(terms(0.0, 0.0, 0.0)):
+            raise UsageError(f"coefficients: expected {len(terms(0.0, 0.0, 0.0))}, got {len(self.coefficients)}")
         floor = np.array(self.floor)
         if floor.shape != (4, 4) or not np.all(np.linalg.eigvalsh(floor) > 0.0):
             raise UsageError("floor: expected a definite (4, 4) covariance")
@@ -97,24 +121,28 @@ class MomentModel:
     def moments(self, k: Moments, force: float) -> Moments:
         """Second moments of the image (m²) for a shape operator (1/m) and a force (N)."""
         (xx, xy, yy), t = self.ideal(k, force)
-        alpha, beta = self._isotropic(xx + yy, xx * yy - xy * xy, t)
+        mean = 0.5 * (xx + yy)
+        half = max(math.hypot(0.5 * (xx - yy), xy), _APART * mean)
+        long, short = self._along(mean + half, mean - half, t), self._along(mean - half, mean + half, t)
+        beta = 0.5 * (long - short) / half
+        alpha = 0.5 * (long + short) - beta * mean
         square = self.pitch**2
         return square * (alpha + beta * xx), square * beta * xy, square * (alpha + beta * yy)
 
-    def _isotropic(self, trace: float, det: float, t: float) -> tuple[float, float]:
-        c0, c1, c2, c3, c4, c5, c6, c7 = self.fit.coefficients
-        alpha = c0 + c2 * trace + c3 * t + (c5 - c4 - c7) * det + c7 * trace * trace
-        return alpha, c1 - c2 + (c4 - c7) * trace + c6 * t
+    def _along(self, a: float, b: float, t: float) -> float:
+        return math.fsum([c * term for c, term in zip(self.fit.coefficients, terms(a, b, t), strict=True)])
 
-    def covers(self, k: Moments, force: float) -> bool:
-        """Whether the calibration pressed such patches (K in 1/m, measured force in N); beyond them it is a guess."""
-        try:
-            (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
-        except ValueError:
-            return False
+    def trust(self, k: Moments, force: float) -> float:
+        """1 where the calibration pressed such patches (K in 1/m, measured force in N), falling to 0 beyond.
+
+        Raises:
+            ValueError: where the surface is as hollow as the probe.
+        """
+        (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         (m0, m1), (t0, t1) = self.fit.m_range, self.fit.t_range
-        return m0 <= mean - half and mean + half <= m1 and t0 <= t <= t1
+        beyond = max(m0 / (mean - half), (mean + half) / m1, t0 / t, t / t1) - 1.0
+        return min(max(1.0 - beyond / TAPER, 0.0), 1.0)
 
     def start(self, v: Moments, force: float) -> Moments | None:
         """K (1/m) to begin with, from moments (m²) and measured force (N), by the ideal layer and two coefficients.
@@ -162,17 +190,18 @@ class MomentModel:
         ).T
         residual = np.array([s * (m - m0) for s, m, m0 in zip(scale, v, here, strict=True)])
         by_force = slope(self.moments(k, f * (1.0 + _STEP)), _STEP)
-        return J, residual, solved(self._covariance(by_force, frames), np.eye(3))
+        lightness = self.ideal(k, f)[1] / self.fit.middle_t
+        return J, residual, solved(self._covariance(by_force, frames, lightness), np.eye(3))
 
-    def _covariance(self, by_force: list[float], frames: float) -> Array:
+    def _covariance(self, by_force: list[float], frames: float, lightness: float) -> Array:
         """(3, 3) of the relative residuals of V11, V12, V22: an error of the force moves the prediction with it."""
-        floor = self.fit.floor
+        floor = lightness * np.array(self.fit.floor)
         noise = self.fit.frame_sigma**2 / max(frames, 1.0)
         order = (0, 2, 1)
         return np.array(
             [
                 [
-                    floor[i][j] + noise * (i == j) - b * floor[j][3] - a * floor[i][3] + a * b * floor[3][3]
+                    floor[i, j] + noise * (i == j) - b * floor[j, 3] - a * floor[i, 3] + a * b * floor[3, 3]
                     for j, a in zip(order, by_force, strict=True)
                 ]
                 for i, b in zip(order, by_force, strict=True)

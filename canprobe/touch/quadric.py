@@ -126,6 +126,42 @@ def rows(c: Array, d: Design) -> Rows:
     likely was (foot moved by the part of the residual that the point's tangential noise explains). At the measured
     point itself its noise would enter the regressors together with the residuals, which draws K towards 0.
     """
+    at = linearise(c, d)
+    log_det = -2.0 * float(np.log(at.W[:, 1, 1] * at.W[:, 2, 2]).sum())
+    return Rows(at.r, at.jacobian(value_rows(at.X), gradient_rows(at.X, at.V), d), log_det)
+
+
+class Linearised(NamedTuple):
+    """The model at the likely places of the samples, from which any term of f has its Jacobian.
+
+    Attributes:
+        r: (n, 3) whitened residuals.
+        X: (n, 3) likely places.
+        V: (n, 3, 3) rows: the model's unit normal and the tangent axes of the measured one.
+        bend: (n, 3, 2) change of the model's normal along the tangent axes when its foot moves along V.
+        inverse: (n,) 1/|∇f|.
+        W: (n, 3, 3) whitener.
+    """
+
+    r: Array
+    X: Array
+    V: Array
+    bend: Array
+    inverse: Array
+    W: Array
+
+    def jacobian(self, F: Array, G: Array, d: Design) -> Array:
+        """Whitened Jacobian (n, 3, k) of k terms of f, from df/dc (n, k) and d(V ∇f)/dc (n, 3, k); changes G."""
+        G[:, 1:] -= (d.T @ self.V[:, 0, :, None]) * G[:, :1]
+        G[:, 0] = F
+        G *= self.inverse[:, None, None]
+        G[:, 1:] -= self.bend[:, 0, :, None] * G[:, :1]  # the foot moves with the model
+        result: Array = self.W @ G
+        return result
+
+
+def linearise(c: Array, d: Design) -> Linearised:
+    """The model at parameters (9,), as for `rows`."""
     S = matrix_of(c)
     B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
     g = d.X @ B + h
@@ -146,13 +182,7 @@ def rows(c: Array, d: Design) -> Rows:
     g = X @ B + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]
-    J = gradient_rows(X, V)
-    J[:, 1:] -= (d.T @ V[:, 0, :, None]) * J[:, :1]
-    J[:, 0] = value_rows(X)
-    J *= inverse[:, None, None]
-    J[:, 1:] -= bend[:, 0, :, None] * J[:, :1]  # the foot moves with the model
-    log_det = -2.0 * float(np.log(W[:, 1, 1] * W[:, 2, 2]).sum())
-    return Rows(r, W @ J, log_det)
+    return Linearised(r, X, V, bend, inverse, W)
 
 
 def _whitener(K: Array, ghat: Array, d: Design) -> Array:

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.errors import UsageError
 from canprobe.touch.strategy import PathFollower
 
 Vector = NDArray[np.float64]
@@ -97,11 +98,13 @@ class LocalSurface:
         Args:
             point: measured surface point (3,), m.
             normal: measured outward unit normal (3,).
-            dt: time since the previous sample, s.
+            dt: time since the previous sample, s; not negative.
 
         Returns:
             The height error before correction (m), positive where the surface was found higher than modelled.
         """
+        if dt < 0:
+            raise UsageError(f"dt: expected a time that has passed, got {dt:g} s")
         p, n = point.tolist(), normal.tolist()
         foot, m = self.foot_of(p)
         error: float = sum(mi * (pi - fi) for mi, pi, fi in zip(m, p, foot, strict=True))

@@ -104,15 +104,13 @@ def test_a_cell_is_shown_while_it_runs(recorded):
     assert port_is_free(address)
 
 
-def test_a_scene_becomes_one_file(tmp_path, capsys):
-    assert (
-        main(
-            ["view", "free", "--html", str(tmp_path / "free.html"), "--out", str(tmp_path / "run"), "--duration", "0.1"]
-        )
-        == 0
-    )
-    assert capsys.readouterr().out == f"{tmp_path / 'free.html'}\n"
-    assert "__VISER_EMBED_DATA__" in (tmp_path / "free.html").read_text(encoding="utf-8")
+def test_a_scene_becomes_one_file_though_a_folder_is_called_like_it(tmp_path, monkeypatch, capsys):
+    (tmp_path / "free").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["view", "free", "--html", "free.html", "--out", "run", "--duration", "0.1"]) == 0
+    assert capsys.readouterr().out == "free.html\n" and "__VISER_EMBED_DATA__" in Path("free.html").read_text("utf-8")
+    assert main(["view", "./free", "--html", "free.html"]) == 2
+    assert "no scene.toml in this folder" in capsys.readouterr().err
 
 
 def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsys, recorded):

@@ -223,7 +223,7 @@ def test_the_patch_of_a_ball_lies_on_the_ball():
     shape = patch.patch_shape(sphere_patch(), xy)
     r = np.hypot(*xy.T)
     exact = 0.05 - np.sqrt(0.05**2 - r**2)
-    assert np.abs(shape.surface[:, 2] - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
+    assert np.abs(shape.surface[:, 2] + patch.LIFT_M - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
     mesh = meshes.Mesh(shape.surface, patch.disc_faces())
     assert (normals(mesh)[:, 2] < 0).all()  # z is the inward normal
     assert np.linalg.norm(normals(mesh), axis=1).sum() / 2 == pytest.approx(math.pi * patch.RADIUS_M**2, rel=0.04)
@@ -256,3 +256,11 @@ def test_colours_rise_in_lightness_and_tell_what_is_unknown():
     assert (np.diff(lightness) >= -1.0).all() and lightness[-1] - lightness[0] > 150
     assert (scale[:50] == scale[0]).all() and scale[0].tolist() == [68, 1, 84]
     assert colours.scale([math.nan, math.inf], 0.0, 1.0).tolist() == [list(colours.UNKNOWN)] * 2
+
+
+def test_linear_light_is_undone_by_the_screen():
+    """Encoded as a screen does it (IEC 61966-2-1), within what eight bits of light leave of dark colours."""
+    rgb = np.arange(0, 256, 5, dtype=np.uint8)
+    light = colours.linear_light(rgb) / 255.0
+    shown = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055) * 255.0
+    assert shown == pytest.approx(rgb, abs=7.0) and shown[20:] == pytest.approx(rgb[20:], abs=1.0)

@@ -69,3 +69,26 @@ def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
     paper = replay_samples(make_shape_estimator(session.scene, "chen1996"), samples, 40)[-1].estimate
     assert paper.method == "chen1996"
     assert not paper.observed.all()
+
+
+def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
+    """Scored absolutely: there is nothing to divide by."""
+    scene = resolve_scene(canprobe.load_scene("axial"), duration_s=1.4)
+    scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
+    session = Session(scene)
+    controller = make_task(session.plan)
+    with session:
+        session.run(controller)
+    late = [r.estimate for r in controller.shape.records if r.travelled_m > 0.02]
+    axis = np.array([np.cos(np.radians(20.0)), np.sin(np.radians(20.0)), 0.0])
+    along_axis, around = [], []
+    for e in late:
+        assert e.observed.all()
+        a = e.T_frame_contact[:3, :2].T @ axis
+        a /= np.linalg.norm(a)
+        b = np.array([-a[1], a[0]])
+        along_axis.append(a @ e.K @ a)
+        around.append(b @ e.K @ b)
+    assert len(late) >= 10
+    assert np.sqrt(np.mean(np.square(along_axis))) < 2.0
+    assert np.sqrt(np.mean(np.square(np.array(around) - 1 / 0.036))) < 1.0

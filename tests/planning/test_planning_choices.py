@@ -56,6 +56,15 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
     assert len(plan.buses) == 1
 
 
+def test_ways_out_name_changes_that_fit_only_together(cylinder):
+    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+    with pytest.raises(PlanError) as refused:
+        make_plan(scene)
+    (line,) = [problem for problem in refused.value.problems if "ways out" in problem]
+    assert 'arm.grouped_rpdo = true and bus.cob_ids = "by_deadline" (95 %' in line
+    assert "or arm.grouped_rpdo = true (" not in line  # alone it does not
+
+
 def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
     image = change(cylinder, sensor={"mode": "image"})
     split = make_plan(opened(image))

@@ -12,7 +12,7 @@ from canprobe.errors import PlanError, UsageError
 from canprobe.planning import make_plan
 from canprobe.scene import ObjectSettings
 from canprobe.scene_loader import load_scene
-from canprobe.touch.contact import ContactSample, indentation_from_force
+from canprobe.touch.contact import ContactSample, Doubt, indentation_from_force
 from canprobe.touch.estimators import METHODS, make_estimator
 from canprobe.touch.fit import fit_surface
 from canprobe.touch.patch import SIDE, PatchCalibration, compute_patch
@@ -193,14 +193,14 @@ class TestSize:
 
 class TestLongRuns:
     def test_standing_still_after_a_scan_changes_nothing(self, truth):
-        """30 000 samples (1e6 in tests/bench): nothing is forgotten or made up."""
+        """1e5 samples (1e6 in tests/bench): nothing is forgotten or made up."""
         path = truth.path("ellipsoid", T=truth.any_pose(3))
         estimator = make("recursive")
         fed(estimator, truth.samples(*path.noisy(*SIGMA, 0)))
         rng = np.random.default_rng(1)
         n, T, r = path.normals[-1], np.eye(4), np.array([0.0, 0.0, 0.04])
         cloud = path.points[-1] + SIGMA[0] * rng.normal(size=(5000, 3))
-        for i in range(30_000):
+        for i in range(100_000):
             estimator.add(ContactSample(1.0 + 0.005 * i, cloud[i % 5000], n, T, r, 1.0))
             if i == 999:
                 settled = estimator.estimate()
@@ -212,7 +212,7 @@ class TestLongRuns:
         assert frobenius(path.error(after)) < 4.0 * math.sqrt(WEIGHT @ np.diag(after.covariance))
 
     def test_motion_after_long_rest_counts_at_once(self, truth):
-        """30 000 samples of rest from the start (an hour in tests/bench); then all is as without them."""
+        """1e5 samples of rest from the start (an hour in tests/bench); then all is as without them."""
         path = truth.path("cylinder")
         p, n = path.noisy(*SIGMA, 2)
         fresh = fed(make("recursive"), truth.samples(p, n))
@@ -220,18 +220,18 @@ class TestLongRuns:
         T, r = np.eye(4), np.array([0.0, 0.0, 0.04])
         cloud = path.points[0] + SIGMA[0] * rng.normal(size=(5000, 3))
         estimator = make("recursive")
-        for i in range(30_000):
+        for i in range(100_000):
             estimator.add(ContactSample(0.005 * i, cloud[i % 5000], path.normals[0], T, r, 1.0))
         waiting = estimator.estimate()
         assert waiting is None or not waiting.observed.any()
-        e = fed(estimator, truth.samples(p, n, 0.005 * 30_000))
+        e = fed(estimator, truth.samples(p, n, 0.005 * 100_000))
         assert e.rank == 3
         assert np.allclose(np.diag(e.covariance), np.diag(fresh.covariance), rtol=0.3)
         assert frobenius(path.error(e)) < 4.0 * math.sqrt(WEIGHT @ np.diag(e.covariance))
 
     def test_many_updates_in_motion(self, truth):
-        """3000 samples (100 000 in tests/bench), symmetric, definite, right at the end as at the start."""
-        s = np.arange(3_000) * 0.125e-3
+        """5000 samples (1e6 in tests/bench), symmetric, definite, right at the end as at the start."""
+        s = np.arange(5_000) * 0.125e-3
         path = truth.placed(truth.surface("saddle"), 5e-3 * np.sin(s / 5e-3), 4e-3 * np.sin(s / 3.1e-3))
         p, n = path.noisy(*SIGMA, 4)
         T, r, estimator, sigmas = np.eye(4), np.array([0.0, 0.0, 0.04]), make("recursive"), []
@@ -296,7 +296,7 @@ class TestBadData:
 
 
 def with_outliers(path, share, size, seed):
-    """A share of the samples with a wrong centroid: the place is off along the surface."""
+    """A share of the samples with a wrong place, off by `size` (m) along every axis."""
     p, n = path.noisy(*SIGMA, seed)
     rng = np.random.default_rng(seed + 1000)
     wrong = rng.random(len(p)) < share
@@ -304,24 +304,90 @@ def with_outliers(path, share, size, seed):
     return p, n, int(wrong.sum())
 
 
+def with_wrong_centroids(path, share, size, seed):
+    """A share of the samples with a centroid that is `size` (m) off on the pad: place and normal are wrong together."""
+    p, n = path.noisy(*SIGMA, seed)
+    rng = np.random.default_rng(seed + 1000)
+    wrong = np.flatnonzero(rng.random(len(p)) < share)
+    for i in wrong:
+        sideways = np.cross(n[i], rng.normal(size=3))
+        angle = size / 0.04
+        turned = math.cos(angle) * n[i] + math.sin(angle) * sideways / np.linalg.norm(sideways)
+        p[i], n[i] = p[i] + 0.04 * (n[i] - turned), turned
+    return p, n, len(wrong)
+
+
+def figure(name, truth, n=400):
+    """n samples on a figure of ±5 mm over a named surface."""
+    s = np.arange(n) * 0.125e-3
+    return truth.placed(truth.surface(name), 5e-3 * np.sin(s / 5e-3), 4e-3 * np.sin(s / 3.1e-3))
+
+
 class TestOutliers:
     @pytest.mark.parametrize("method", MUST)
+    @pytest.mark.parametrize("spoil", [with_outliers, with_wrong_centroids])
     @pytest.mark.parametrize(
         ("name", "size"), [("plane", 1e-3), ("cylinder", 0.3e-3), ("saddle", 1e-3), ("saddle", 5e-3)]
     )
-    def test_five_percent_have_bounded_influence_and_are_flagged(self, name, size, method, truth):
-        s = np.arange(400) * 0.125e-3
-        path = truth.placed(truth.surface(name), 5e-3 * np.sin(s / 5e-3), 4e-3 * np.sin(s / 3.1e-3))
-        worst = 0.0
+    def test_five_percent_have_bounded_influence_and_are_flagged(self, name, size, spoil, method, truth):
+        path, worst = figure(name, truth), 0.0
         for seed in range(2):
-            p, n, wrong = with_outliers(path, 0.05, size, seed)
+            p, n, wrong = spoil(path, 0.05, size, seed)
             e = fed(make(method), truth.samples(p, n))
             assert wrong > 10
             assert_sane(e)
             assert any("reduced weight" in note for note in e.notes)
+            assert not any("changed" in note for note in e.notes)
             worst = max(worst, frobenius(path.error(e)))
-        # 5 mm is 250 σ: the filter then restarts again and again, and its answer soon after a restart is poor
-        assert worst < 2.0 or (method == "recursive" and size > 1e-3 and any("changed" in note for note in e.notes))
+        assert worst < 1.0
+
+    @pytest.mark.parametrize("spoil", [with_outliers, with_wrong_centroids])
+    @pytest.mark.parametrize("name", ["cylinder", "sphere"])
+    def test_online_they_leave_error_and_coverage_as_without_them(self, name, spoil, truth):
+        """5 % of the centroids 5 mm off, all along a run, against the same run without."""
+        path = figure(name, truth)
+        squares, inside = {0.0: [], 0.05: []}, []
+        for seed in range(5):
+            for share, errors in squares.items():
+                p, n, _ = spoil(path, share, 5e-3, seed)
+                estimator = make("recursive")
+                for i, sample in enumerate(truth.samples(p, n)):
+                    estimator.add(sample)
+                    if i < 150 or i % 25:
+                        continue
+                    e = estimator.estimate()
+                    assert e.rank == 3
+                    K, B = path.surface.curvature_at(path.surface.project(e.point))
+                    P = e.T_frame_contact[:3, :2]
+                    D = e.K - P.T @ (B @ K @ B.T) @ P
+                    d = np.array([D[0, 0], D[0, 1], D[1, 1]])
+                    errors.append(WEIGHT @ d**2)
+                    if share:
+                        inside.append(d @ np.linalg.solve(e.covariance, d) < 7.815)
+                assert not any("changed" in note for note in e.notes)
+        clean, spoilt = (math.sqrt(np.mean(errors)) for errors in squares.values())
+        assert spoilt < 1.3 * clean
+        assert np.mean(inside) >= 0.9
+
+    @pytest.mark.parametrize("method", MUST)
+    @pytest.mark.parametrize("doubt", list(Doubt))
+    def test_doubtful_images_count_less_and_are_told(self, doubt, method, truth):
+        """Every eighth centroid 0.3 mm off, its image in doubt: told, and the answer is nearer than untold."""
+        path, wide, plain = figure("cylinder", truth), [], []
+        for seed in range(3):
+            p, n, _ = with_wrong_centroids(path, 0.0, 0.0, seed)
+            for i in range(0, 400, 8):
+                turned = n[i] + 0.0075 * np.array([1.0, 0.0, 0.0])
+                turned /= np.linalg.norm(turned)
+                p[i], n[i] = p[i] + 0.04 * (n[i] - turned), turned
+            told = [dataclasses.replace(s, doubts=() if i % 8 else (doubt,)) for i, s in enumerate(truth.samples(p, n))]
+            e = fed(make(method, (2e-5, 3e-3)), told)
+            assert_sane(e)
+            assert any(doubt.value in note and note.startswith("20 of the last 160") for note in e.notes)
+            wide.append(frobenius(path.error(e)))
+            plain.append(frobenius(path.error(fed(make(method, (2e-5, 3e-3)), truth.samples(p, n)))))
+        assert np.mean(wide) < np.mean(plain)
+        assert max(wide) < 4.0
 
     @pytest.mark.parametrize("method", ["chen1996", "chord"])
     def test_the_baselines_only_stay_sane(self, method, truth):

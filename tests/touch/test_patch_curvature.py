@@ -6,17 +6,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 
 from canprobe.errors import UsageError
-from canprobe.touch.contact import ContactSample
+from canprobe.touch.contact import ContactSample, direction_to_pad
 from canprobe.touch.estimators import make_estimator
 from canprobe.touch.estimators.patched import PatchedEstimator
+from canprobe.touch.evidence import CurvatureInformation
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.patch import PatchCalibration
 from canprobe.touch.patch_curvature import LEAST_FRAMES, PatchCurvature
-from canprobe.touch.patch_fusion import fuse, patch_estimate
+from canprobe.touch.patch_fusion import patch_estimate
 from canprobe.touch.patch_image import LEVEL_COUNTS, MomentImage
+from canprobe.touch.patch_memory import PadMemory
 from canprobe.touch.patch_moments import MomentFit, MomentModel
 from canprobe.touch.prior import Prior
 
@@ -27,9 +30,18 @@ FLOOR = (
     (0.0, 0.0, 0.45e-4, 0.0),
     (1.7e-4, 1.7e-4, 0.0, 4.8e-4),
 )
-WIDE = {"m_range": (0.5, 6.0), "t_range": (0.01, 0.3)}
-IDEAL = MomentFit((0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0), 1.0, FLOOR, 0.01, **WIDE)
-REAL = MomentFit((0.3, 1.06, 0.08, -1.77, -0.024, 0.008, -2.06, -0.018), 0.97, FLOOR, 0.01, **WIDE)
+HERE_T = LEVEL_PA / STIFFNESS / math.sqrt(4.0 / 0.97 * 0.5 * math.sqrt((25.0 + 27.8) * 25.0) / (math.pi * STIFFNESS))
+"""Level over peak pressure at 2 N on a cylinder of 36 mm."""
+WIDE = {"m_range": (0.5, 6.0), "t_range": (HERE_T / 6.0, 6.0 * HERE_T)}
+IDEAL = MomentFit((0.0, 1.0) + 13 * (0.0,), 1.0, FLOOR, 0.01, **WIDE)
+REAL = MomentFit(
+    (0.3, 1.06, 0.08, -1.77, -0.024, 0.008, -2.06, -0.018, 2e-3, -1e-3, 1.5e-3, -1e-3, 0.05, 3.0, 0.02),
+    0.97,
+    FLOOR,
+    0.01,
+    **WIDE,
+    memory=0.03,
+)
 FORCE = 2.0
 
 
@@ -71,24 +83,33 @@ def test_real_moments_follow_the_fitted_formula_in_any_axes():
     assert off == 0.0
 
     def formula(i, j):
-        return np.dot(REAL.coefficients, [1, i, j, t, i * i, i * j, t * i, j * j]) * PITCH**2
+        low = [1, i, j, t, i * i, i * j, t * i, j * j]
+        return np.dot(REAL.coefficients, [*low, i**3, i * i * j, i * j * j, j**3, t * j, t * t, t * i * i]) * PITCH**2
 
     turned = tensor(formula(mi, mj), formula(mj, mi), angle)
     assert m.moments(entries(tensor(*k, angle)), FORCE) == pytest.approx(entries(turned), rel=1e-12)
     assert formula(mi, mj) < formula(mj, mi)  # the patch is shorter across the sharper curvature
 
 
-def test_hollow_as_tight_as_the_probe_is_no_patch_and_is_not_covered():
+def test_hollow_as_tight_as_the_probe_is_no_patch():
     with pytest.raises(ValueError, match="hollower"):
         model().moments((10.0, 0.0, -25.0), FORCE)
-    assert not model().covers((10.0, 0.0, -25.0), FORCE)
-    assert not model().covers((2000.0, 0.0, 2000.0), FORCE)
-    assert model().covers((27.8, 0.0, 0.0), FORCE)
+    with pytest.raises(ValueError, match="hollower"):
+        model().trust((10.0, 0.0, -25.0), FORCE)
 
 
-@pytest.mark.parametrize("bad", [{"coefficients": (1.0,) * 7}, {"floor": ((1.0, 2.0), (2.0, 1.0))}])
+def test_trust_ends_softly_where_the_calibration_ends():
+    k = np.linspace(0.0, 2000.0, 4001)
+    trust = np.array([model().trust((a, 0.0, a), FORCE) for a in k])
+    assert trust[0] == model().trust((27.8, 0.0, 0.0), FORCE) == 1.0
+    assert trust[-1] == 0.0
+    assert np.all(np.diff(trust) <= 0.0)
+    assert np.abs(np.diff(trust)).max() < 0.02
+
+
+@pytest.mark.parametrize("bad", [{"coefficients": (1.0,) * 14}, {"floor": ((1.0, 2.0), (2.0, 1.0))}])
 def test_a_fit_that_is_none_is_refused(bad):
-    values = {"coefficients": (0.0,) * 8, "force_ratio": 1.0, "floor": FLOOR, "frame_sigma": 0.0, **WIDE, **bad}
+    values = {"coefficients": (0.0,) * 15, "force_ratio": 1.0, "floor": FLOOR, "frame_sigma": 0.0, **WIDE, **bad}
     with pytest.raises(UsageError, match=next(iter(bad))):
         MomentFit(**values)
 
@@ -208,6 +229,20 @@ def test_axes_are_carried_along_a_contact_that_rolls_and_spins():
     found = patch_estimate(touch, patch, 0.02)
     P = found.T_frame_contact[:3, :2]
     np.testing.assert_allclose(P @ found.K @ P.T, here @ truth @ here.T, atol=0.05)
+
+
+def test_what_the_pad_remembers_is_taken_off():
+    """Touches at wandering places of the pad, whose moments hold the model's share of their past ways."""
+    K = base_tensor(tensor(27.8, -6.0, 0.5))
+    memory, patch = PadMemory(), PatchCurvature(model())
+    for i in range(120):
+        off = (0.06 * math.sin(0.05 * i), 0.03 * math.sin(0.09 * i))
+        touch = replace(samples(K, NORMAL, FORCE, exact, 1, off_pole=off)[0], t_s=0.04 * i)
+        d = touch.r_probe / np.linalg.norm(touch.r_probe)
+        ways = memory.add(touch.t_s, *direction_to_pad(d, RADIUS))
+        patch.add(replace(touch, moments=tuple(m + REAL.memory * w for m, w in zip(touch.moments, ways, strict=True))))
+    found = patch_estimate(touch, patch, 0.02)
+    np.testing.assert_allclose(found.kappa, [27.8, -6.0], atol=0.02)
 
 
 def test_fewer_than_eight_frames_say_nothing_and_a_reset_forgets():
@@ -367,35 +402,149 @@ def test_curvature_known_along_the_path_sharpens_that_across():
         patch.add(touch)
     alone = patch_estimate(touches[-1], patch, 0.02)
     both = after_path(AXIAL).estimate()
-
-    def across(estimate):
-        y = estimate.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
-        weights = np.array([y[0] ** 2, 2 * y[0] * y[1], y[1] ** 2])
-        return math.sqrt(weights @ estimate.covariance @ weights)
-
     assert across(both) < 0.75 * across(alone)
 
 
-def test_where_the_path_shows_all_curvature_the_patch_is_not_asked():
-    one = after_path(WEAVE)
-    answer = one.estimate()
-    assert answer.method == "recursive"
-    assert answer.rank == 3
-    assert fuse(answer, one.patch, 0.02) is answer
+def across(estimate):
+    """Standard deviation of the curvature across the axis, 1/m."""
+    y = estimate.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
+    weights = np.array([y[0] ** 2, 2 * y[0] * y[1], y[1] ** 2])
+    return math.sqrt(weights @ estimate.covariance @ weights)
+
+
+def test_where_the_path_shows_all_curvature_the_patch_hardly_counts():
+    alone, both = (after_path(WEAVE, moments=moments).estimate() for moments in (False, True))
+    assert alone.method == "recursive"
+    assert both.rank == 3
+    assert any(note.endswith("% of the curvature from the patch") for note in both.notes)
+    assert 0.9 * across(alone) < across(both) < across(alone)
+    assert np.linalg.norm(both.K - alone.K) < 0.5 * across(alone)
+
+
+def lies(factor):
+    """The answer after an axial path under images whose moments are too large."""
+    one = after_path(AXIAL, moments=False)
+    for i, (x, y) in enumerate(AXIAL[-64:]):
+        touch = cylinder_touch(x, y, 10.0 + i * 5e-3, True)
+        one.patch.add(replace(touch, moments=tuple(factor * m for m in touch.moments)))
+    return one.estimate()
 
 
 def test_an_image_that_lies_does_not_spoil_what_the_motion_knows():
-    """Moments a third too large: the curvature along the path stays that of the motion."""
-    one = after_path(AXIAL, moments=False)
-    for x, y in AXIAL[-64:]:
-        touch = cylinder_touch(x, y, 0.0, True)
-        wrong = tuple(1.33 * m for m in touch.moments)
-        one.patch.add(
-            ContactSample(0.0, touch.p_base, touch.n_base, touch.T_base_probe, touch.r_probe, FORCE, moments=wrong)
-        )
-    answer = one.estimate()
-    ex = answer.T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
-    assert ex @ answer.K @ ex == pytest.approx(0.0, abs=0.5)
+    """However large the moments, the curvature along the path stays the motion's; far off, they are not believed."""
+    for factor in (1.02, 1.05, 1.1, 1.2, 1.33, 2.0):
+        answer = lies(factor)
+        ex = answer.T_frame_contact[:3, :2].T @ [1.0, 0.0, 0.0]
+        along = 2.0 * ex @ answer.S[:2, :2] @ ex
+        assert along == pytest.approx(0.0, abs=0.5)
+    assert answer.observed.tolist() == [True, False]
+    assert "the patch contradicts the motion" in answer.notes
+
+
+@pytest.fixture(scope="module")
+def touches():
+    """A touch whose patch is longer along x."""
+    return samples(base_tensor(np.diag([-6.0, 27.8])), NORMAL, FORCE, exact, 12)
+
+
+class TestFusion:
+    """Informations are added; nothing jumps."""
+
+    T = homogeneous(tangent_rotation(-NORMAL), np.zeros(3))
+
+    def patch(self, touches, scale=1.0):
+        found = PatchCurvature(model())
+        for touch in touches:
+            found.add(replace(touch, moments=tuple(scale * m for m in touch.moments)))
+        return found
+
+    def test_it_is_the_minimum_of_both_costs(self, touches):
+        """Against a general minimiser."""
+        patch, rng, m = self.patch(touches), np.random.default_rng(5), model()
+        A = rng.normal(size=(3, 3))
+        information = A @ A.T + 0.3 * np.eye(3)
+        motion = CurvatureInformation(np.array([-4.0, 0.8, 26.5]), information)
+        v = exact((-6.0, 0.0, 27.8))
+
+        def cost(q):
+            _, r, W = m.linearised(v, FORCE, 12, (q[0], q[1] / math.sqrt(2.0), q[2]))
+            return (q - motion.q) @ information @ (q - motion.q) + r @ W @ r
+
+        best = minimize(cost, motion.q, method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-9}).x
+        found = patch.fuse(self.T, motion)
+        assert found.q == pytest.approx(best, abs=0.03)  # W moves with q, which steps leave out
+        assert found.weight == 1.0
+        assert np.linalg.norm(found.q - motion.q) > 0.3
+        assert np.linalg.norm(found.q - [-6.0, 0.0, 27.8]) > 0.25
+
+    def test_more_of_the_motion_moves_the_answer_over_without_a_jump(self, touches):
+        patch = self.patch(touches)
+        own = patch.fuse(self.T)
+        q = own.q + np.array([1.5, -1.0, 1.0])
+        answers = [
+            patch.fuse(self.T, CurvatureInformation(q, size * np.diag([1.0, 0.5, 2.0]))).q
+            for size in np.geomspace(1e-4, 1e4, 401)
+        ]
+        assert answers[0] == pytest.approx(own.q, abs=0.01)
+        assert answers[-1] == pytest.approx(q, abs=0.01)
+        assert np.abs(np.diff(answers, axis=0)).max() < 0.05
+        assert np.all(np.diff([np.linalg.norm(a - q) for a in answers]) < 1e-3)
+
+    def test_no_jump_where_images_leave_what_the_motion_believes_and_the_calibration(self, touches):
+        motion = CurvatureInformation(np.array([-5.0, 0.0, 26.0]), np.diag([4.0, 4.0, 0.5]))
+        scales = np.linspace(0.6, 1.6, 401)
+        answers = [found.q for s in scales if (found := self.patch(touches, s).fuse(self.T, motion))]
+        assert len(answers) > 380
+        assert np.abs(np.diff(answers, axis=0)).max() < 0.4
+        assert answers[-1] == pytest.approx(motion.q, abs=1.0)  # nobody believes moments that are 60 % too large
+
+    def test_estimates_along_a_path_that_begins_to_weave_do_not_jump(self):
+        """Axial, then ever wider: motion takes over from the patch within its standard deviation."""
+        x = np.arange(0.0, 0.06, 1.25e-4)
+        line = [(a, max(a - 0.03, 0.0) * 0.15 * math.sin((a - 0.03) / 1e-3)) for a in x]
+        one, K, sigma = estimator(), [], []
+        for i, (a, y) in enumerate(line):
+            one.add(cylinder_touch(a, y, i * 5e-3, True))
+            if i > 160:
+                answer = one.estimate()
+                assert answer.rank == 3
+                ey = answer.T_frame_contact[:3, :2].T @ [0.0, 1.0, 0.0]
+                K.append(ey @ answer.K @ ey)
+                sigma.append(across(answer))
+        assert sigma[-1] < 0.65 * sigma[0]
+        assert np.abs(np.diff(K)).max() < 0.25 * max(sigma)
+        assert np.asarray(K) == pytest.approx(1 / 0.036, abs=1.0)
+
+    def test_regions_of_both_together_cover_the_truth(self):
+        """Motion and floor drawn anew 200 times: 95 % regions, and never worse than either alone."""
+        rng = np.random.default_rng(12)
+        K = tensor(27.8, 0.0, 0.0)
+        T = homogeneous(tangent_rotation(-np.array([0.0, 0.0, 1.0])), np.zeros(3))
+        P = T[:3, :2]
+        k = P.T @ base_tensor(K, np.array([0.0, 0.0, 1.0])) @ P
+        true = np.array([k[0, 0], math.sqrt(2.0) * k[0, 1], k[1, 1]])
+        information = np.array([[1.5, 0.4, 0.0], [0.4, 0.5, 0.1], [0.0, 0.1, 0.25]])
+        root, floor, inside, errors = np.linalg.inv(np.linalg.cholesky(information)).T, np.linalg.cholesky(FLOOR), 0, []
+        for _ in range(200):
+            e1, e2, shear, ef = floor @ rng.standard_normal(4)
+
+            def seen(k, e1=e1, e2=e2, shear=shear):
+                xx, _, yy = exact(k)
+                return xx * (1 + e1), math.sqrt(xx * yy) * shear, yy * (1 + e2)
+
+            patch = PatchCurvature(model())
+            for touch in samples(base_tensor(K, np.array([0.0, 0.0, 1.0])), np.array([0.0, 0.0, 1.0]),
+                                 FORCE * (1 + ef), seen, 2 * LEAST_FRAMES):  # fmt: skip
+                patch.add(touch)
+            motion = CurvatureInformation(true + root @ rng.standard_normal(3), information)
+            found = patch.fuse(T, motion)
+            off = found.q - true
+            inside += off @ (information + found.patch) @ off < 7.815
+            errors.append([off, motion.q - true, patch.fuse(T).q - true])
+        assert 0.915 <= inside / 200 <= 0.985
+        both, motion_alone, patch_alone = np.sqrt(np.mean(np.square(errors), axis=0))
+        assert np.all(both < 1.02 * motion_alone)
+        assert np.all(both < 1.02 * patch_alone)
 
 
 def test_a_standing_contact_is_answered_by_the_patch_alone_and_a_reset_forgets_both():

@@ -5,6 +5,7 @@ from collections import deque
 import numpy as np
 import pytest
 
+from canprobe.errors import UsageError
 from canprobe.touch.servo import LocalSurface, SurfaceGains, TactileServo
 from canprobe.touch.strategy import PathFollower, make_strategy
 
@@ -136,3 +137,11 @@ def test_raising_the_model_moves_it_outward_and_leaves_its_normal():
     surface.raise_by(1e-3)
     np.testing.assert_allclose(surface.point, (0.0106, 0.02, 0.0308), atol=1e-12)
     np.testing.assert_allclose(surface.normal, n, atol=1e-12)
+
+
+def test_time_does_not_run_backwards():
+    """A negative time would turn the correction round, and the more so the longer it is."""
+    local = LocalSurface(np.zeros(3), np.array([0.0, 0.0, 1.0]), SurfaceGains())
+    with pytest.raises(UsageError, match=r"dt: expected a time that has passed, got -0\.06 s"):
+        local.correct(np.array([0.0, 0.0, 1e-3]), np.array([0.0, 0.0, 1.0]), -0.06)
+    assert local.point.tolist() == [0.0, 0.0, 0.0]

@@ -28,6 +28,9 @@ if TYPE_CHECKING:
 
 SIGMA_POINT_M = 0.1e-3
 SIGMA_NORMAL_RAD = 4e-3
+CORRELATION = (0.25e-3, 0.3)
+"""Length (m) and share of errors that last: with it 95 % regions of K hold the truth in 95 of 100 cases, without in 71.
+Set on seeds 0 and 1 of five scenes, verified on others by `canprobe study pipeline`."""
 CYCLES_TO_EFFECT = 2
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes; the others stay what they are in the literature."""
@@ -96,6 +99,7 @@ def _strategy(task: TaskSettings) -> Strategy | None:
 def make_shape_estimator(scene: Scene, method: str) -> Estimator:
     """An estimator as the scene sets it, by name."""
     from canprobe.touch.estimators import make_estimator  # only where a shape is asked for
+    from canprobe.touch.noise import Correlation
 
     assert scene.shape is not None and scene.probe is not None and scene.sensor is not None
     memory = scene.shape.memory_mm * 1e-3
@@ -107,6 +111,7 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
         probe_radius=scene.probe.radius_mm * 1e-3,
         memory_m=memory,
         window=window,
+        correlation=Correlation(*CORRELATION),
     )
     if method not in WITH_PATCH or not _uses_patch(scene):
         return estimator

@@ -16,6 +16,7 @@ from canprobe.touch.compliance import stiffness_from_slope
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
 from canprobe.touch.patch_image import MomentImage, Moments
+from canprobe.touch.patch_mending import mended
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
@@ -158,13 +159,14 @@ class ContactSensing:
             radius=self.radius,
             force_n=patch.force,
             moments=self._moments(sample, patch),
+            doubts=patch.doubts,
         )
 
     def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
         """Second moments of the image; None where nobody asked, or they are not those of the whole patch."""
         if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
             return None
-        return self._moment_image.moments(sample.frame.taxels)
+        return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)
 
 
 def patch_of(sample: TactileSample, calibration: PatchCalibration) -> Patch:

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 CERTAIN = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
+LONGEST_GAP_S = 0.02
+"""Between two contacts, for the servo's surface: after a longer one too it does not rest on one sample alone."""
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
@@ -213,10 +215,13 @@ class TouchTask:
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
         contact = self.sensing.contact(measurement.tactile, patch) if patch.force > self._s.touch_force / 2 else None
+        if contact is not None and self._sample_t is not None and contact.t_s <= self._sample_t:
+            self.sensing.dropped += 1  # it says that it is older than the one before
+            contact = None
         self._contact = contact
         if contact is not None and self._servo is not None:
             elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._s.period_s
-            self._servo.surface.correct(contact.p_base, contact.n_base, elapsed)
+            self._servo.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
                 self._feel_stiffness(contact)

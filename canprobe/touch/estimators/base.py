@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import deque
-from dataclasses import dataclass
+from collections import Counter, deque
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.batch import Touches, make_touches
-from canprobe.touch.contact import ContactSample
+from canprobe.touch.contact import ContactSample, Doubt
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.noise import make_noise
 
@@ -39,6 +39,12 @@ class Dropped:
     def total(self) -> int:
         """All of them."""
         return self.not_finite + self.repeated + self.backwards + self.zero_sigma + self.not_unit
+
+
+WIDER = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
+"""Factor of both standard deviations of a contact whose image is in doubt."""
+DOUBTS_OF = 160
+"""Last contacts whose doubts an estimate tells."""
 
 
 class Estimator(Protocol):
@@ -75,10 +81,17 @@ class Gate:
         self.sigma_point = positive("sigma_point", sigma_point)
         self.sigma_normal = positive("sigma_normal", sigma_normal)
         self._last_t = -math.inf
+        self._doubts: deque[tuple[Doubt, ...]] = deque(maxlen=DOUBTS_OF)
 
     def reset(self) -> None:
         """Accept any time again."""
         self._last_t = -math.inf
+        self._doubts.clear()
+
+    def notes(self) -> tuple[str, ...]:
+        """What was in doubt about the images of the last contacts."""
+        counts = Counter(doubt for doubts in self._doubts if doubts for doubt in doubts)
+        return tuple(f"{n} of the last {len(self._doubts)} contacts: {doubt.value}" for doubt, n in counts.items())
 
     def passes(self, sample: ContactSample, dropped: Dropped) -> bool:
         """Whether to use a sample; counts it where not."""
@@ -99,14 +112,16 @@ class Gate:
                 dropped.backwards += 1
         else:
             self._last_t = t
+            self._doubts.append(sample.doubts)
             return True
         return False
 
     def sigmas(self, sample: ContactSample) -> tuple[float, float]:
         """Standard deviations of a sample's point (m) and normal (rad)."""
+        wider = max([WIDER[doubt] for doubt in sample.doubts], default=1.0)
         return (
-            self.sigma_point if sample.sigma_point is None else sample.sigma_point,
-            self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal,
+            wider * (self.sigma_point if sample.sigma_point is None else sample.sigma_point),
+            wider * (self.sigma_normal if sample.sigma_normal is None else sample.sigma_normal),
         )
 
 
@@ -144,7 +159,8 @@ class WindowEstimator:
         if self._answer is None and len(self._samples) >= self.least:
             touches = self._touches()
             if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
-                self._answer = self._solve(touches)
+                answer = self._solve(touches)
+                self._answer = replace(answer, notes=answer.notes + self._gate.notes())
         return self._answer
 
     def reset(self) -> None:

@@ -1,24 +1,28 @@
 """Whether the surface has changed under a filter: an innovation test that wrong single samples do not set off.
 
 A change of the surface makes every following sample disagree with the prediction, a wrong centroid makes one. So two
-running innovations must both have risen: that of all samples, and that of the better half of each step. Each is
+innovations must both have risen: the running one of all samples, and that of the best of the last few. Each is
 measured by what it usually is, since stated standard deviations are often generous.
 """
 
 from __future__ import annotations
 
-from canprobe.touch._arrays import Array
+from collections import deque
+
 from canprobe.touch.nonlinear import CHI2_999
 
-ALARM = 2.2
-"""Running innovations, over their long-term means, at which the surface is taken to have changed."""
+LAST_FEW, BEST = 8, 3
+"""Of so many last samples so many are the best: they stay right while no more than five of eight are wrong."""
+BEST_SHARE = 0.37
+"""Innovation of the best three of eight over that of all, when nothing is wrong."""
+ALARM, ALARM_OF_BEST = 2.2, 3.5
+"""Innovations, over what is usual, at which the surface is taken to have changed. By chance, or with three wrong
+samples among the eight, one in a thousand and one in a hundred are above the second."""
 USUAL = (0.3, 2.0)
-"""Bounds of the long-term innovation that an alarm is measured by. It is small where the stated noise is generous;
-above the upper bound no innovation, capped as it is, could ever set off an alarm."""
-BETTER_HALF = 0.4
-"""Innovation of the better half of a step over that of all, about, when nothing is wrong."""
+"""Bounds of the usual innovation that an alarm is measured by. It is small where the stated noise is generous; above
+the upper bound no innovation, capped as it is, could ever set off an alarm."""
 RUNNING, LONG_TERM = 0.1, 0.004
-"""Weights of one sample in the running and in the long-term innovations."""
+"""Weights of one sample in the running and in the long-term innovation."""
 
 
 class ChangeTest:
@@ -26,41 +30,45 @@ class ChangeTest:
 
     Attributes:
         alarms: how often the surface was taken to have changed.
+        innovation: mean squared whitened innovation per degree of freedom over the last samples; about 1.
     """
 
     def __init__(self) -> None:
         self.alarms = 0
-        self._running = self._usual = (1.0, BETTER_HALF)
-
-    @property
-    def innovation(self) -> float:
-        """Mean squared whitened innovation per degree of freedom over the last samples; about 1."""
-        return self._running[0]
+        self.innovation = self._all = 1.0
+        self._of_best = BEST_SHARE
+        self._last: deque[float] = deque(maxlen=LAST_FEW)
 
     @property
     def usual(self) -> float:
-        """The same in the long term, within `USUAL`."""
-        return _bounded(self._usual[0])
+        """The innovation in the long term, within `USUAL`."""
+        return _bounded(self._all)
 
-    def take(self, d2: Array) -> bool:
-        """Take the squared innovations (n,) of a step, χ² of 3 each; whether they say that the surface has changed."""
-        n = len(d2)
-        capped = sorted([min(d, CHI2_999) / 3.0 for d in d2.tolist()])
-        half = (n + 1) // 2
-        now = sum(capped) / n, sum(capped[:half]) / half
-        self._running = _moved(self._running, now, min(1.0, RUNNING * n))
-        better = BETTER_HALF * _bounded(self._usual[1] / BETTER_HALF)
-        if self._running[0] < ALARM * self.usual or self._running[1] < ALARM * better:
-            self._usual = _moved(self._usual, now, min(1.0, LONG_TERM * n))
-            return False
-        self._running = self._usual
+    def take(self, square: float, caution: float = 1.0) -> bool:
+        """Take the squared innovation, χ² of 3, of a sample; whether the surface now looks changed.
+
+        Args:
+            square: of the sample.
+            caution: factor of both thresholds.
+        """
+        now = min(square, CHI2_999) / 3.0
+        self._last.append(now)
+        best = sum(sorted(self._last)[:BEST]) / BEST if len(self._last) == LAST_FEW else 0.0
+        self.innovation += RUNNING * (now - self.innovation)
+        usual_best = BEST_SHARE * _bounded(self._of_best / BEST_SHARE)
+        if self.innovation >= caution * ALARM * self.usual and best >= caution * ALARM_OF_BEST * usual_best:
+            return True
+        self._all += LONG_TERM * (now - self._all)
+        if len(self._last) == LAST_FEW:
+            self._of_best += LONG_TERM * (best - self._of_best)
+        return False
+
+    def alarm(self) -> None:
+        """Count a change; the running innovation begins again at what is usual."""
         self.alarms += 1
-        return True
+        self.innovation = self.usual
+        self._last.clear()
 
 
 def _bounded(usual: float) -> float:
     return min(max(usual, USUAL[0]), USUAL[1])
-
-
-def _moved(old: tuple[float, float], now: tuple[float, float], share: float) -> tuple[float, float]:
-    return old[0] + share * (now[0] - old[0]), old[1] + share * (now[1] - old[1])

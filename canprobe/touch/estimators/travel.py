@@ -10,6 +10,8 @@ import numpy as np
 from canprobe.touch._arrays import Array
 
 _MEDIAN_OF, _MEAN_OF = 5, 8
+_FAR2, _SLOWLY = 16.0, 0.05
+"""Squared distance from the median, over the usual, that is no jump; and the share of one point in the usual."""
 
 
 class Travel:
@@ -23,10 +25,13 @@ class Travel:
 
     Attributes:
         total: path so far, m.
+        weight: of the last point: below 1 where it lies several times further from the median than points usually do.
     """
 
     def __init__(self, step: float) -> None:
         self.total = 0.0
+        self.weight = 1.0
+        self._usual2 = 0.0
         self._step2 = step * step
         self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
         self._mean = self._mark = (0.0, 0.0, 0.0)
@@ -34,9 +39,11 @@ class Travel:
 
     def add(self, point: Array) -> float:
         """Take a point (3,), m; the length of the step that it completes, or 0."""
-        self._last.append(point.tolist())
+        px, py, pz = here = point.tolist()
+        self._last.append(here)
         middle = len(self._last) // 2
         a, b, c = [sorted(axis)[middle] for axis in zip(*self._last, strict=True)]
+        self._weigh((px - a) ** 2 + (py - b) ** 2 + (pz - c) ** 2)
         self._count = min(self._count + 1, _MEAN_OF)
         share = 1.0 / self._count
         x, y, z = self._mean
@@ -52,6 +59,13 @@ class Travel:
         length = math.sqrt(square)
         self.total += length
         return length
+
+    def _weigh(self, square: float) -> None:
+        """A contact does not jump from frame to frame; one that does is not believed, however little is known there."""
+        limit = max(_FAR2 * self._usual2, self._step2)
+        ratio = limit / max(square, limit)
+        self.weight = ratio * ratio
+        self._usual2 += _SLOWLY * (min(square, limit) - self._usual2)
 
 
 class Spread:

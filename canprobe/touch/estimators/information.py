@@ -1,0 +1,109 @@
+"""A square-root information filter for the nine-parameter model, and how it is carried from frame to frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, inverted, upper_root
+from canprobe.touch.anchor import foot
+from canprobe.touch.estimators.score import Score
+from canprobe.touch.frames import homogeneous, transported_rotation
+from canprobe.touch.noise import Correlation
+from canprobe.touch.nonlinear import DIFFUSE
+from canprobe.touch.prior import Prior
+from canprobe.touch.quadric import transport
+
+ANCHOR = 0.05
+"""Travel between two changes of the working frame over the memory."""
+
+
+class InformationFilter:
+    """Parameters with a root of their information in a working frame; rows come in, old ones fade.
+
+    Args:
+        length: the memory, and the unit of length of the problem, m.
+        prior: never forgotten: what forgetting takes of it is put back.
+        correlation: of the rows along the path; only the covariance of the answer knows of it.
+
+    Attributes:
+        length: m.
+        T: (4, 4) working frame to base, m.
+        c: (9,) parameters (`quadric`).
+        root: (9, 9) `rootᵀ root` is their information.
+        inverse: (9, 9) of `root`.
+        score: what the noise of the rows does to them.
+    """
+
+    def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
+        self.length = length
+        self.root: Array
+        self.inverse: Array
+        self._prior_rows = _prior_rows(prior, length)
+        self.score = Score(self._prior_rows.T @ self._prior_rows, correlation)
+        self.begin(np.eye(4))
+
+    def begin(self, T: Array) -> None:
+        """Know nothing but the prior: a plane in a frame (4, 4)."""
+        self.T = T
+        self.c = np.zeros(9)
+        self._set_root(self._prior_rows)
+        self.score.reset()
+
+    def adopt(self, T: Array, c: Array, root: Array, J: Array, travelled: float) -> None:
+        """Take over a batch solution.
+
+        Args:
+            T: (4, 4) its working frame.
+            c: (9,) its parameters.
+            root: (9, 9) of its information.
+            J: (n, 3, 9) its whitened, weighted rows, evenly spread over the path.
+            travelled: length of that path, m.
+        """
+        self.T, self.c = T, c.copy()
+        self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
+        self.score.start(self.root, J, travelled)
+
+    def take(self, rows: Array, moved: float) -> None:
+        """Forget over a step of the path (m), then take in weighted rows (3n, 10): one QR."""
+        kept = math.exp(-moved / self.length)
+        lost = math.sqrt(1.0 - kept) * self._prior_rows
+        stacked = np.empty((18 + len(rows), 10))
+        stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
+        stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
+        stacked[18:] = rows
+        full = upper_root(stacked)
+        self._set_root(full[:9, :9])
+        self.c = self.c + self.inverse @ full[:9, 9]
+        self.score.take(rows[:, :9], moved, kept)
+
+    def place(self, point: Array) -> Array:
+        """A point (3,) of base in the working frame, dimensionless."""
+        result: Array = (point - self.T[:3, 3]) @ self.T[:3, :3] / self.length
+        return result
+
+    def follow(self, point: Array) -> None:
+        """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
+        x = self.place(point)
+        if float(x @ x) < ANCHOR**2:
+            return
+        x, z = foot(self.c, x)
+        turned = transported_rotation(np.eye(3), z)
+        self.c, M = transport(self.c, homogeneous(turned, x))
+        self.c[:3] = 0.0
+        back = inverted(M)
+        self.root, self.inverse = self.root @ back, M @ self.inverse
+        self.score.carry(back)
+        R = self.T[:3, :3]
+        self.T = homogeneous(R @ turned, self.T[:3, 3] + R @ (self.length * x))
+
+    def _set_root(self, root: Array) -> None:
+        self.root, self.inverse = root, inverted(root)
+
+
+def _prior_rows(prior: Prior, length: float) -> Array:
+    """(9, 9) root of what is always known."""
+    own = DIFFUSE * np.eye(9)
+    own[3:6] = prior.rows(length)[0][:3]
+    return own

@@ -1,0 +1,121 @@
+"""The first stretch of a filter: all its contacts at once, by one Gauss–Newton step whenever some more have come.
+
+A filter that is linearised on a plane would be off by the tilt of a curved surface along the first stretch, and would
+keep it. So the contacts of the first stretch are kept and solved together. The solution is never iterated to the end:
+each call takes one step from the last answer on the data that are there by now, which bounds the work of every call
+(the real-time iteration of model predictive control); by the end of the stretch it has settled.
+
+Source: Diehl, Bock and Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal feedback
+control", 2005.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from canprobe.touch._arrays import Array
+from canprobe.touch.estimators.equations import Touch, batch_design
+from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.linearised import SETTLED, Linearised, gauss_newton, linearised
+from canprobe.touch.nonlinear import linear_start
+from canprobe.touch.prior import Prior
+from canprobe.touch.quadric import Design
+from canprobe.touch.rank import SPREAD, spread_of
+
+FIRST = 0.1
+"""Travel over the memory at the first solution."""
+LAST = 0.4
+"""Travel over the memory at which the filter takes over, once the solution has settled."""
+LATEST = 0.8
+"""Travel over the memory at which it takes over even where the solution still moves."""
+MOST = 128
+"""Contacts that are kept; of more every second one goes."""
+_FRAME_OF = 5
+"""Contacts whose median place and normal make the working frame."""
+
+
+class Start:
+    """Contacts of the first stretch and their solution so far.
+
+    Args:
+        length: the memory of the filter, m.
+        prior: on the parameters.
+
+    Attributes:
+        T: (4, 4) working frame of the solution to base, m.
+        solution: None before there is one.
+        settled: the solution is one: its last step was small, and all of K was observed or the stretch is over.
+        travelled: path so far, m.
+    """
+
+    def __init__(self, length: float, prior: Prior) -> None:
+        self.T = np.eye(4)
+        self.solution: Linearised | None = None
+        self.settled = False
+        self.travelled = 0.0
+        self._length = length
+        self._prior = prior.rows(length)
+        self._touches: list[Touch] = []
+
+    @property
+    def over(self) -> bool:
+        """Whether the filter should take over."""
+        share = self.travelled / self._length
+        return self.solution is not None and (share >= LATEST or (share >= LAST and self.settled))
+
+    def add(self, touches: Sequence[Touch], moved: float) -> None:
+        """Take in the contacts of a step of the path (m), and improve the solution by one Gauss–Newton step."""
+        self._touches += touches
+        if len(self._touches) > MOST:
+            self._touches = self._touches[::2]
+        self.travelled += moved
+        share = self.travelled / self._length
+        if share < FIRST:
+            return
+        if self.solution is None:
+            self.T = _frame(self._touches[-_FRAME_OF:])
+        d = batch_design(self.T, self._length, self._touches)
+        if share < LAST and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
+            return
+        self._improve(d, share >= LAST)
+
+    def _improve(self, d: Design, stretch_over: bool) -> None:
+        """From the better of the last solution and, until that has settled, a linear one."""
+        now = None if self.solution is None else linearised(self.solution.target, d, self._prior)
+        if now is None or not self.settled:
+            fresh = linearised(self._linear(d), d, self._prior)
+            now = fresh if now is None or fresh.cost < now.cost else now
+        better = gauss_newton(now, d, self._prior)
+        self.solution = better
+        known = self.settled or better.decision.rank == 3 or stretch_over
+        self.settled = known and better.step < SETTLED
+
+    def _linear(self, d: Design) -> Array:
+        spread = spread_of(d.X, d.point_variance)
+        return linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
+
+
+def isolation(points: Array, variance: Array) -> Array:
+    """Weights (n,) of points (n, 3) along a path: far below 1 for single ones that lie off between their neighbours.
+
+    A point is compared with the median of the five about it. What is usual is the median of these distances, and never
+    less than the variance (n,) of the points' noise per axis.
+    """
+    if len(points) < 5:
+        return np.ones(len(points))
+    padded = np.concatenate([points[1:3][::-1], points, points[-3:-1][::-1]])
+    windows = np.stack([padded[k : k + len(points)] for k in range(5)])
+    off = points - np.median(windows, axis=0)
+    square = np.einsum("ij,ij->i", off, off)
+    usual = 9.0 * np.maximum(float(np.median(square)), variance)
+    result: Array = usual / np.maximum(square, usual)
+    return result
+
+
+def _frame(touches: Sequence[Touch]) -> Array:
+    """A frame (4, 4) at the median place of contacts, z against their median normal."""
+    normal = np.median([t.normal for t in touches], axis=0)
+    normal = normal / np.sqrt(normal @ normal)
+    return homogeneous(tangent_rotation(-normal), np.median([t.point for t in touches], axis=0))

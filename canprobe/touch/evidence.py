@@ -1,0 +1,50 @@
+"""What a source says about curvature: value and information, before any decision on what is observed."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, inverted, solved
+from canprobe.touch.quadric import UNIT, curvature_jacobian
+from canprobe.touch.rank import spread_share
+
+TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
+"""K11, K12, K22 to q."""
+
+
+class CurvatureInformation(NamedTuple):
+    """What a source says about q = (K11, √2 K12, K22) in some contact frame.
+
+    Attributes:
+        q: (3,) its own value, 1/m; counts only where there is information.
+        information: (3, 3) inverse covariance, m².
+    """
+
+    q: Array
+    information: Array
+
+
+def evidence_of(c: Array, deviation: Array, spread: Array | None, length: float) -> CurvatureInformation:
+    """The evidence of a solution with all its parameters free.
+
+    Args:
+        c: (9,) parameters in the contact frame, in units of `length`.
+        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
+            not spread for is weighed down (`rank.spread_share`). None where that has been seen to.
+        length: m.
+    """
+    D = TO_Q[:, None] * curvature_jacobian(c) @ deviation
+    information = inverted(D @ D.T)
+    if spread is not None:
+        share = spread_share(spread)
+        information = share @ information @ share
+    return CurvatureInformation(c[6:] / (UNIT * length), information * length**2)
+
+
+def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
+    """(3,) the mean weighted with the information of both, which together must be definite."""
+    return solved(a.information + b.information, a.information @ a.q + b.information @ b.q)

@@ -1,0 +1,129 @@
+"""What a quadric leaves out: the cubic and quartic terms of a surface, found in the residuals or allowed for.
+
+A quadric has two of the four cubic terms of a surface's height over its tangent plane; a torus, a fillet or a wave has
+the others too. They turn into errors of K that no covariance of a quadric knows. Here the height gets terms
+`Σ a_j φ_j(x, y)`, all cubic and quartic monomials about the contact, with `a ~ N(0, τ²)` alike in all directions, and
+the answer is averaged over τ: 0 (a quadric), what is usual for a surface of such curvature (`CHANGES`), and, should the
+residuals insist, anything (`EVIDENCE`). The weights are the prior's times the marginal likelihood of the residuals: a
+quadric stays one, a misfit that shows is corrected, one that could hide in the noise widens the covariance.
+
+The correction is one linear step, and higher terms follow where quartic ones matter: their part is taken to be a
+quarter of `‖K‖ · length` of the correction, and goes into the covariance. A correction of more than a tenth of K is
+beyond that: the path has no local quadric, and K is not observed.
+
+Source: Hoeting, Madigan, Raftery and Volinsky, "Bayesian model averaging: a tutorial", 1999, (1)–(3), with the marginal
+likelihood of a linear model.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, inverted, upper_root
+from canprobe.touch.noise import mixed
+from canprobe.touch.nonlinear import robust
+from canprobe.touch.quadric import UNIT, Design, gradient_rows, linearise, value_rows
+
+NONE, USUAL, TAIL = 0.75, 0.22, 0.03
+"""Prior weights of: no misfit; a usual one; one that is only believed when seen."""
+CHANGES = (0.05, 0.15, 0.5)
+"""A usual change of curvature along a surface: dK/ds over ‖K‖²."""
+EVIDENCE = 10.0 ** np.arange(1.0, 9.0)
+"""Variances of the tail over that of the best known of the terms."""
+LEFT_OUT = 0.25
+"""Higher terms over what cubic and quartic ones changed, per unit of ‖K‖ · length."""
+TRUST = 0.1
+"""Largest change of K that is believed, over ‖K‖ or 1/length."""
+_NEVER_LESS = 0.1
+"""‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
+_POWER_Y = np.array([0, 1, 2, 3, 0, 1, 2, 3, 4])
+_DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
+_POWER_X = _DEGREE - _POWER_Y
+_FACTOR = np.sqrt([math.comb(int(n), int(k)) for n, k in zip(_DEGREE, _POWER_Y, strict=True)])
+"""Makes the prior the same in all directions."""
+_PRIOR = np.concatenate(
+    [[NONE], np.full(len(CHANGES), USUAL / len(CHANGES)), np.full(len(EVIDENCE), TAIL / len(EVIDENCE))]
+)
+
+
+class Corrected(NamedTuple):
+    """A fit with what it leaves out.
+
+    Attributes:
+        c: (9,) parameters.
+        root: (9, 9) upper triangular information root.
+        misfit: probability of there being one; `1 − NONE` where the residuals cannot tell.
+        trusted: the change of K is small enough for a linear step.
+    """
+
+    c: Array
+    root: Array
+    misfit: float
+    trusted: bool
+
+
+def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corrected:
+    """Average a converged fit, everything observed, over the misfit of its quadric.
+
+    Args:
+        c: (9,) in the frame at the last sample, dimensionless.
+        root: (9, 9) of its information, prior included.
+        d: its samples.
+        independent: as for `nonlinear.fit`.
+    """
+    J, E, r, slack = _rows(c, d, independent)
+    inverse = inverted(root)
+    H = inverse @ inverse.T
+    curvature = float(np.linalg.norm(c[6:] / UNIT))
+    E *= np.where(_DEGREE == 3, 1.0, 0.25 * max(curvature, _NEVER_LESS))
+    carried = H @ (J.T @ E)  # terms a put the quadric off by −carried a
+    m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the nine parameters and their prior cannot explain of them
+    m, s, carried = np.maximum(m, 0.0), U.T @ (carried.T @ slack - E.T @ r), carried @ U
+    usual = np.square(np.array(CHANGES) * curvature**2 / 6.0)
+    variance = np.concatenate([[0.0], usual, EVIDENCE / max(float(m[-1]), 1e-300)])[:, None]
+    share = variance / (1.0 + variance * m)
+    weight = _PRIOR * _relative(0.5 * (s * s * share - np.log1p(variance * m)).sum(axis=1))
+    weight /= weight.sum()
+    shifts = -(share * s) @ carried.T
+    mean = weight @ shifts
+    apart = shifts - mean
+    C = H + (carried * (weight @ share)) @ carried.T + (apart.T * weight) @ apart
+    changed = float(weight @ np.square(shifts[:, 6:] / UNIT).sum(axis=1))
+    C[6:, 6:] += np.diag(UNIT**2) * (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed
+    lower = np.asarray(np.linalg.cholesky(C), dtype=np.float64)
+    trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
+    return Corrected(c + mean, upper_root(inverted(lower)), 1.0 - float(weight[0]), trusted)
+
+
+def _relative(log_likelihood: Array) -> Array:
+    result: Array = np.exp(log_likelihood - log_likelihood.max())
+    return result
+
+
+def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array, Array, Array]:
+    """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), what is left of Jᵀ r (9,).
+
+    Wrong samples count by the square of their weight: some that still pull at the fit would look like a misfit.
+    """
+    at = linearise(c, d)
+    weight = robust(np.einsum("ij,ij->i", at.r, at.r))[0][:, None, None]
+    J = at.jacobian(value_rows(at.X), gradient_rows(at.X, at.V), d)
+    joined = np.concatenate([J, at.jacobian(*_terms(at.X, at.V), d), at.r[:, :, None]], axis=2)
+    rows, fitted = joined * weight, joined[:, :, [*range(9), -1]] * np.sqrt(weight)
+    if independent is not None:
+        rows, fitted = mixed(independent, rows), mixed(independent, fitted)
+    rows, fitted = rows.reshape(-1, rows.shape[2]), fitted.reshape(-1, 10)
+    J, E, r = rows[:, :9], rows[:, 9:-1], rows[:, -1]
+    return J, E, r, J.T @ r - fitted[:, :9].T @ fitted[:, 9]
+
+
+def _terms(X: Array, V: Array) -> tuple[Array, Array]:
+    """Values (n, k) and derivatives along vectors V (n, 3, 3) of the monomials at places X (n, 3), (n, 3, k)."""
+    x, y = X[:, :1], X[:, 1:2]
+    F = _FACTOR * x**_POWER_X * y**_POWER_Y
+    along_x = _FACTOR * _POWER_X * x ** np.maximum(_POWER_X - 1, 0) * y**_POWER_Y
+    along_y = _FACTOR * _POWER_Y * x**_POWER_X * y ** np.maximum(_POWER_Y - 1, 0)
+    return F, V[:, :, :1] * along_x[:, None] + V[:, :, 1:2] * along_y[:, None]

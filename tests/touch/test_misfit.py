@@ -1,0 +1,97 @@
+"""Cubic and quartic terms of a surface: corrected for where they show, allowed for where they hide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from canprobe.touch.fit import fit_surface
+
+CUBIC = np.array([9.0, -14.0, 6.0, 11.0])
+"""Of x³, x²y, xy², y³, 1/m²: curvature changes by 2 1/m over the path."""
+K_TRUE = np.array([[30.0, 6.0], [6.0, -12.0]])
+
+
+def felt(cubic, sigma_point, sigma_normal, seed, K=K_TRUE):
+    """A weave of 20 mm that ends at the origin of a surface z = ½ xᵀ K x + cubic (z inward), with noise."""
+    rng = np.random.default_rng(seed)
+    t = np.linspace(-1.0, 0.0, 160)
+    x, y = 0.012 * t, 0.004 * np.sin(2 * np.pi * 1.7 * t)
+    z = 0.5 * (K[0, 0] * x * x + 2 * K[0, 1] * x * y + K[1, 1] * y * y)
+    z = z + cubic @ np.array([x**3, x * x * y, x * y * y, y**3])
+    zx = K[0, 0] * x + K[0, 1] * y + cubic @ np.array([3 * x * x, 2 * x * y, y * y, 0 * y])
+    zy = K[0, 1] * x + K[1, 1] * y + cubic @ np.array([0 * x, x * x, 2 * x * y, 3 * y * y])
+    n = np.stack([zx, zy, -np.ones_like(x)], axis=1)
+    p = np.stack([x, y, z], axis=1) + sigma_point * rng.normal(size=(160, 3))
+    n = n / np.linalg.norm(n, axis=1, keepdims=True) + sigma_normal * rng.normal(size=(160, 3))
+    return p, n / np.linalg.norm(n, axis=1, keepdims=True)
+
+
+def error(estimate, cubic=CUBIC):
+    """(3,) of K11, K12, K22, the truth taken at the place that the estimate speaks of."""
+    x, y = estimate.T_frame_contact[:2, 3]
+    a, b, c, d = cubic
+    tensor = np.zeros((3, 3))
+    change = [[6 * a * x + 2 * b * y, 2 * b * x + 2 * c * y], [2 * b * x + 2 * c * y, 2 * c * x + 6 * d * y]]
+    tensor[:2, :2] = K_TRUE + np.array(change)
+    P = estimate.T_frame_contact[:3, :2]
+    D = estimate.K - P.T @ tensor @ P
+    return np.array([D[0, 0], D[0, 1], D[1, 1]])
+
+
+@pytest.mark.parametrize("scale", [4.0, -4.0, 8.0])
+def test_a_misfit_that_shows_is_corrected(scale):
+    points, normals = felt(scale * CUBIC, 1e-9, 1e-9, 1)
+    sigmas = {"sigma_point": 5e-6, "sigma_normal": 2e-4}
+    plain = fit_surface(points, normals, quadric=True, **sigmas)
+    found = fit_surface(points, normals, **sigmas)
+    left, corrected = (np.linalg.norm(error(e, scale * CUBIC)) for e in (plain, found))
+    assert left > 0.4
+    assert corrected < 0.12 * left
+    assert any("no quadric" in note for note in found.notes)
+    assert np.all(np.linalg.eigvalsh(found.covariance) > 0)
+    assert np.array_equal(found.K, 2 * found.S[:2, :2])
+
+
+@pytest.mark.parametrize(("scale", "least", "plain_most"), [(1.0, 0.6, 0.45), (3.0, 0.90, 0.05), (8.0, 0.90, 0.05)])
+def test_regions_hold_the_truth_whether_it_shows_or_hides(scale, least, plain_most):
+    """Half-way between, where a bias of one standard deviation cannot be told from noise, they hold it less often."""
+    inside, plain_inside = [], []
+    for seed in range(40):
+        points, normals = felt(scale * CUBIC, 20e-6, 1e-3, seed)
+        for quadric, share in ((False, inside), (True, plain_inside)):
+            estimate = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=1e-3, quadric=quadric)
+            if estimate.rank == 3:
+                e = error(estimate, scale * CUBIC)
+                share.append(e @ np.linalg.solve(estimate.covariance, e) < 7.815)
+    assert len(inside) >= 36
+    assert np.mean(inside) >= least
+    assert np.mean(plain_inside) <= plain_most
+
+
+def test_where_there_is_no_local_quadric_nothing_is_observed():
+    points, normals = felt(50.0 * CUBIC, 1e-9, 1e-9, 1)
+    estimate = fit_surface(points, normals, sigma_point=5e-6, sigma_normal=2e-4)
+    assert estimate.rank == 0
+    assert np.isnan(estimate.K).all() and not estimate.observed.any()
+    assert any("varies too much" in note for note in estimate.notes)
+
+
+def test_a_quadric_stays_what_it_is():
+    """On a sphere answers and their covariances hardly change, and nothing is said of a misfit."""
+    t = np.linspace(-1.0, 0.0, 160)
+    direction = np.stack([0.3 * t, 0.1 * np.sin(11 * t), -np.ones_like(t)], axis=1)
+    n = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    squares, claims = {True: [], False: []}, {True: [], False: []}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        normals = n + 1e-3 * rng.normal(size=n.shape)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        points = 0.04 * n + 20e-6 * rng.normal(size=n.shape)
+        for quadric in (True, False):
+            e = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=1e-3, quadric=quadric)
+            assert not any("quadric" in note for note in e.notes)
+            squares[quadric].append(np.sum((e.K - 25.0 * np.eye(2)) ** 2))
+            claims[quadric].append(np.trace(e.covariance))
+    assert np.mean(squares[False]) < 1.1 * np.mean(squares[True])
+    assert np.mean(claims[True]) < np.mean(claims[False]) < 1.1 * np.mean(claims[True])
