@@ -26,7 +26,7 @@ ENDS = {
 }
 """How a touch ended: colour, marker, words."""
 VIEWS = {"told": "believes the stiffness it was told", "felt": "feels the stiffness"}
-SIDES = {"drives": "drives", "pose": "pose", "radii": "radii", "speed": "speed, 1e4 … 4e4 N/m"}
+SIDES = {"drives": "drives, 1e4 and 1e6 N/m", "pose": "pose", "radii": "radii", "speed": "1e4, 4e4 N/m"}
 
 
 def draw_stability(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -80,6 +80,8 @@ def _draw_map(
         )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_yticks([2.0, 8.0, 25.0, 50.0], ["2", "8", "25", "50"])
+    axes.minorticks_off()
 
 
 def _draw_side(axes: Axes, words: str, rows: Sequence[dict[str, Any]]) -> None:
