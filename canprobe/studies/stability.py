@@ -148,9 +148,11 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
         right = sum(r["ended"] == "stable" for r in settles)
         not_settling = [r for r in told if r["eigenvalue"] >= 1.0]
         wrong = sum(r["ended"] != "stable" for r in not_settling)
+        early = sum(r["ended"] != "stable" and r["contact_n_m"] > approach_limit(r) for r in not_settling)
         said.append(
-            f"Servo that believes what it was told: of {len(settles)} touches whose eigenvalues lie inside the unit "
-            f"circle {right} are stable, of {len(not_settling)} outside {wrong} are not."
+            f"Servo that believes what it was told, from 1e+03 N/m up: of {len(settles)} touches whose eigenvalues lie "
+            f"inside the unit circle {right} are stable, of {len(not_settling)} outside {wrong} are not; {early} of "
+            "these are beyond the approach's own limit, and tell nothing about the loop."
         )
     felt = [r for r in rows if r["view"] == "felt" and r["ended"] != "refused"]
     for name, group in (("believes what it was told", told), ("feels the stiffness", felt)):
