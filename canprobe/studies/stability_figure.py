@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from canprobe.studies.stability import approach_limit
-from canprobe.studies.stability_loop import spectral_radius
+from canprobe.studies.stability_loop import Array, ForceLoop, spectral_radius
 from canprobe.studies.stability_runs import Case, loop_of
 
 INK, FAINT = "#1f2933", "#d9dee4"
@@ -26,8 +26,7 @@ ENDS = {
 }
 """How a touch ended: colour, marker, words."""
 VIEWS = {"told": "believes the stiffness it was told", "felt": "feels the stiffness"}
-SIDES = {"drives": "drives", "pose": "pose", "radii": "radii", "speed": "speed, 1e4 … 4e4 N/m"}
-_POINTS = 48
+SIDES = {"drives": "drives, 1e4 and 1e6 N/m", "pose": "pose", "radii": "radii", "speed": "1e4, 4e4 N/m"}
 
 
 def draw_stability(rows: Sequence[dict[str, Any]], path: Path) -> None:
@@ -42,10 +41,12 @@ def draw_stability(rows: Sequence[dict[str, Any]], path: Path) -> None:
     )  # fmt: skip
     upper, lower = figure.subfigures(2, 1, squeeze=False, height_ratios=(3, 2))[:, 0]
     grid = upper.subplots(len(VIEWS), len(buses), squeeze=False, sharex=True, sharey=True)
+    stiffness = np.geomspace(70.0, 1.5e7, 40)
     for i, (view, words) in enumerate(VIEWS.items()):
+        ratios = [loop_of(Case(view, float(k), feels=view == "felt")).depth_ratio for k in stiffness]
         for axes, (rate, late) in zip(grid[i], buses, strict=True):
             mine = [r for r in rows if r["view"] == view and (r["rate_hz"], r["late_ms"]) == (rate, late)]
-            _draw_map(axes, view, rate, late, mine)
+            _draw_map(axes, stiffness, ratios, loop_of(Case(view, 1e4, rate_hz=rate, late_ms=late)), mine)
             if i == 0:
                 axes.set_title(f"{rate:g} Hz" + (f", {late:g} ms late" if late else ""), loc="left", fontsize=10)
         grid[i][0].set_ylabel(f"{words}\nforce gain, Hz")
@@ -59,11 +60,14 @@ def draw_stability(rows: Sequence[dict[str, Any]], path: Path) -> None:
     figure.savefig(path)
 
 
-def _draw_map(axes: Axes, view: str, rate: float, late: float, rows: Sequence[dict[str, Any]]) -> None:
+def _draw_map(
+    axes: Axes, stiffness: Array, ratios: Sequence[float], bus: ForceLoop, rows: Sequence[dict[str, Any]]
+) -> None:
     """One panel of the map."""
-    stiffness, gains = np.geomspace(70.0, 1.5e7, _POINTS), np.geomspace(1.5, 70.0, _POINTS // 2)
-    loops = [loop_of(Case(view, float(k), rate_hz=rate, late_ms=late, feels=view == "felt")) for k in stiffness]
-    radius = [[spectral_radius(replace(loop, height_hz=float(gain))) for loop in loops] for gain in gains]
+    gains = np.geomspace(1.5, 70.0, 20)
+    radius = [
+        [spectral_radius(replace(bus, depth_ratio=ratio, height_hz=float(gain))) for ratio in ratios] for gain in gains
+    ]
     axes.contourf(stiffness, gains, radius, levels=np.linspace(0.0, 2.0, 11), cmap="Greys", alpha=0.35, extend="both")
     axes.contour(stiffness, gains, radius, levels=[1.0], colors=INK, linewidths=1.6)
     if rows:
@@ -76,6 +80,8 @@ def _draw_map(axes: Axes, view: str, rate: float, late: float, rows: Sequence[di
         )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
+    axes.set_yticks([2.0, 8.0, 25.0, 50.0], ["2", "8", "25", "50"])
+    axes.minorticks_off()
 
 
 def _draw_side(axes: Axes, words: str, rows: Sequence[dict[str, Any]]) -> None:
@@ -88,7 +94,7 @@ def _draw_side(axes: Axes, words: str, rows: Sequence[dict[str, Any]]) -> None:
     axes.set_yticks(range(len(names)), names, fontsize=7)
     axes.set_xticks([])
     axes.set_xlim(-1.0, 4.0)
-    axes.set_ylim(len(names) - 0.5, -0.5)
+    axes.set_ylim(max(len(names), 1) - 0.5, -0.5)
     axes.set_title(words, loc="left", fontsize=10)
     for side in ("top", "right", "bottom"):
         axes.spines[side].set_visible(False)

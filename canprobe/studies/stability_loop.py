@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,16 +55,17 @@ class ForceLoop:
         return math.floor(self.late_s / self.period_s + 1e-9)
 
 
-def drive_step(loop: ForceLoop) -> Array:
+@lru_cache(maxsize=64)
+def drive_step(period_s: float, omega: float, damping: float) -> Array:
     """Map (3, 4) of position, rate, reference and the target that is latched to the first three a cycle later."""
-    T, w, z = loop.period_s, loop.omega, loop.damping
     rates = np.zeros((4, 4))  # of position, rate, reference, slope
     rates[0, 1] = 1.0
-    rates[1, :3] = -w * w, -2.0 * z * w, w * w
+    rates[1, :3] = -omega * omega, -2.0 * damping * omega, omega * omega
     rates[2, 3] = 1.0
     ramp = np.eye(4)
-    ramp[3] = 0.0, 0.0, -1.0 / T, 1.0 / T
-    step: Array = (expm(rates * T) @ ramp)[:3]
+    ramp[3] = 0.0, 0.0, -1.0 / period_s, 1.0 / period_s
+    step: Array = (expm(rates * period_s) @ ramp)[:3]
+    step.flags.writeable = False
     return step
 
 
@@ -73,7 +75,7 @@ def sample_map(loop: ForceLoop) -> Array:
     The state at a SYNC: position, rate, reference, a, the last targets, newest first, and the positions at the SYNCs
     before, newest first.
     """
-    drive = drive_step(loop)
+    drive = drive_step(loop.period_s, loop.omega, loop.damping)
     delay = 1 + loop.late_cycles
     oldest = delay + loop.sample_cycles
     size = 4 + delay + oldest

@@ -77,23 +77,6 @@ def test_sensor_falls_silent_but_lives():
     assert truth["force"][-1] == 0.0
 
 
-def test_samples_that_say_they_are_old_do_not_move_the_surface():
-    """A sample older than the one before would turn the correction of the servo's surface round."""
-    session = press_session()
-    controller = make_task(session.plan)
-
-    def step(measurement):
-        sample = measurement.tactile
-        if sample is not None and 900 < measurement.cycle < 1100 and measurement.cycle % 8 in (4, 5):
-            measurement = replace(measurement, tactile=replace(sample, t_sample_ns=sample.t_sample_ns - 60_000_000))
-        return controller.step(measurement)
-
-    with session:
-        session.run(step)
-    assert controller.unplaced > 20
-    assert session.truth["force"].max() < 3.0
-
-
 def test_sensor_lives_but_never_sends_a_frame():
     session = press_session()
     frames = {pdo.cob_id for pdo in session.plan.pdos_of(16, "tpdo")}
@@ -110,6 +93,23 @@ def test_sensor_lives_but_never_sends_a_frame():
     reason, truth = run_until_stopped(session)
     assert "no tactile frame for" in reason
     assert truth["force"].max() == 0.0
+
+
+def test_samples_that_say_they_are_old_do_not_move_the_surface():
+    """A sample older than the one before would turn the correction of the servo's surface round."""
+    session = press_session()
+    controller = make_task(session.plan)
+
+    def step(measurement):
+        sample = measurement.tactile
+        if sample is not None and 900 < measurement.cycle < 1100 and measurement.cycle % 8 in (4, 5):
+            measurement = replace(measurement, tactile=replace(sample, t_sample_ns=sample.t_sample_ns - 60_000_000))
+        return controller.step(measurement)
+
+    with session:
+        session.run(step)
+    assert controller.unplaced > 20
+    assert session.truth["force"].max() < 3.0
 
 
 def test_joint_at_its_stop():

@@ -1,5 +1,6 @@
 """Study `stability`: the linear loop against a plain simulation of it, and how extreme touches end."""
 
+import json
 import math
 from collections import deque
 from dataclasses import replace
@@ -10,7 +11,8 @@ import pytest
 from canprobe.emulator.plant.arm import natural_frequency
 from canprobe.studies import stability
 from canprobe.studies.stability_loop import ForceLoop, sample_map, spectral_radius, steepest_ratio
-from canprobe.studies.stability_runs import Case, carry_out, layer_stiffness, longest_above, loop_of, scene_of
+from canprobe.studies.stability_runs import Case, layer_stiffness, longest_above, loop_of, scene_of
+from canprobe.studies.study_files import write_study
 from canprobe.touch.contact import indentation_from_force
 
 LOOP = ForceLoop(1.0, 0.0025, 2, 8.0, 0.0, natural_frequency(30.0, 1.0))
@@ -110,21 +112,35 @@ def test_cells_of_every_view_and_bus():
     assert scene_of(Case("x", 1e4, probe_mm=1.0)).probe.radius_mm == 1.0
 
 
+class InLine:
+    """A sweep without processes."""
+
+    def say(self, words):
+        assert words
+
+    def map(self, measure, cells, model):
+        return [json.loads(json.dumps(measure(cell), allow_nan=False)) for cell in cells]
+
+
 ENDINGS = [
-    (Case("told", 1e4, feels=False, hold_s=0.1, rate_hz=200.0), "stable", ""),
-    (Case("felt", 1e2), "stopped", "no object found"),
-    (Case("told", 1e7, feels=False), "stopped", "above the limit"),
-    (Case("felt", 1e4, rate_hz=1000.0), "refused", "worst-case load"),
-    (Case("felt", 1e4, late_ms=20.0), "stopped", "no tactile frame"),
-    (Case("speed", 1e4, speed_mm_s=250.0), "refused", "deg/s"),
+    ("stable", ""),
+    ("stopped", "above the limit"),
+    ("stopped", "the array is saturated in 100 % of the samples"),
+    ("stopped", "no tactile frame"),
+    ("refused", "worst-case load"),
+    ("refused", "out of reach"),
+    ("refused", "deg/s"),
 ]
 
 
-@pytest.mark.parametrize(("case", "ended", "why"), ENDINGS, ids=lambda value: str(getattr(value, "view", value)))
-def test_touches_end_as_they_may(case, ended, why):
-    answer = carry_out(case)
-    assert (answer["ended"], why in answer["reason"]) == (ended, True), answer
-    assert answer["above_ms"] is None or answer["above_ms"] <= answer["allowed_ms"]
+def test_quick_touches_end_as_they_may_and_are_drawn(tmp_path):
+    result = stability.run(quick=True, sweep=InLine())
+    for row, (ended, why) in zip(result.rows, ENDINGS, strict=True):
+        assert (row["ended"], why in row["reason"]) == (ended, True), row
+        assert row["above_ms"] is None or row["above_ms"] <= row["allowed_ms"]
+    assert "Every touch is stable" in result.findings[-1]
+    pytest.importorskip("matplotlib")
+    assert write_study(result, tmp_path)[-1].stat().st_size > 20_000
 
 
 def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
