@@ -40,6 +40,7 @@ class Received:
     Attributes:
         t_ns, measurement, frames: as in `Observation`.
         phase: column `phase` of the command, None without one.
+        depth: column `depth_at_1n_mm`: indentation at 1 N with which its contact was placed, None without one.
         estimate: of the command.
         dropped: observations that were lost before this one.
     """
@@ -47,6 +48,7 @@ class Received:
     t_ns: int
     measurement: Measurement | None
     phase: float | None
+    depth: float | None
     estimate: EstimateParts | None
     frames: list[TimedFrame]
     dropped: int
@@ -61,14 +63,16 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
     """
     command = observation.command
     phase: float | None = None
+    depth: float | None = None
     estimate = None
     if command is not None:
         phase = _number(command.columns.get("phase"))
+        depth = _number(command.columns.get("depth_at_1n_mm"))
         if command.estimate is not None:
             estimate = _pack_estimate(command.estimate)
     measurement = observation.measurement
     parts: Any = _pack_measurement(measurement) if measurement is not None else None
-    return marshal.dumps((observation.t_ns, parts, phase, estimate, observation.frames, dropped))
+    return marshal.dumps((observation.t_ns, parts, phase, depth, estimate, observation.frames, dropped))
 
 
 def _number(value: object) -> float | None:
@@ -78,11 +82,12 @@ def _number(value: object) -> float | None:
 
 def unpack_observation(data: bytes) -> Received:
     """The inverse of `pack_observation`."""
-    t_ns, parts, phase, estimate, frames, dropped = marshal.loads(data)
+    t_ns, parts, phase, depth, estimate, frames, dropped = marshal.loads(data)
     return Received(
         t_ns,
         _unpack_measurement(parts) if parts is not None else None,
         phase,
+        depth,
         _unpack_estimate(estimate) if estimate is not None else None,
         frames,
         dropped,

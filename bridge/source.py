@@ -54,6 +54,8 @@ class SampleSource:
         diagnostics = self._health.step(t_ns, received)
         if measurement is None:
             return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
+        if received.depth is not None and self._sensing is not None:
+            self._sensing.set_depth_at_1_n(received.depth * 1e-3)
         taxels, wrench, contact = self._touch(measurement, t_ns - measurement.t_ns)
         self._feel(received.estimate)  # after the contact that it rests on, as the task does
         return Sample(

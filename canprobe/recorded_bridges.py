@@ -28,6 +28,9 @@ from canprobe.scene import BridgeSettings, Scene
 from canprobe.session import LOCKSTEP, Say
 from canprobe.touch.estimate import SurfaceEstimate
 
+LOGGED = ("phase", "depth_at_1n_mm")
+"""Columns of the task that the bridges use."""
+
 
 @dataclass(frozen=True, slots=True)
 class RecordedBridges:
@@ -113,7 +116,7 @@ class _Observations:
         self._recording = read_recording(path, plan, as_taken=self._as_taken)
         self._drifts = folder is None
         self._estimates = _estimates(result)
-        self._phases = _phases(folder) if self._ours else {}
+        self._columns = _columns(folder) if self._ours else {}
 
     def __iter__(self) -> Iterator[Observation]:
         groups = _frames_by_sync(self._path, self._recording)
@@ -145,11 +148,9 @@ class _Observations:
         return bits * 1_000_000_000 // bus.bitrate
 
     def _command(self, m: Measurement) -> Command | None:
-        phase = self._phases.get(m.t_ns)
+        columns = self._columns.get(m.t_ns, {})
         estimate = self._estimates.get(m.tactile.t_sample_ns) if m.tactile is not None else None
-        if phase is None and estimate is None:
-            return None
-        return Command(columns={} if phase is None else {"phase": phase}, estimate=estimate)
+        return Command(columns=columns, estimate=estimate) if columns or estimate is not None else None
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
@@ -160,16 +161,18 @@ def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
     return {round(record.t_s * 1e9): record.estimate for record in records}
 
 
-def _phases(folder: Path | None) -> dict[int, float]:
-    """The task's phase by the time of the cycle, ns, where the run logged it."""
+def _columns(folder: Path | None) -> dict[int, dict[str, float | NDArray[np.float64]]]:
+    """What the bridges use of the task's columns, by the time of the cycle, ns, where the run logged it."""
     if folder is None or not (folder / "log.npz").is_file():
         return {}
     with np.load(folder / "log.npz", allow_pickle=False) as log:
-        if "phase" not in log:
-            return {}
-        known = np.isfinite(log["phase"])
-        times = np.round(log["t_s"][known] * 1e9).astype(np.int64)
-        return dict(zip(times.tolist(), log["phase"][known].tolist(), strict=True))
+        names = [name for name in LOGGED if name in log]
+        times = np.round(log["t_s"] * 1e9).astype(np.int64).tolist()
+        rows = zip(*(log[name].tolist() for name in names), strict=True)
+        return {
+            t_ns: {name: value for name, value in zip(names, row, strict=True) if np.isfinite(value)}
+            for t_ns, row in zip(times, rows, strict=False)
+        }
 
 
 def _frames_by_sync(path: Path, recording: Recording) -> Iterator[list[TimedFrame]]:

@@ -201,9 +201,9 @@ def test_cia402_60b0_position_offset_is_added(rig):
     assert rig.counts == 70
 
 
-def test_cia402_58_bit_11_in_csp_and_pp_when_the_motion_takes_more_than_6072h(rig, plant):
+def test_cia402_58_bit_11_in_csp_and_pp_when_the_motion_takes_all_of_6072h(rig, plant):
     rig.put(_6072=300).enable(8).drive.nmt(0x01)
-    for torque, limited in ((0, 0), (301, 1), (-301, 1), (-300, 0)):
+    for torque, limited in ((0, 0), (300, 1), (-301, 1), (-299, 0)):
         plant.torque = torque
         rig.put(_607A=0).cycles(2)
         rig.put(_607A=0).cycles(1)

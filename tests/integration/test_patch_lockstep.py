@@ -73,7 +73,7 @@ def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
 
 def test_across_a_circumferential_path_the_curvature_is_0_within_2_per_m():
     """Scored absolutely: there is nothing to divide by."""
-    scene = resolve_scene(canprobe.load_scene("axial"), duration_s=1.4)
+    scene = resolve_scene(canprobe.load_scene("axial"), duration_s=2.4)
     scene = replace(scene, task=replace(scene.task, heading_deg=110.0, length_mm=20.0))
     session = Session(scene)
     controller = make_task(session.plan)

@@ -128,6 +128,10 @@ class ContactSensing:
             self._settle_stiffness(stiffness_from_slope(self._slope, self.radius, possible))
         self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
 
+    def set_depth_at_1_n(self, depth: float) -> None:
+        """Place contacts as another sensing did that had this depth at 1 N, m."""
+        self._depth_at_1_n = depth
+
     def set_slope(self, slope: float) -> None:
         """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
         flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))

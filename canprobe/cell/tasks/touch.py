@@ -214,6 +214,7 @@ class TouchTask:
         self._force = patch.force
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
+        depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
         contact = self.sensing.contact(measurement.tactile, patch) if patch.force > self._s.touch_force / 2 else None
         if contact is not None and self._sample_t is not None and contact.t_s <= self._sample_t:
             self.sensing.dropped += 1  # it says that it is older than the one before
@@ -229,7 +230,7 @@ class TouchTask:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self._take_shape(contact)
-        self._columns = self._columns_of(measurement, patch, contact)
+        self._columns = self._columns_of(measurement, patch, contact) | {"depth_at_1n_mm": depth_at_1n_mm}
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
         """Learn from the growing force how stiff this touch is; what was measured so far moves with it, no bump."""
