@@ -15,7 +15,7 @@ from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
-from canprobe.errors import CanprobeError, UsageError
+from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
@@ -162,8 +162,14 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
         session.out,
     )
     if session.out is not None:
-        write_files(result, session.out)
-        _draw(result, session.out)
+        try:
+            write_files(result, session.out)
+            _draw(result, session.out)
+        except OSError as error:  # a full disk: what stopped the run counts for more, and the cell is safe
+            told = f"{session.out}: not all results could be written: {error.strerror or error}"
+            summary["faults"].append(told)
+            if failure is None:
+                raise ResultsError(told) from error
     return result
 
 

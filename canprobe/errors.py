@@ -9,6 +9,7 @@ CanprobeError
 │   ├── InterfaceError   3  the CAN interface itself
 │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
 ├── StudyError           3  a study's worker, cell or files failed
+├── ResultsError         3  results that cannot be written
 ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
 └── ProtocolError        3  bytes on the bus that mean nothing where they stand
 """
@@ -92,6 +93,10 @@ class StudyError(CanprobeError):
 
 class ProtocolError(BusError):
     """Bytes that do not decode to what they must be where they stand."""
+
+
+class ResultsError(CanprobeError):
+    """What a run measured cannot be written; the drives are disabled."""
 
 
 class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake

@@ -194,8 +194,12 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
-            if self._cell is not None and (failure := self._log_failure()) is not None:
-                self._cell.faults.append(f"the log is not whole: {failure}")
+            if (failure := self._log_failure()) is not None:
+                self._note(f"the log is not whole: {failure}")
+
+    def _note(self, fault: str) -> None:
+        if self._cell is not None:
+            self._cell.faults.append(fault)
 
     def _log_failure(self) -> str | None:
         return self._candump.failure if self._candump is not None else None
@@ -267,7 +271,10 @@ class Session:
         if self.world.recorder is not None:
             self.truth = self.world.recorder.arrays()
             if self.out is not None:
-                self.world.recorder.save(self.out / "truth.npz")
+                try:
+                    self.world.recorder.save(self.out / "truth.npz")
+                except OSError as error:
+                    self._note(f"truth.npz could not be written: {error.strerror or error}")
 
     def _open_real(self) -> Port:
         from canprobe.bus.open import open_port
