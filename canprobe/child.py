@@ -132,7 +132,7 @@ class EmulatorChild:
         truth = {}
         if self._truth.exists():
             with (
-                contextlib.suppress(OSError, ValueError, zipfile.BadZipFile),  # cut off by a full disk
+                contextlib.suppress(OSError, ValueError, EOFError, zipfile.BadZipFile),  # cut off by a full disk
                 np.load(self._truth, allow_pickle=False) as data,
             ):
                 truth = {name: np.asarray(data[name]) for name in data.files}

@@ -53,7 +53,7 @@ def test_the_emulator_stands_still_and_the_drives_are_lost(bench: Any) -> None:
     finally:
         with contextlib.suppress(ProcessLookupError):  # the cell has killed it
             os.kill(child, signal.SIGCONT)
-    assert "lost: no usable TPDO" in line
+    assert "lost: no usable TPDO" in line or "lost: no heartbeat" in line  # at 100 Hz both come within 250 ms
 
 
 def test_the_disk_is_full(bench: Any) -> None:
