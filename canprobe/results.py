@@ -156,7 +156,7 @@ def _scan(controller: object) -> tuple[int, int] | None:
     return cycles if cycles is not None and cycles[1] > cycles[0] else None
 
 
-def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, float | None]:
+def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
     task, scan = session.scene.task, _scan(controller)
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
@@ -171,7 +171,14 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
+    losses = [
+        {
+            "searched_mm": 1e3 * loss.searched,
+            "regained_after_ms": None if loss.regained_s is None else 1e3 * loss.regained_s,
+        }
+        for loss in getattr(controller, "losses", ())
+    ]
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, "losses": losses}
 
 
 def summarise_shape(
@@ -337,12 +344,25 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
+    if contact["losses"]:
+        lines.append(f"  {_losses(contact['losses'])}")
     if shape["method"] is not None:
         lines += shape_lines(shape)
     lines += bridge_lines(summary.get("bridges") or {})
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
+
+
+def _losses(losses: Sequence[Mapping[str, float | None]]) -> str:
+    """How often contact was lost in the scan, and what was done about it."""
+    told = ", ".join(
+        f"not regained within {loss['searched_mm']:.1f} mm"
+        if loss["regained_after_ms"] is None
+        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
+        for loss in losses
+    )
+    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -140,22 +140,20 @@ def samples_between_estimates(scene: Scene) -> int:
     return max(1, round(scene.shape.every_ms * 1e-3 * scene.sensor.rate_hz))
 
 
-def make_shape_tracker(scene: Scene, gap_s: float = math.inf) -> ShapeTracker | None:
+def make_shape_tracker(scene: Scene) -> ShapeTracker | None:
     """The estimator of a scene that asks for a shape, None of one that does not."""
     if scene.shape is None or scene.task.kind != "scan":
         return None
-    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene), gap_s)
+    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene))
 
 
-def estimates_of(
-    scene: Scene, tracker: ShapeTracker, methods: Iterable[str], gap_s: float = math.inf
-) -> dict[str, list[ShapeRecord]]:
+def estimates_of(scene: Scene, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
     """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
     assert scene.shape is not None and scene.sensor is not None
     every = max(1, round(0.1 * scene.sensor.rate_hz))
     return {
         method: tracker.records
         if method == scene.shape.method
-        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every, gap_s)
+        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every)
         for method in dict.fromkeys(methods)
     }
