@@ -453,12 +453,12 @@ def test_contact_lost_in_a_scan_that_must_not_search():
 
 def test_a_saturated_array_makes_the_probe_retreat():
     class Saturated(Injected):
-        saturated_ns = None
+        saturated_ns = None  # since when without a break
 
         def command(self, measurement, command):
-            patch = self.task.sensing.patch
-            if self.saturated_ns is None and patch is not None and patch.saturated:
-                self.saturated_ns = self.now()
+            if measurement.tactile is not None and self.answered_ns is None:
+                first = self.saturated_ns or self.now()
+                self.saturated_ns = first if self.task.sensing.patch.saturated else None
             return command
 
     stiff = {"stiffness_n_m3": 1.4e10}  # 0.1 MN/m: a few taxels carry all of it
