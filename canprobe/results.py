@@ -20,6 +20,7 @@ from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
+from canprobe.tool_file import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
 from canprobe.traffic_log import LOG, measure_traffic
@@ -128,6 +129,8 @@ def summarise(
         "shape": summarise_shape(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
+        "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
+        "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
         "bus_load": {
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
@@ -312,7 +315,10 @@ def write_files(result: RunResult, out: Path) -> None:
     )
     (out / "scene.toml").write_text(dump_scene(result.plan.scene), encoding="utf-8")
     np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)
-    (out / "surface.npz").unlink(missing_ok=True)  # of an earlier run
+    for name in ("surface.npz", FILE):
+        (out / name).unlink(missing_ok=True)  # of an earlier run
+    if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
+        (out / FILE).write_text(text, encoding="utf-8")
     if result.surface_map is not None:
         save_surface_map(result.surface_map, out / "surface.npz")
 
@@ -333,6 +339,7 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         f"  cycle      {rate}, {cycle['overruns']} overruns,"
         f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
     ]
+    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
     if contact["force_rms_error_n"] is not None:
         target = contact["force_target_n"]
         lines.append(
@@ -348,6 +355,8 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         lines.append(f"  {_losses(contact['losses'])}")
     if shape["method"] is not None:
         lines += shape_lines(shape)
+    if summary.get("calibration") is not None:
+        lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
     if out is not None:
         lines.append(f"  files      {out}")

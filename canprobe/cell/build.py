@@ -124,6 +124,8 @@ def make_task(plan: Plan) -> Controller:
         assert plan.scene.sensor is not None
         calibration = array_calibration(plan.scene.sensor.full_scale_kpa * 1e3)
         return ListenTask(calibration, task.duration_s, period_s, limits_of(plan))
-    from canprobe.cell.tasks.build import make_touch_task
+    from canprobe.cell.tasks.build import make_calibrate_task, make_touch_task
 
+    if task.kind == "calibrate":
+        return make_calibrate_task(plan, period_s)
     return make_touch_task(plan, period_s)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
+from canprobe.planning.ball_reach import joints_on_ball
 from canprobe.planning.model import JointSpeeds
 from canprobe.planning.surface_path import SAMPLES, SurfacePath, surface_path
 from canprobe.robot.inverse import inverse_near
@@ -35,6 +36,8 @@ def check_motion(scene: Scene, samples: int = SAMPLES) -> tuple[JointSpeeds | No
     problems = _start_problems(model, scene, scene.arm)
     if scene.task.kind == "free":
         return _check_swing(model, scene, scene.arm, problems)
+    if scene.task.kind == "calibrate":
+        return _check_ball(model, scene, scene.arm, problems)
     path, found = surface_path(scene, samples)
     problems += found
     if path is None or scene.probe is None:
@@ -150,6 +153,17 @@ def speed_problems(scene: Scene, speeds: JointSpeeds) -> list[str]:
         for i, (need, limit) in enumerate(zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True))
         if need > limit
     ]
+
+
+def _check_ball(
+    model: PumaModel, scene: Scene, arm: ArmSettings, problems: list[str]
+) -> tuple[JointSpeeds | None, list[str]]:
+    assert scene.probe is not None
+    joints, found = joints_on_ball(model, scene, arm, scene.probe)
+    problems += found
+    if joints is None:
+        return None, problems
+    return _joint_speeds(model, scene, np.zeros(6)), problems + _stop_problems(model, scene, joints)
 
 
 def _check_swing(
