@@ -17,10 +17,10 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
+from canprobe.scene_tool import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
-from canprobe.tool_file import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
 from canprobe.traffic_log import LOG, measure_traffic

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     scene = with_realtime(load_scene(args.scene), args.realtime)
     if args.tool is not None:
-        from canprobe.tool_file import with_tool
+        from canprobe.scene_tool import with_tool
 
         scene = with_tool(scene, args.tool)
     target = target_of(args, scene)

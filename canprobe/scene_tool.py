@@ -61,7 +61,8 @@ def _true_tool(scene: Scene, believed: Array) -> Array | None:
     """Where the emulated probe's centre is (3,), mm; None of a real arm."""
     if scene.arm is None or not scene.arm.emulated:
         return None
-    return believed + np.array((scene.plant or PlantSettings()).tool_error_mm)
+    true: Array = believed + np.array((scene.plant or PlantSettings()).tool_error_mm)
+    return true
 
 
 def calibration_lines(found: Mapping[str, Any]) -> list[str]:
@@ -70,10 +71,8 @@ def calibration_lines(found: Mapping[str, Any]) -> list[str]:
     true, errors = found["true_mm"] or [None] * 3, found["error_mm"] or [None] * 3
     columns = zip("xyz", found["tool_centre_mm"], found["sigma_mm"], found["believed_mm"], true, errors, strict=True)
     for axis, value, sigma, believed, truth, error in columns:
-        if value is None:
-            line = f"not observed (1σ {_number(sigma, '.2f')} mm)"
-        else:
-            line = f"{value:8.3f} ± {sigma:.3f} mm"
+        unknown = f"not observed (1σ {_number(sigma, '.2f')} mm)"
+        line = unknown if value is None else f"{value:8.3f} ± {sigma:.3f} mm"
         line += f", believed {believed:.3f}"
         if truth is not None:
             line += f", true {truth:.3f}" + (f", error {error:+.3f}" if error is not None else "")
@@ -92,8 +91,8 @@ def tool_text(found: Mapping[str, Any], name: str) -> str | None:
     x, y, z = found["tool_centre_mm"]
     sigma = ", ".join(f"{value:.3f}" for value in found["sigma_mm"])
     return (
-        f"# The probe's centre on the flange, by {found['touches']} touches of a ball (scene {name}); standard deviation\n"
-        f"# of x, y, z: {sigma} mm. For a scene's own [probe], or: canprobe run SCENE --tool THIS_FILE\n\n"
+        f"# The probe's centre on the flange, by {found['touches']} touches of a ball (scene {name}); standard\n"
+        f"# deviation of x, y, z: {sigma} mm. For a scene's own [probe], or: canprobe run SCENE --tool THIS_FILE\n\n"
         f"[probe]\ncentre_offset_mm = {z:.4f}\ncentre_lateral_mm = [{x:.4f}, {y:.4f}]\n"
     )
 
