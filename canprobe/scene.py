@@ -162,7 +162,7 @@ class TaskSettings:
     strategy: Annotated[Strategy, SCANNING] = "weave"
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
     heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane
-    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 3.0  # towards the object where contact is lost; 0: give up
+    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0  # towards the object where contact is lost; 0: give up
     turn_max_deg: Annotated[float, Range(0, 180), SCANNING] = (
         90.0  # that the plan may turn it where joints are too slow
     )

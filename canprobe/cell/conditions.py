@@ -258,7 +258,7 @@ CONDITIONS: tuple[Condition, ...] = (
         Reaction.SEARCH,
         _lost,
         "goes on from where the object is found",
-        "no further along the path; towards the object at 2 mm/s, for `task.regain_mm` (3); counted",
+        "no further along the path; towards the object at 2 mm/s, for `task.regain_mm` (2); counted",
         check=checks.contact_to_regain,
         touch=True,
     ),

@@ -71,7 +71,7 @@ def _draw_tool(axes: Axes, result: RunResult) -> None:
             continue
         moved = value - found["believed_mm"][row]
         axes.errorbar(moved, row, xerr=TWO_SIGMA * sigma, fmt="o", color=ACCENT, capsize=4, label="found, 95 %")
-        axes.annotate(f"{value:.3f} mm", (moved, row), (0, 9), textcoords="offset points", ha="center", color=INK)
+        axes.annotate(f"{value:.3f} mm", (moved, row), (0, 14), textcoords="offset points", ha="center", color=INK)
     if found["true_mm"] is not None:
         true = np.subtract(found["true_mm"], found["believed_mm"])
         axes.plot(true, rows, "|", color=TRUE, markersize=26, markeredgewidth=2.0, label="truth")
