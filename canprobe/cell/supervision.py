@@ -117,7 +117,7 @@ class Seen:
     log_failure: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)  # not frozen: one is made in every cycle, and freezing triples its cost
 class Contact:
     """A touch as its checks see it.
 

@@ -110,7 +110,7 @@ def scene_of(case: Case) -> Scene:
     stiffness = layer_stiffness(case)
     task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm)
     if case.speed_mm_s > 0.0:
-        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight", turn_max_deg=0.0)
+        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight", turn_max_deg=0.0, regain_mm=0.0)
     return replace(
         scene,
         bus=replace(scene.bus, timed=False),

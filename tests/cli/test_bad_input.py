@@ -57,6 +57,13 @@ def edited(folder, name, *changes):
     return path.name
 
 
+def test_a_tool_file_that_is_none(tmp_path):
+    (tmp_path / "tool.toml").write_text("[probe]\nmass_kg = 1\n")
+    (line,) = lines_of(tmp_path, 2, "run", "cylinder", "--tool", "tool.toml")
+    assert "tool.toml: expected the section [probe] with centre_offset_mm and centre_lateral_mm" in line
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize("command", ["run", "plan", "up", "emulate"])
 def test_unknown_scene(command, tmp_path):
     (line,) = lines_of(tmp_path, 2, command, "cylindre")

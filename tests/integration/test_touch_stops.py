@@ -122,6 +122,7 @@ def test_joint_at_its_stop():
             motion = controller._motion
             motion._high = motion.q + 1e-6  # the stops close in on the posture
             motion._low = motion.q - 1e-6
+            motion._range = list(zip(motion._low.tolist(), motion._high.tolist(), strict=True))
         return command
 
     step.retreat = controller.retreat

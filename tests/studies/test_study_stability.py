@@ -125,7 +125,7 @@ class InLine:
 ENDINGS = [
     ("stable", ""),
     ("stopped", "above the limit"),
-    ("stopped", "the array is saturated in 100 % of the samples"),
+    ("stopped", "the array is saturated and no stiffness was felt"),
     ("stopped", "no tactile frame"),
     ("refused", "worst-case load"),
     ("refused", "out of reach"),
