@@ -9,9 +9,11 @@ Source: CiA 305, "LSS slave", "LSS services".
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 from canprobe.emulator.aborts import SdoAbort
 from canprobe.emulator.core import NodeCore, Route
+from canprobe.emulator.entries import key_of
 from canprobe.emulator.store import Store
 from canprobe.protocol.lss import (
     BIT_RATES,
@@ -28,6 +30,9 @@ from canprobe.protocol.lss import (
     pack_number,
 )
 
+if TYPE_CHECKING:
+    from canprobe.emulator.node import SlaveNode
+
 Answer = bytes | None
 _MASK = 0xFFFFFFFF
 _SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
@@ -42,15 +47,16 @@ class LssSlave:
         core: of the node; its `node_id` is the active one.
         store: keeps the id that "store configuration" stores.
         reset: called with the time when a node that had no id is to boot with its new one.
-        bitrate: of the bus, bit/s.
+        bitrate: see below.
 
     Attributes:
         pending: node id from the next reset communication on, or `UNCONFIGURED`.
         state: waiting or configuration.
+        bitrate: of the bus, bit/s.
     """
 
     def __init__(self, core: NodeCore, store: Store, reset: Callable[[int], None], bitrate: int = 1_000_000) -> None:
-        self._core, self._store, self._reset, self._bitrate = core, store, reset, bitrate
+        self._core, self._store, self._reset, self.bitrate = core, store, reset, bitrate
         self.pending = core.node_id
         self.state = LssState.WAITING
         self._heard: list[tuple[int, int]] = []  # command and number, of the sequence under way
@@ -186,7 +192,7 @@ class LssSlave:
         return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE if fits else LssError.REFUSED)
 
     def _configure_bit_timing(self, data: bytes) -> Answer:
-        same = data[1] == 0 and BIT_RATES.get(data[2]) == self._bitrate
+        same = data[1] == 0 and BIT_RATES.get(data[2]) == self.bitrate
         return _verdict(LssCommand.CONFIGURE_BIT_TIMING, LssError.NONE if same else LssError.REFUSED)
 
     def _store_configuration(self, _: bytes) -> Answer:
@@ -203,6 +209,12 @@ class LssSlave:
         """The active id; in initialisation the pending one, which is about to be."""
         node_id = self.pending if self.unconfigured else self._core.node_id
         return pack_lss(LssCommand.INQUIRE_NODE_ID, bytes((node_id,)))
+
+
+def set_serial_number(node: SlaveNode, serial: int) -> None:
+    """Tell two devices of one EDS apart; a device without 1018h:04 has none."""
+    if key_of(0x1018, 4) in node.dictionary:
+        node.dictionary.set_default(0x1018, 4, serial)
 
 
 def _number(data: bytes) -> int:
