@@ -16,6 +16,7 @@ from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.link_report import check_links
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
@@ -285,6 +286,7 @@ def up(
         scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
     )
     plan = make_plan(resolved)
+    check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
         Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,

@@ -56,6 +56,7 @@ COMPOSITION = {
     "tables",
     "traffic_log",
     "emulation",
+    "link_report",
 }
 
 # module → packages of its extra; it is imported only where the extra is asked for
