@@ -16,6 +16,7 @@ from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.joint_report import check_joints
 from canprobe.link_report import check_links
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
@@ -35,6 +36,7 @@ __all__ = [
     "Measurement",
     "Observation",
     "RunResult",
+    "check_joints",
     "commission",
     "emulate",
     "emulate_eds",
