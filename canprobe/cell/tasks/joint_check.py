@@ -108,6 +108,7 @@ class JointCheck:
         self._angle = math.radians(angle_deg)
         self._move_s = _PEAK * angle_deg / speed_deg_s
         self.findings: list[JointFinding] = []
+        self._quits = False
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
 
@@ -132,20 +133,21 @@ class JointCheck:
             )
         for joint in range(len(start)):
             finding = yield from self._joint(joint, start)
-            if finding is None:
+            if finding is not None:
+                self.findings.append(finding)
+            if self._quits:
                 return
-            self.findings.append(finding)
 
     def _joint(self, joint: int, start: Vector) -> Generator[Command, Measurement, JointFinding | None]:
-        """Ask, move, look, ask, move back; None where the operator has enough."""
+        """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
         degrees = math.degrees(start[joint])
         way = self._way(joint, start)
         if way is None:
             return JointFinding(joint, degrees, skipped="either way it would leave its limits or the workspace")
         told = math.degrees(way[joint])
         question = f"joint {joint + 1} at {degrees:.2f} deg: turn it by {told:+.2f} deg?"
-        if (answer := (yield from self._asked(question, start))) is not Answer.YES:
-            return None if answer is Answer.QUIT else JointFinding(joint, degrees, skipped="as the operator wished")
+        if (yield from self._asked(question, start)) is not Answer.YES:
+            return None if self._quits else JointFinding(joint, degrees, skipped="as the operator wished")
         before = yield from self._hold(start)
         measured = yield from self._move(start, start + way)
         assert before.q is not None and measured.q is not None
@@ -154,7 +156,7 @@ class JointCheck:
         seen = f"did joint {joint + 1} turn by about {told:+.1f} deg, positive by the right hand round its axis?"
         answer = yield from self._asked(seen, start + way)
         yield from self._move(start + way, start)
-        if answer is not Answer.YES and fault is None:
+        if answer is Answer.NO and fault is None:
             fault = "the operator did not see it turn that way: polarity, gear or another joint's drive"
         turned = math.degrees(float(moved[joint] / self._model.counts[joint, joint]))
         return JointFinding(joint, degrees, told, turned, fault)
@@ -202,6 +204,7 @@ class JointCheck:
         self._operator.ask(question)
         while (answer := self._operator.answer()) is None:
             yield Command(q_target=q)
+        self._quits = answer is Answer.QUIT
         return answer
 
     def _hold(self, q: Vector) -> Script:
