@@ -340,7 +340,7 @@ def commission(
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
     from canprobe.cell.commission import commission, wanted_by
-    from canprobe.cell.lss import Wanted
+    from canprobe.cell.lss_choice import Wanted
 
     hush_canopen()
     wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]

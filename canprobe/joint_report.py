@@ -13,7 +13,7 @@ from canprobe.scene import Scene
 from canprobe.session import Say, Session, quiet, resolve_scene
 
 if TYPE_CHECKING:
-    from canprobe.cell.tasks.joint_check import JointFinding, Operator
+    from canprobe.cell.tasks.joint_findings import JointFinding, Operator
 
 ROWS_KEPT = 4000
 

@@ -8,7 +8,8 @@ from typing import Any
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port
-from canprobe.cell.lss import Assignment, Wanted, assign, choose_assignments, find_unconfigured
+from canprobe.cell.lss import assign, find_unconfigured
+from canprobe.cell.lss_choice import Assignment, Wanted, choose_assignments
 from canprobe.cell.scan import NUMBERS, scan_nodes
 from canprobe.errors import BusError
 from canprobe.planning import Plan

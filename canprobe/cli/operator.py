@@ -6,7 +6,7 @@ import os
 import select
 import sys
 
-from canprobe.cell.tasks.joint_check import Answer
+from canprobe.cell.tasks.joint_findings import Answer
 from canprobe.cli.output import say
 
 _CHOICES = "Enter or y: yes, n: no, q: end"

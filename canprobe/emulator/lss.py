@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING
 from canprobe.emulator.aborts import SdoAbort
 from canprobe.emulator.core import NodeCore, Route
 from canprobe.emulator.entries import key_of
+from canprobe.emulator.lss_search import IDENTIFY, SELECT, LssSearch, Match
 from canprobe.emulator.store import Store
 from canprobe.protocol.lss import (
     BIT_RATES,
     LSS_ANSWER_ID,
     LSS_LENGTH,
     LSS_REQUEST_ID,
-    NOTHING_ASKED,
     UNCONFIGURED,
     LssAddress,
     LssCommand,
@@ -34,9 +34,6 @@ if TYPE_CHECKING:
     from canprobe.emulator.node import SlaveNode
 
 Answer = bytes | None
-_MASK = 0xFFFFFFFF
-_SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
-_IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
 _INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
@@ -59,15 +56,14 @@ class LssSlave:
         self._core, self._store, self._reset, self.bitrate = core, store, reset, bitrate
         self.pending = core.node_id
         self.state = LssState.WAITING
-        self._heard: list[tuple[int, int]] = []  # command and number, of the sequence under way
-        self._position = 0
+        self._search = LssSearch()
         self._in_both_states: dict[int, Callable[[bytes], Answer]] = {
             LssCommand.IDENTIFY_UNCONFIGURED: self._identify_unconfigured,
-            **dict.fromkeys(_IDENTIFY, self._identify),
+            **dict.fromkeys(IDENTIFY, self._identify),
         }
         self._in_waiting: dict[int, Callable[[bytes], Answer]] = {
             LssCommand.FASTSCAN: self._fastscan,
-            **dict.fromkeys(_SELECT, self._select),
+            **dict.fromkeys(SELECT, self._select),
         }
         self._in_configuration: dict[int, Callable[[bytes], Answer]] = {
             LssCommand.CONFIGURE_NODE_ID: self._configure_node_id,
@@ -125,65 +121,34 @@ class LssSlave:
 
     def _enter(self, state: LssState) -> None:
         self.state = state
-        self._heard.clear()
-        self._position = 0
+        self._search.forget()
 
-    # ------------------------------------------------------------------ waiting
+    # ------------------------------------------------------------------ being found
+
+    @property
+    def _is_blank(self) -> bool:
+        """It has no id and was not given one yet: the searches are for such nodes alone."""
+        return self.unconfigured and self.pending == UNCONFIGURED
 
     def _select(self, data: bytes) -> Answer:
-        """Switch state selective: the four numbers one after another, the last one decides."""
-        if tuple(self._complete(data, _SELECT)) != self.address.numbers:
+        if not self._search.selects(data, self.address):
             return None
         self._enter(LssState.CONFIGURATION)
         return pack_lss(LssCommand.SELECTED)
 
     def _identify(self, data: bytes) -> Answer:
-        """Identify remote slave: vendor and product, revision and serial number each from a lowest to a highest."""
-        numbers = self._complete(data, _IDENTIFY)
-        if not numbers:
-            return None
-        vendor, product, *bounds = numbers
-        mine = self.address
-        fits = (
-            (vendor, product) == (mine.vendor_id, mine.product_code)
-            and bounds[0] <= mine.revision_number <= bounds[1]
-            and bounds[2] <= mine.serial_number <= bounds[3]
-        )
-        return pack_lss(LssCommand.IDENTIFIED) if fits else None
-
-    def _complete(self, data: bytes, sequence: range) -> list[int]:
-        """Take one number of a sequence; all of them where it is the last one and none was left out, else nothing."""
-        if data[0] != sequence[0] and (not self._heard or self._heard[-1][0] != data[0] - 1):
-            self._heard.clear()
-            return []
-        if data[0] == sequence[0]:
-            self._heard.clear()
-        self._heard.append((data[0], _number(data)))
-        return [number for _, number in self._heard] if data[0] == sequence[-1] else []
+        return pack_lss(LssCommand.IDENTIFIED) if self._search.identifies(data, self.address) else None
 
     def _identify_unconfigured(self, _: bytes) -> Answer:
-        return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._searched else None
-
-    @property
-    def _searched(self) -> bool:
-        return self.unconfigured and self.pending == UNCONFIGURED
+        return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._is_blank else None
 
     def _fastscan(self, data: bytes) -> Answer:
-        bit, position, following = data[5:]
-        if not self._searched or not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
-            return None
-        if bit == NOTHING_ASKED:
-            self._position = 0
-            return pack_lss(LssCommand.IDENTIFIED)
-        asked = _MASK << bit & _MASK
-        if position != self._position or (_number(data) ^ self.address.numbers[position]) & asked:
-            return None
-        self._position = following
-        if bit == 0 and following < position:
+        match = self._search.fastscan(data, self.address) if self._is_blank else Match.NO
+        if match is Match.FOUND:
             self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.IDENTIFIED)
+        return pack_lss(LssCommand.IDENTIFIED) if match is not Match.NO else None
 
-    # ------------------------------------------------------------------ configuration
+    # ------------------------------------------------------------------ being configured
 
     def _configure_node_id(self, data: bytes) -> Answer:
         fits = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
@@ -215,10 +180,6 @@ def set_serial_number(node: SlaveNode, serial: int) -> None:
     """Tell two devices of one EDS apart; a device without 1018h:04 has none."""
     if key_of(0x1018, 4) in node.dictionary:
         node.dictionary.set_default(0x1018, 4, serial)
-
-
-def _number(data: bytes) -> int:
-    return int.from_bytes(data[1:5], "little")
 
 
 def _verdict(command: LssCommand, error: LssError) -> bytes:

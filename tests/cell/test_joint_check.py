@@ -12,7 +12,8 @@ import pytest
 import canprobe
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Measurement
-from canprobe.cell.tasks.joint_check import Answer, JointCheck
+from canprobe.cell.tasks.joint_check import JointCheck
+from canprobe.cell.tasks.joint_findings import Answer
 from canprobe.cli.operator import TerminalOperator
 from canprobe.planning import make_plan
 from canprobe.robot.puma260 import UPENN, counts_to_joints, joints_to_counts

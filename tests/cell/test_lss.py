@@ -14,7 +14,8 @@ from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.timed import TimedBus
 from canprobe.cell.commission import commission
-from canprobe.cell.lss import Assignment, Wanted, assign, choose_assignments, find_unconfigured
+from canprobe.cell.lss import assign, find_unconfigured
+from canprobe.cell.lss_choice import Assignment, Wanted, choose_assignments
 from canprobe.eds import load_eds
 from canprobe.emulator.lss import set_serial_number
 from canprobe.emulator.node import SlaveNode

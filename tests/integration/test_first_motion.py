@@ -11,7 +11,7 @@ import pytest
 import canprobe
 import canprobe.api
 from canprobe import joint_report
-from canprobe.cell.tasks.joint_check import Answer
+from canprobe.cell.tasks.joint_findings import Answer
 from canprobe.cli import main
 from canprobe.emulator.entries import key_of
 from canprobe.errors import NodeError, SafetyStop, UsageError

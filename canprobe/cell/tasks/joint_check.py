@@ -9,9 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from dataclasses import dataclass
-from enum import Enum
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +16,7 @@ from numpy.typing import NDArray
 from canprobe.cell.joint_guard import outside_workspace
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.supervision import Limits
+from canprobe.cell.tasks.joint_findings import Answer, JointFinding, Operator, find_fault
 from canprobe.cell.tasks.probe_motion import smooth_step
 from canprobe.robot.puma260 import PumaModel, joints_to_counts
 
@@ -26,55 +24,7 @@ Vector = NDArray[np.float64]
 Script = Generator[Command, Measurement, Measurement]
 ANGLE_DEG, SPEED_DEG_S = 1.0, 2.0
 SETTLE_S = 0.25
-TOLERANCE, TOLERANCE_COUNTS = 0.05, 4
-"""How far an encoder's way may be from what was asked: this share, but at least so many counts."""
 _PEAK = 15 / 8  # of the quintic's speed over its mean
-
-
-class Answer(Enum):
-    """What an operator says."""
-
-    YES = "yes"
-    NO = "no"
-    QUIT = "quit"
-
-
-class Operator(Protocol):
-    """Somebody who looks at the arm. The cell goes on meanwhile: `answer` never waits."""
-
-    def ask(self, question: str) -> None:
-        """Put a question."""
-
-    def answer(self) -> Answer | None:
-        """The answer to it, None as long as there is none."""
-
-
-@dataclass(frozen=True, slots=True)
-class JointFinding:
-    """What became of one joint.
-
-    Attributes:
-        joint: 0 to 5.
-        start_deg: where it stood.
-        asked_deg: how far it was told to turn; 0 where it was not moved.
-        moved_deg: how far it turned, by its own motor's encoder.
-        fault: what is wrong; None where nothing is.
-        skipped: why it was not moved; None where it was.
-    """
-
-    joint: int
-    start_deg: float
-    asked_deg: float = 0.0
-    moved_deg: float = 0.0
-    fault: str | None = None
-    skipped: str | None = None
-
-    def __str__(self) -> str:
-        where = f"joint {self.joint + 1} at {self.start_deg:.2f} deg: "
-        if self.skipped is not None:
-            return where + f"not moved, {self.skipped}"
-        way = f"told {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
-        return where + way + (f": {self.fault}" if self.fault is not None else ", as it must")
 
 
 class JointCheck:
@@ -152,7 +102,7 @@ class JointCheck:
         measured = yield from self._move(start, start + way)
         assert before.q is not None and measured.q is not None
         moved = joints_to_counts(self._model, measured.q - before.q)
-        fault = self._fault(joint, joints_to_counts(self._model, way), moved)
+        fault = find_fault(joint, joints_to_counts(self._model, way), moved)
         seen = f"did joint {joint + 1} turn by about {told:+.1f} deg, positive by the right hand round its axis?"
         answer = yield from self._asked(seen, start + way)
         yield from self._move(start + way, start)
@@ -176,25 +126,6 @@ class JointCheck:
         if limits.workspace is None or limits.tip_of is None:
             return False
         return outside_workspace(limits.tip_of(q), limits.workspace) is not None
-
-    def _fault(self, joint: int, asked: Vector, moved: Vector) -> str | None:
-        """What is wrong with the motors' ways (6,), counts: the joint's own, then those of the others."""
-        tolerance = np.maximum(TOLERANCE * np.abs(asked), TOLERANCE_COUNTS)
-        wrong = np.abs(moved - asked) > tolerance
-        if wrong[joint]:
-            share = float(moved[joint] / asked[joint])
-            if abs(moved[joint]) <= TOLERANCE_COUNTS:
-                return "it did not turn"
-            if share < 0:
-                return "it turned the wrong way"
-            return f"it turned {share:.2f} times as far: gear or encoder resolution"
-        if wrong.any():
-            other = int(np.argmax(wrong))
-            return (
-                f"the motor of joint {other + 1} turned by {moved[other]:.0f} counts,"
-                f" {asked[other]:.0f} are due to joint {joint + 1}"
-            )
-        return None
 
     # ------------------------------------------------------------------ parts of the script
 
