@@ -157,8 +157,8 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     if args.bus_yml is not None:
         from canprobe.bridge.bus_yml import read_bus_yml
 
-        if args.node_id:
-            raise UsageError("emulate: --node-id belongs to --eds; a bus.yml has its own")
+        if args.node_id or args.serial:
+            raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
         return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml).nodes]
     if len(args.eds) != len(args.node_id):
         raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
