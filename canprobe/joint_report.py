@@ -13,7 +13,8 @@ from canprobe.scene import Scene
 from canprobe.session import Say, Session, quiet, resolve_scene
 
 if TYPE_CHECKING:
-    from canprobe.cell.tasks.joint_findings import JointFinding, Operator
+    from canprobe.cell.tasks.joint_findings import JointFinding, Operator, Vector
+    from canprobe.robot.puma260 import PumaModel
 
 ROWS_KEPT = 4000
 
@@ -61,8 +62,8 @@ def check_joints(
     finally:
         for finding in check.findings:
             say(str(finding))
-        if check.findings:
-            say(_zero_pose(scene, check.findings))
+        if check.start is not None:
+            say(_zero_pose(MODELS[scene.arm.model], check.start))
     wrong = [finding for finding in check.findings if finding.fault is not None]
     if wrong:
         ids = scene.arm.node_ids
@@ -71,15 +72,13 @@ def check_joints(
     return check.findings
 
 
-def _zero_pose(scene: Scene, findings: list[JointFinding]) -> str:
-    """Where the arm would have to be, for a look at its marks."""
+def _zero_pose(model: PumaModel, start: Vector) -> str:
+    """Where the arm has to be if its zeros are right, for a look at its marks."""
     from canprobe.robot.kinematics import forward
-    from canprobe.robot.puma260 import MODELS
 
-    assert scene.arm is not None
-    angles = [finding.start_deg for finding in findings]
-    text = "by its encoders the arm stands at " + ", ".join(f"{angle:.2f}" for angle in angles) + " deg"
-    if len(angles) == len(scene.arm.node_ids):
-        x, y, z = forward(MODELS[scene.arm.model], np.radians(angles))[:3, 3] * 1e3
-        text += f", its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm"
-    return text + ": compare that with its marks; where it differs, a zero is wrong"
+    angles = ", ".join(f"{angle:.2f}" for angle in np.degrees(start))
+    x, y, z = forward(model, start)[:3, 3] * 1e3
+    return (
+        f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
+        " that with its marks; where it differs, a zero is wrong"
+    )

@@ -127,10 +127,11 @@ def test_a_flipped_polarity_that_no_encoder_shows_is_seen_by_the_operator(cell):
 
 
 def test_an_arm_that_says_that_it_is_outside_its_limits_is_not_moved(cell):
-    cell.joins = on_node(5, flip)
+    cell.joins, said = on_node(5, flip), []
     with pytest.raises(SafetyStop, match=r"joint 5 stands at -100\.0 deg, outside -29\.0 to 199\.0 deg"):
-        canprobe.api.check_joints(scene())
+        canprobe.api.check_joints(scene(), say=said.append)
     assert "q_target_rad" not in cell.session.cell.log.arrays()
+    assert said[-1].startswith(f"{REPORTED} 90.00, 65.00, 15.00, 0.00, -100.00, ")
     assert_disabled(cell.session)
 
 

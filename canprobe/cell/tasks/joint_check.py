@@ -40,6 +40,7 @@ class JointCheck:
 
     Attributes:
         findings: one for each joint that its turn has come to.
+        start: joint angles (6,), rad, before any motion; None as long as they are not known.
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class JointCheck:
         self._angle = math.radians(angle_deg)
         self._move_s = _PEAK * angle_deg / speed_deg_s
         self.findings: list[JointFinding] = []
+        self.start: Vector | None = None
         self._quits = False
         self._script: Generator[Command, Measurement, None] = self._all_joints()
         next(self._script)
@@ -72,7 +74,7 @@ class JointCheck:
     def _all_joints(self) -> Generator[Command, Measurement, None]:
         measurement = yield Command()
         assert measurement.q is not None
-        start = measurement.q
+        start = self.start = measurement.q
         outside = np.flatnonzero((start < self._low) | (start > self._high))
         if outside.size:
             joint = int(outside[0])
