@@ -29,6 +29,8 @@ Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Row4 = tuple[float, float, float, float]
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
+SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
+SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
 NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 
 TOUCHING = Only("kind", ("scan", "press", "calibrate"))
@@ -85,6 +87,7 @@ class ArmSettings:
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
     grouped_rpdo: bool | Auto = False  # two targets in one RPDO through dummy mapping
+    serial_numbers: Annotated[SerialNumbers | None, Distinct()] = None  # 1018h:04 of each drive; None: any
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +101,7 @@ class SensorSettings:
     mode: TactileModeName = "window"
     rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
+    serial_number: SerialNumber | None = None  # 1018h:04; None: any
 
 
 @dataclass(frozen=True, slots=True)

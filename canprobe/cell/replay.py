@@ -109,7 +109,10 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
         if patch is None or measurement.tactile is None or patch.force <= TOUCH_FORCE:
             continue
         contact = sensing.contact(measurement.tactile, patch)
-        estimate = tracker.add(contact) if contact is not None else None
+        if contact is None:
+            continue
+        tracker.add(contact)
+        estimate = tracker.answer()
         if estimate is not None and bool(np.all(estimate.observed)):
             sensing.set_kappa(np.asarray(estimate.kappa))
     return tracker, sensing.dropped

@@ -214,13 +214,22 @@ def _nodes(scene: Scene, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
             kind=kind,
             role=role,
             eds=devices[node_id].eds,
-            identity=devices[node_id].identity,
+            identity=replace(devices[node_id].identity, serial_number=_serial_number(scene, node_id)),
             emulated=emulated,
             channel=channel_of[node_id],
             switched_off=_switched_off(node_id, devices[node_id], pdos),
         )
         for node_id, kind, role, emulated in sorted(roles)
     )
+
+
+def _serial_number(scene: Scene, node_id: int) -> int | None:
+    """What the scene wants 1018h:04 of a node to be."""
+    if scene.sensor is not None and node_id == scene.sensor.node_id:
+        return scene.sensor.serial_number
+    if scene.arm is None or scene.arm.serial_numbers is None:
+        return None
+    return scene.arm.serial_numbers[scene.arm.node_ids.index(node_id)]
 
 
 def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:

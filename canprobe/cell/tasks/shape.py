@@ -38,6 +38,9 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
+    A contact is taken and an answer worked out by calls of their own: together they take longer than either, and the
+    loop has a cycle between two images for the answer.
+
     Args:
         estimator: the online estimator.
         every: samples between two answers.
@@ -59,9 +62,10 @@ class ShapeTracker:
         self._every = max(1, every)
         self._gap_s = gap_s
         self._last: ContactSample | None = None
+        self._due = False
 
-    def add(self, sample: ContactSample) -> SurfaceEstimate | None:
-        """Take one contact; the new estimate where one was due and can be given."""
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
         if self._last is not None:
             if sample.t_s - self._last.t_s > self._gap_s:
                 self._estimator.reset()
@@ -70,15 +74,20 @@ class ShapeTracker:
         self._last = sample
         self.samples.append(sample)
         self._estimator.add(sample)
-        if len(self.samples) % self._every:
+        self._due = len(self.samples) % self._every == 0
+
+    def answer(self) -> SurfaceEstimate | None:
+        """The estimate at the last contact, once, where one is due and can be given."""
+        if not self._due or self._last is None:
             return None
+        self._due = False
         estimate = self._estimator.estimate()
         if estimate is not None and has_diverged(estimate):
             self.restarts += 1
             self._estimator.reset()
             return None
         if estimate is not None:
-            self.records.append(ShapeRecord(sample.t_s, self.travelled_m, estimate))
+            self.records.append(ShapeRecord(self._last.t_s, self.travelled_m, estimate))
         return estimate
 
 
@@ -94,4 +103,5 @@ def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every
     tracker = ShapeTracker(estimator, every)
     for sample in samples:
         tracker.add(sample)
+        tracker.answer()
     return tracker.records

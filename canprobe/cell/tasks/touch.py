@@ -195,8 +195,8 @@ class TouchTask:
             self._motion = self._motion_from(measurement.q)
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
-        self._estimate = None
         self._pass_time(measurement.t_ns)
+        self._take_answer()
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
@@ -247,7 +247,7 @@ class TouchTask:
                 if self._t > AT_REST * self._s.settle_s:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
-                self._take_shape(contact)
+                self.shape.add(contact)
         self._columns = self._columns_of(measurement, patch, contact) | {"depth_at_1n_mm": depth_at_1n_mm}
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
@@ -265,10 +265,11 @@ class TouchTask:
             self._servo.surface.raise_by(rise)
             self._depth0 += rise
 
-    def _take_shape(self, contact: ContactSample) -> None:
-        assert self.shape is not None and self._servo is not None
-        estimate = self._estimate = self.shape.add(contact)
-        if estimate is None:
+    def _take_answer(self) -> None:
+        """What the estimator says about the contact of the cycle before."""
+        estimate = self._estimate = self.shape.answer() if self.shape is not None else None
+        contact = self._contact
+        if estimate is None or contact is None or self._servo is None:
             return
         self._shape_columns = {
             "kappa_per_m": np.where(estimate.observed, estimate.kappa, np.nan),
@@ -276,6 +277,7 @@ class TouchTask:
             "K_per_m": estimate.K,
             "K_covariance_per_m2": estimate.covariance,
         }
+        self._columns = self._columns | self._shape_columns
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             before = self.sensing.depth(contact.force_n)
@@ -283,7 +285,7 @@ class TouchTask:
             self.sensing.set_kappa(np.asarray(estimate.kappa), sigma)
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
-            if is_too_hollow(estimate, self.sensing.radius):
+            if self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
                 hollow = -1e3 / float(estimate.kappa[1])
                 self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
 
