@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.cell import Cell
 from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, score_shape
+from canprobe.cell.tasks.regain import losses_text, summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
 from canprobe.planning import Plan
@@ -174,14 +175,9 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
-    losses = [
-        {
-            "searched_mm": 1e3 * loss.searched,
-            "regained_after_ms": None if loss.regained_s is None else 1e3 * loss.regained_s,
-        }
-        for loss in getattr(controller, "losses", ())
-    ]
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, "losses": losses}
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
+        "losses": summarise_losses(getattr(controller, "losses", ()))
+    }
 
 
 def summarise_shape(
@@ -352,7 +348,7 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
     if contact["losses"]:
-        lines.append(f"  {_losses(contact['losses'])}")
+        lines.append(f"  {losses_text(contact['losses'])}")
     if shape["method"] is not None:
         lines += shape_lines(shape)
     if summary.get("calibration") is not None:
@@ -361,17 +357,6 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
-
-
-def _losses(losses: Sequence[Mapping[str, float | None]]) -> str:
-    """How often contact was lost in the scan, and what was done about it."""
-    told = ", ".join(
-        f"not regained within {loss['searched_mm']:.1f} mm"
-        if loss["regained_after_ms"] is None
-        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
-        for loss in losses
-    )
-    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

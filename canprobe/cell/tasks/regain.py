@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,3 +51,25 @@ class Search:
         """Pose ``t`` seconds after the loss."""
         sideways = self._sideways * (BRAKE_S * (1.0 - math.exp(-t / BRAKE_S)))
         return ProbePose(self._start.centre + sideways + self._start.pole * (SPEED * t), self._start.pole)
+
+
+def summarise_losses(losses: Sequence[Loss]) -> list[dict[str, float | None]]:
+    """Each loss for `summary.json`: `searched_mm`, and `regained_after_ms`, None where it was not."""
+    return [
+        {
+            "searched_mm": 1e3 * loss.searched,
+            "regained_after_ms": None if loss.regained_s is None else 1e3 * loss.regained_s,
+        }
+        for loss in losses
+    ]
+
+
+def losses_text(losses: Sequence[Mapping[str, float | None]]) -> str:
+    """How often contact was lost in the scan, and what was done about it, in words."""
+    told = ", ".join(
+        f"not regained within {loss['searched_mm']:.1f} mm"
+        if loss["regained_after_ms"] is None
+        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
+        for loss in losses
+    )
+    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from canprobe.results import _losses
+from canprobe.cell.tasks.regain import Loss, losses_text, summarise_losses
 
 FOUND = {"searched_mm": 0.93, "regained_after_ms": 465.0}
 GONE = {"searched_mm": 2.0, "regained_after_ms": None}
@@ -16,4 +16,10 @@ GONE = {"searched_mm": 2.0, "regained_after_ms": None}
     ],
 )
 def test_each_loss_is_told(losses, text):
-    assert _losses(losses) == text
+    assert losses_text(losses) == text
+
+
+def test_a_loss_is_summed_up_in_the_units_of_the_summary():
+    (found, gone) = summarise_losses([Loss(900, 0.93e-3, 0.465), Loss(1400, 2e-3)])
+    assert found == pytest.approx(FOUND)
+    assert gone == GONE
