@@ -126,9 +126,7 @@ def software_limits(model: PumaModel) -> tuple[Array, Array]:
 def _sensor_writes(plan: Plan) -> list[Write]:
     assert plan.scene.sensor is not None
     writes = [Write(0x2000, 0, TactileMode[plan.scene.sensor.mode.upper()])]
-    if plan.scene.task.kind in (
-        "scan",
-        "press",
-    ):  # nothing touches the array yet; a listening cell knows no such moment
+    # nothing touches the array yet; a listening cell knows no such moment
+    if plan.scene.task.kind in ("scan", "press", "calibrate"):
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes

@@ -91,7 +91,7 @@ def _plant_config(scene: Scene) -> PlantConfig:
     settings, probe, arm = scene.plant or PlantSettings(), scene.probe or ProbeSettings(), scene.arm
     config = PlantConfig(
         model=MODELS[arm.model] if arm is not None else None,
-        T_flange_probe_centre=T_flange_probe(probe),
+        T_flange_probe_centre=_real_tool(probe, settings),
         radius_m=probe.radius_mm * 1e-3,
         stiffness_n_m3=settings.stiffness_n_m3 or probe.stiffness_n_m3,
         damping_s_m=settings.contact_damping_s_m,
@@ -112,6 +112,13 @@ def _plant_config(scene: Scene) -> PlantConfig:
         dynamics=_dynamics(settings, probe),
         base_offset_m=_base_offset(scene, real),
     )
+
+
+def _real_tool(probe: ProbeSettings, settings: PlantSettings) -> Array:
+    """Where the probe's centre is on the flange, (4, 4), m: where the controller believes it, and an error."""
+    T = T_flange_probe(probe)
+    T[:3, 3] += np.array(settings.tool_error_mm) * 1e-3
+    return T
 
 
 def _dynamics(settings: PlantSettings, probe: ProbeSettings) -> DynamicSettings:
@@ -142,7 +149,7 @@ def _first_posture(scene: Scene) -> Array:
     """Joint angles (6,), rad, at power on: above the start point of a touch, else as the scene says."""
     assert scene.arm is not None
     given = np.radians(scene.arm.start_deg)
-    if scene.probe is None or scene.task.kind not in ("scan", "press"):
+    if scene.probe is None or scene.task.kind not in ("scan", "press", "calibrate"):
         return given
     return start_posture(
         MODELS[scene.arm.model],

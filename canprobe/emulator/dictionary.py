@@ -96,10 +96,11 @@ class Dictionary:
         checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
         if entry.low is None and entry.high is None and not checks and not hooks:
             return None
-        values = self.values
+        values, limited = self.values, entry.low is not None or entry.high is not None
 
         def store(value: Value) -> None:
-            entry.check_limits(value)
+            if limited:
+                entry.check_limits(value)
             for check in checks:
                 check(subindex, value)
             values[key] = value

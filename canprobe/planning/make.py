@@ -25,8 +25,8 @@ from canprobe.planning.model import (
 from canprobe.planning.needs import missing_objects
 from canprobe.planning.open_keys import candidates
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
-from canprobe.planning.reach import check_motion
 from canprobe.planning.traffic import plan_traffic
+from canprobe.planning.turning import plan_motion
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
 
@@ -50,7 +50,7 @@ def make_plan(scene: Scene) -> Plan:
     if found is not None:
         problems += found.reasons()
         scene = found.scene
-    joint_speeds, unreachable = check_motion(scene)
+    scene, joint_speeds, unreachable, turn = plan_motion(scene)
     problems += unreachable
     if problems or found is None:
         raise PlanError(problems)
@@ -61,7 +61,7 @@ def make_plan(scene: Scene) -> Plan:
         pdos=bus.pdos,
         sync=bus.sync,
         buses=bus.buses,
-        choices=found.choices,
+        choices=(*found.choices, *turn),
         joint_speeds=joint_speeds,
         estimator=scene.shape.method if scene.shape is not None else None,
         offline_estimators=scene.shape.also if scene.shape is not None else (),

@@ -236,6 +236,11 @@ class JointSpeeds:
     needed_deg_s: tuple[float, ...]
     limit_deg_s: tuple[float, ...]
 
+    @property
+    def worst_share(self) -> float:
+        """Largest share of its limit that a joint is asked for; above 1 it cannot."""
+        return max(need / limit for need, limit in zip(self.needed_deg_s, self.limit_deg_s, strict=True))
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,6 +14,8 @@ if TYPE_CHECKING:
     from canprobe.touch.estimators import Estimator
 
 
+GAP_S = 0.1
+"""Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
 """1/m; no pad feels a ball of 1 mm, so an answer beyond it has diverged."""
 
@@ -40,8 +41,7 @@ class ShapeTracker:
     Args:
         estimator: the online estimator.
         every: samples between two answers.
-        gap_s: time without a contact after which the estimator starts afresh; by default it never does, as a loop
-            that loses contact is at its end.
+        gap_s: time without a contact after which the estimator starts afresh.
 
     Attributes:
         records: every answer.
@@ -50,7 +50,7 @@ class ShapeTracker:
         restarts: how often the estimator diverged and started afresh.
     """
 
-    def __init__(self, estimator: Estimator, every: int, gap_s: float = math.inf) -> None:
+    def __init__(self, estimator: Estimator, every: int, gap_s: float = GAP_S) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
@@ -89,11 +89,9 @@ def has_diverged(estimate: SurfaceEstimate) -> bool:
     return not (finite and bool((np.abs(known) < SHARPEST).all()))
 
 
-def replay_samples(
-    estimator: Estimator, samples: Sequence[ContactSample], every: int, gap_s: float = math.inf
-) -> list[ShapeRecord]:
+def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:
     """Feed recorded contacts to another estimator, as the loop would have."""
-    tracker = ShapeTracker(estimator, every, gap_s)
+    tracker = ShapeTracker(estimator, every)
     for sample in samples:
         tracker.add(sample)
     return tracker.records
