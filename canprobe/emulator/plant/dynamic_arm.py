@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import numpy.typing as npt
 
 from canprobe.emulator.plant.equations import ArmEquations
-from canprobe.emulator.plant.integrators import STEPS
+from canprobe.emulator.plant.held_step import held_rosenbrock2
+from canprobe.emulator.plant.integrators import STEPS, rosenbrock2
 from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.plant.reference import Reference
 from canprobe.robot.actuation import (
@@ -57,7 +57,10 @@ class DynamicArm:
         self.equations = equations
         self.t_ns = 0
         self._stepping, self._step = stepping, STEPS[stepping.method]
+        if self._step is rosenbrock2:
+            self._step = held_rosenbrock2
         self._scale = counts_per_radian(model)
+        self._scales: list[float] = self._scale.tolist()
         counts = joints_to_counts(model, q0)
         self._references = [Reference(c) for c in counts.tolist()]
         self._y = equations.resting(counts / self._scale)
@@ -137,7 +140,9 @@ class DynamicArm:
         """
         self._advance_to(self.t_ns)
         rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
-        self.equations.set_loop(axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille)
+        self.equations.loops.set_loop(
+            axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
+        )
         self._now = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
@@ -177,9 +182,9 @@ class DynamicArm:
     def _bend(self) -> None:
         """Some reference changes its slope here."""
         rows = [r.at(self._y_ns) for r in self._references]
-        self.equations.set_reference(
-            1e-9 * self._y_ns, *(np.array(column) / self._scale for column in zip(*rows, strict=True))
-        )
+        theta = [x / scale for (x, _), scale in zip(rows, self._scales, strict=True)]
+        slope = [v / scale for (_, v), scale in zip(rows, self._scales, strict=True)]
+        self.equations.loops.set_reference(1e-9 * self._y_ns, theta, slope)
         self._bend_ns = min(r.next_bend(self._y_ns) for r in self._references)
 
     def _stepped(self, end_ns: int) -> Array:
