@@ -68,6 +68,7 @@ class DynamicArm:
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
         self._now: tuple[int, Array] | None = None
+        self._torques: tuple[Array, list[float]] | None = None
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -85,7 +86,7 @@ class DynamicArm:
         self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns
-        self._now = None
+        self._now = self._torques = None
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -125,8 +126,9 @@ class DynamicArm:
             axis: 0 to 5.
         """
         y = self._state()
-        torque = float(self.equations.torque(1e-9 * self.t_ns, y)[axis])
-        permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
+        if self._torques is None or self._torques[0] is not y:
+            self._torques = y, self.equations.torque(1e-9 * self.t_ns, y)
+        permille = round(1000.0 * self._torques[1][axis] / CONTINUOUS_TORQUE_NM[axis])
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
@@ -143,7 +145,7 @@ class DynamicArm:
         self.equations.loops.set_loop(
             axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
         )
-        self._now = None
+        self._now = self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
