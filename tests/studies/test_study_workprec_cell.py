@@ -41,7 +41,7 @@ def test_quick_has_scans_and_the_plans_refusals(quick):
     assert [(r["rate_hz"], r["bus"]) for r in refused] == [(500.0, "classical"), (500.0, "FD")]
     assert all("can0" in r["reason"] for r in refused)
     assert len(done) + len(refused) + sum(r["ended"] == "stopped" for r in quick.rows) == len(quick.rows) == 4
-    assert sum(line.startswith("Refused by the plan, 500 Hz, features") for line in quick.findings) == 2
+    assert sum(line.startswith("Refused by the plan, 500 Hz, window") for line in quick.findings) == 2
 
 
 def test_files_of_a_study_with_two_tables(quick, tmp_path):
