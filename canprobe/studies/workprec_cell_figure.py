@@ -9,6 +9,7 @@ from typing import Any
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import LogFormatter, StrMethodFormatter
 
 from canprobe.studies.workprec_cell import FIDELITIES, default_of, good
 
@@ -67,6 +68,9 @@ def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
             )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.7)))
     axes.grid(color=FAINT, linewidth=0.6)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
