@@ -256,6 +256,7 @@ class PlantSettings:
     crosstalk: bool = True
     saturation: bool = True
     threshold: bool = True  # of the array itself, before the node's own
+    adc_bits: Annotated[int, Range(8, 16)] = 8  # beyond 8 the node's features gain by it; taxels go out in whole counts
 
 
 @dataclass(frozen=True, slots=True)

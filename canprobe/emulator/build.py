@@ -165,5 +165,5 @@ def _first_posture(scene: Scene) -> Array:
 def _taxels(scene: Scene, settings: PlantSettings) -> TaxelConfig | None:
     if scene.sensor is None:
         return None
-    array = TaxelConfig(full_scale_pa=scene.sensor.full_scale_kpa * 1e3)
+    array = TaxelConfig(full_scale_pa=scene.sensor.full_scale_kpa * 1e3, adc_bits=settings.adc_bits)
     return array.without(*(effect for effect in EFFECTS if not getattr(settings, effect)))

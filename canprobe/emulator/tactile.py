@@ -18,7 +18,15 @@ from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.entries import Value
 from canprobe.emulator.node import OdOf, SlaveNode
-from canprobe.emulator.tactile_image import Image, compute_features, correct, follow, is_overloaded
+from canprobe.emulator.tactile_image import (
+    Image,
+    Raw,
+    compute_features,
+    correct,
+    correct_finely,
+    follow,
+    is_overloaded,
+)
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
 from canprobe.protocol.tactile import SIDE, Features, TactileHeader, TactileMode, pack_frame
@@ -37,8 +45,8 @@ class TactilePlant(Protocol):
     def advance(self, t_ns: int) -> None:
         """Bring the plant to `t_ns`; idempotent."""
 
-    def sample_image(self, t_ns: int) -> NDArray[np.uint8]:
-        """Raw counts of the array at `t_ns`, uint8 (16, 16)."""
+    def sample_image(self, t_ns: int) -> Raw:
+        """Raw counts of the array at `t_ns`, (16, 16), 255 at full scale."""
 
 
 class TactileApplication(Application):
@@ -54,9 +62,9 @@ class TactileApplication(Application):
         """
         self._plant = plant
         self._latency, self._tare_images = latency_frames, tare_images
-        self._pipeline: deque[tuple[int, Image]] = deque()
+        self._pipeline: deque[tuple[int, Raw]] = deque()
         self._tare: NDArray[np.float64] | None = None
-        self._taring: list[Image] | None = None
+        self._taring: list[Raw] | None = None
         self._frames = 0
         self._origin = (4, 4)
         self._counter = 0
@@ -122,12 +130,13 @@ class TactileApplication(Application):
         sampled_ns, raw = pipeline.popleft() if len(pipeline) > self._latency else pipeline[0]
         self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
 
-    def _show(self, raw: Image, age_us: int) -> None:
+    def _show(self, raw: Raw, age_us: int) -> None:
         """Put one frame into the objects that the TPDOs carry."""
         dictionary = self._node.dictionary
         number = dictionary.number
         mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
-        image = correct(raw, self._tare, number(GAIN, 0, 1000), number(THRESHOLD))
+        settings = self._tare, number(GAIN, 0, 1000), number(THRESHOLD)
+        image = correct(raw, *settings)
         overload = is_overloaded(raw) or is_overloaded(image)
         self._origin = follow(image, self._origin)
         row, column = self._origin if mode is TactileMode.WINDOW else (0, 0)
@@ -135,7 +144,8 @@ class TactileApplication(Application):
         self._frames = (self._frames + 1) % 256
         content: Image | Features = image
         if mode is TactileMode.FEATURES:
-            content = compute_features(image, number(FULL_SCALE_PA, 0, 100_000))
+            seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
+            content = compute_features(seen, number(FULL_SCALE_PA, 0, 100_000))
         words = [int.from_bytes(payload, "little") for payload in pack_frame(header, content)]
         dictionary.put(OVERLOAD, 0, int(overload))
         dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])

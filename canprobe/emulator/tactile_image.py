@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 from canprobe.protocol.tactile import SIDE, WINDOW, Features
 
 Image = NDArray[np.uint8]
+Raw = NDArray[np.uint8] | NDArray[np.float64]
+"""Counts of 255 at full scale: whole ones of an ADC of 8 bits, parts of counts of a finer one."""
 FULL_SCALE = 255
 GAIN_ONE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
@@ -17,27 +19,43 @@ _SUMS = np.stack((np.ones(SIDE), _INDEX), axis=1)
 TAXEL_AREA_M2 = 1.5875e-3**2
 
 
-def is_overloaded(raw: Image) -> bool:
+def is_overloaded(raw: Raw) -> bool:
     """Whether a taxel has reached full scale."""
     return bool(raw.max() == FULL_SCALE)
 
 
-def correct(raw: Image, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
-    """Raw counts (16, 16) → counts with the tare subtracted, times the gain, saturated, zero below the threshold."""
-    if tare is None and gain_permille == GAIN_ONE:
+def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
+    """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
+    if tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8:
         return np.where(raw >= threshold, raw, np.uint8(0))
+    counts = _scaled(raw, tare, gain_permille)
+    np.rint(counts, out=counts)
+    return _limited(counts, threshold).astype(np.uint8)
+
+
+def correct_finely(
+    raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
+) -> NDArray[np.float64]:
+    """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
+    return _limited(_scaled(raw, tare, gain_permille), threshold)
+
+
+def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
     counts = raw.astype(np.float64)
     if tare is not None:
         counts -= tare
     if gain_permille != GAIN_ONE:
         counts *= gain_permille / GAIN_ONE
-    np.rint(counts, out=counts)
+    return counts
+
+
+def _limited(counts: NDArray[np.float64], threshold: int) -> NDArray[np.float64]:
     np.minimum(counts, FULL_SCALE, out=counts)
     counts[counts < max(threshold, 0)] = 0.0
-    return counts.astype(np.uint8)
+    return counts
 
 
-def _moments(image: Image) -> tuple[float, float, float]:
+def _moments(image: Raw) -> tuple[float, float, float]:
     """Sum, centroid row, centroid column; the centre of the pad without a contact."""
     (total, columns), (rows, _) = (_SUMS.T @ image @ _SUMS).tolist()
     if total == 0.0:
@@ -45,7 +63,7 @@ def _moments(image: Image) -> tuple[float, float, float]:
     return total, rows / total, columns / total
 
 
-def follow(image: Image, origin: tuple[int, int]) -> tuple[int, int]:
+def follow(image: Raw, origin: tuple[int, int]) -> tuple[int, int]:
     """First taxel (row, column), 0..8 each, of the window round the contact.
 
     The window stays while the contact's centroid is near its middle, and where it is without a contact.
@@ -63,11 +81,11 @@ def _shift(origin: int, centroid: float) -> int:
     return min(max(round(ideal), 0), _LAST_ORIGIN)
 
 
-def compute_features(image: Image, full_scale_pa: float) -> Features:
+def compute_features(image: Raw, full_scale_pa: float) -> Features:
     """Force, centroid and central second moments of the whole pad.
 
     Args:
-        image: corrected counts, (16, 16).
+        image: corrected counts, (16, 16), whole or not.
         full_scale_pa: pressure at 255 counts, Pa.
     """
     total, row, column = _moments(image)
@@ -82,5 +100,5 @@ def compute_features(image: Image, full_scale_pa: float) -> Features:
         var_rr=float(d_row**2 @ weights.sum(axis=1)),
         var_rc=float(d_row @ weights @ d_column),
         var_cc=float(d_column**2 @ weights.sum(axis=0)),
-        peak=int(image.max()),
+        peak=round(float(image.max())),
     )

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from canprobe.robot.puma260 import Array, PumaModel
 
 Vec = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
 
 
 @dataclass(slots=True, eq=False)
@@ -47,7 +48,7 @@ def chain(model: PumaModel, q: npt.ArrayLike) -> Chain:
     Source: product of the standard DH transforms, worked out by hand; checked against the matrix product in tests.
     """
     d1, a2, offset, a3, d4, d6 = model.links
-    q1, q2, q3, q4, q5, q6 = np.asarray(q, dtype=float).tolist()
+    q1, q2, q3, q4, q5, q6 = q if isinstance(q, list) else np.asarray(q, dtype=float).tolist()
     c1, s1, c2, s2, c23, s23 = cos(q1), sin(q1), cos(q2), sin(q2), cos(q2 + q3), sin(q2 + q3)
     c4, s4, c5, s5, c6, s6 = cos(q4), sin(q4), cos(q5), sin(q5), cos(q6), sin(q6)
     # Elbow and wrist centre in the vertical plane of the arm, then turned by joint 1.
@@ -108,23 +109,46 @@ def forward_jacobian(model: PumaModel, q: npt.ArrayLike, T_flange_tool: Array) -
     """
     c = chain(model, q)
     T_base_tool = _pose(c) @ T_flange_tool
+    (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = c.axis4, c.axis5, c.z
     px, py, pz = T_base_tool[:3, 3].tolist()
+    ax, ay, _ = c.axis2
+    turns = (0.0, ax, ax, fx, gx, hx), (0.0, ay, ay, fy, gy, hy), (1.0, 0.0, 0.0, fz, gz, hz)
+    return T_base_tool, np.array((*point_jacobian(c, (px, py, pz)), *turns))
+
+
+def point_jacobian(c: Chain, point: Vec) -> tuple[Six, Six, Six]:
+    """Velocity of a point fixed to the flange, per joint rate.
+
+    Args:
+        c: the evaluated chain.
+        point: the point now, base frame, m.
+
+    Returns:
+        Rows x, y and z in the base frame, m/s per rad/s.
+    """
+    px, py, pz = point
     ax, ay, _ = c.axis2
     (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = c.axis4, c.axis5, c.z
     ex, ey, ez = px - c.elbow[0], py - c.elbow[1], pz - c.elbow[2]
     wx, wy, wz = px - c.wrist[0], py - c.wrist[1], pz - c.wrist[2]
     sz = pz - c.d1
-    J = np.array(
-        (
-            (-py, ay * sz, ay * ez, fy * wz - fz * wy, gy * wz - gz * wy, hy * wz - hz * wy),
-            (px, -ax * sz, -ax * ez, fz * wx - fx * wz, gz * wx - gx * wz, hz * wx - hx * wz),
-            (0.0, ax * py - ay * px, ax * ey - ay * ex, fx * wy - fy * wx, gx * wy - gy * wx, hx * wy - hy * wx),
-            (0.0, ax, ax, fx, gx, hx),
-            (0.0, ay, ay, fy, gy, hy),
-            (1.0, 0.0, 0.0, fz, gz, hz),
-        )
+    return (
+        (-py, ay * sz, ay * ez, fy * wz - fz * wy, gy * wz - gz * wy, hy * wz - hz * wy),
+        (px, -ax * sz, -ax * ez, fz * wx - fx * wz, gz * wx - gx * wz, hz * wx - hx * wz),
+        (0.0, ax * py - ay * px, ax * ey - ay * ex, fx * wy - fy * wx, gx * wy - gy * wx, hx * wy - hy * wx),
     )
-    return T_base_tool, J
+
+
+def point_on_flange(c: Chain, offset: Vec) -> Vec:
+    """Place of a point fixed to the flange, base frame, m.
+
+    Args:
+        c: the evaluated chain.
+        offset: of the point in the flange frame, m.
+    """
+    a, b, d = offset
+    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = c.x, c.y, c.z, c.flange
+    return p0 + x0 * a + y0 * b + z0 * d, p1 + x1 * a + y1 * b + z1 * d, p2 + x2 * a + y2 * b + z2 * d
 
 
 def point_velocity(c: Chain, point: Vec, qd: npt.ArrayLike) -> Vec:

@@ -74,7 +74,7 @@ def _press(
         angle = 2 * np.pi * ROLL_HZ * max(0.0, t - LOADING_S)
         uv = (u + ROLL_M * np.sin(angle), v + 0.4 * ROLL_M * np.sin(2 * angle))
         image = array.image(uv, depth * min(1.0, t / LOADING_S), kappa, np.eye(2), float(t))
-        sums.append(compute_patch(image, plain).force)
+        sums.append(compute_patch(image.astype(np.uint8), plain).force)
     return float(np.mean(sums[-round(AVERAGE_S / FRAME_S) :]))
 
 

@@ -22,7 +22,7 @@ STUDIES: Mapping[str, str] = MappingProxyType(
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
         "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
-        "workprec": "error of the dynamic plant against its run time, over integrators, steps and stiffness",
+        "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
         "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
@@ -59,6 +59,7 @@ class StudyResult:
         findings: plain sentences with figures, right or wrong ones.
         facts: what it was measured with.
         draw: writes the picture to a path; needs matplotlib.
+        more: further tables of the study, each with findings, files and a picture of its own.
     """
 
     name: str
@@ -67,6 +68,7 @@ class StudyResult:
     findings: Sequence[str]
     facts: Mapping[str, Any]
     draw: Callable[[Path], None]
+    more: Sequence[StudyResult] = ()
 
 
 def run_study(name: str, *, quick: bool, sweep: Sweep) -> StudyResult:

@@ -59,18 +59,21 @@ def table_lines(result: StudyResult) -> list[str]:
 
 
 def text_of(result: StudyResult) -> str:
-    """Facts, table and findings."""
+    """Facts, table and findings, of all its tables."""
     facts = ", ".join(f"{name} {value}" for name, value in result.facts.items() if value is not None)
-    return "\n".join([f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""])
+    own = [f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""]
+    return "\n".join([*own, *(f"\n{text_of(more)}" for more in result.more)])
 
 
 def as_document(result: StudyResult) -> dict[str, Any]:
     """For `--json`: no NaN, what does not apply is null."""
+    more = {"more": [as_document(part) for part in result.more]} if result.more else {}
     return {
         "study": result.name,
         "facts": dict(result.facts),
         "findings": list(result.findings),
         "rows": [{key: _plain(value) for key, value in row.items()} for row in result.rows],
+        **more,
     }
 
 
@@ -78,7 +81,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
 
     Returns:
-        The files, the picture last where there is one.
+        The files of each table, its picture last where there is one.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
@@ -90,7 +93,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     if importlib.util.find_spec("matplotlib") is not None:
         paths.append(out / f"{result.name}.png")
         result.draw(paths[-1])
-    return paths
+    return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 
 def _write_csv(writer: Any, result: StudyResult) -> None:

@@ -7,6 +7,8 @@ time a cycle, the best of several repeats, the first one apart. Errors are RMS o
 force relative to the reference's RMS force, position of the probe's centre, pressure of a taxel in counts of 1/255 of
 the full scale. Besides, each method and step must come to rest against a contact of 10 MN/m, the stiffest that the
 project looks at: explicit steps that are not short enough rattle there.
+
+The whole cell, of which the plant is a part, is measured by `workprec_cell`.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from canprobe.emulator.plant.dynamic_arm import Stepping
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
+from canprobe.studies.workprec_cell import run_cell
 from canprobe.studies.workprec_trial import Array, integrated, observed, reference, stands
 
 STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
@@ -104,7 +107,9 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
         draw_workprec(rows, floors, default_choice(), path)
 
-    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), measuring_facts(quick, 0, MODEL), draw)
+    facts = measuring_facts(quick, 0, MODEL)
+    whole = run_cell(quick=quick, sweep=sweep)
+    return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw, (whole,))
 
 
 def stand(todo: Sequence[Case], sweep: Sweep) -> dict[tuple[str, float], bool]:

@@ -116,7 +116,8 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     h, seen = CYCLE_NS * 1e-9, []
     y = equations.resting(targets[0] / scale)
     for k in range(cycles):
-        equations.set_reference(k * h, targets[k] / scale, (targets[k + 1] - targets[k]) / scale / h)
+        slope = (targets[k + 1] - targets[k]) / scale / h
+        equations.loops.set_reference(k * h, (targets[k] / scale).tolist(), slope.tolist())
         solved = solve_ivp(
             equations.rate, (k * h, (k + 1) * h), y, "Radau", rtol=rtol, atol=1e-2 * rtol, jac=equations.jacobian
         )

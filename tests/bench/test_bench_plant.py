@@ -1,7 +1,6 @@
 """Costs of the plant's inner calls. Run with --benchmark-only; skipped by default.
 
-Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150. A dynamic cycle should take 300;
-it takes 880 with the default step, 420 with rk4 at 1250 us.
+Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150, a dynamic cycle 300.
 """
 
 import numpy as np

@@ -246,6 +246,16 @@ def test_sensor_features_by_hand(make, plant):
     assert features.force_n == pytest.approx(force_n, abs=1 / 800)
 
 
+def test_sensor_a_finer_adc_sharpens_the_force_and_leaves_taxels_whole(make, plant):
+    plant.image = np.zeros((16, 16))
+    plant.image[4:10, 4:10] = 50.4
+    taxels = make(mode=TactileMode.IMAGE).go().frames(1)[0].taxels
+    assert (taxels.max(), taxels.sum()) == (50, 36 * 50)
+    features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
+    assert features.force_n == pytest.approx(36 * 50.4 / 255 * 100_000 * 1.5875e-3**2, abs=1 / 800)
+    assert (features.row, features.col, features.peak) == (6.5, 6.5, 50)
+
+
 def test_sensor_features_without_contact(make):
     features = make(mode=TactileMode.FEATURES).go().frames(1)[0].features
     assert (features.force_n, features.row, features.col, features.peak) == (0.0, 7.5, 7.5, 0)

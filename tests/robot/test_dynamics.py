@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from canprobe.robot.dynamics import RigidBody, link_frames
+from canprobe.robot.dynamics import RigidBody
 from canprobe.robot.inertia import LinkInertia, ball_inertia, puma260_inertia
-from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
+from canprobe.robot.kinematics import forward_jacobian, tool_z_offset
 from canprobe.robot.puma260 import MODELS, UPENN
 
 TOOL = tool_z_offset(80.0)
@@ -20,6 +20,11 @@ def random_links(seed):
     clouds = rng.normal(0.0, 0.05, (6, 30, 3))
     tensors = [np.eye(3) * (c * c).sum() - c.T @ c for c in clouds]
     return LinkInertia(rng.uniform(0.1, 3.0, 6), rng.normal(0.0, 0.1, (6, 3)), 0.01 * np.array(tensors))
+
+
+def denavit_hartenberg(q, a, alpha, d):
+    c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+    return np.array(((c, -s * ca, s * sa, a * c), (s, c * ca, -c * sa, a * s), (0, sa, ca, d), (0, 0, 0, 1)))
 
 
 def in_mujoco(model, links):
@@ -71,15 +76,6 @@ def test_pose_and_jacobian_are_those_of_mujoco(model):
         assert pytest.approx(np.vstack((linear, angular)), abs=1e-10) == J
 
 
-@BOTH
-def test_frames_end_at_the_flange(model):
-    q = np.random.default_rng(2).uniform(-3.0, 3.0, 6)
-    frames = link_frames(model, q)
-    T = forward(model, q)
-    assert frames.origins[6] == pytest.approx(T[:3, 3], abs=1e-14)
-    assert pytest.approx(T[:3, :3], abs=1e-14) == frames.axes[5].T
-
-
 def test_weight_of_the_horizontal_arm_is_the_published_one():
     links = puma260_inertia(UPENN)
     loaded = links.with_payload(0.3, TOOL, ball_inertia(0.3, 0.04))
@@ -94,8 +90,10 @@ def test_gravity_is_the_slope_of_the_height(model):
     body, q = RigidBody(model, links), np.random.default_rng(3).uniform(-2.0, 2.0, 6)
 
     def potential(q):
-        frames = link_frames(model, q)
-        heights = frames.origins[1:, 2] + np.einsum("ij,ij->i", links.com, frames.axes[:, :, 2])
+        T, heights = np.eye(4), []
+        for angle, row, com in zip(q, model.dh, links.com, strict=True):
+            T = T @ denavit_hartenberg(angle, *row)
+            heights.append(T[2, :3] @ com + T[2, 3])
         return 9.81 * float(links.mass @ heights)
 
     h = 1e-6 * np.eye(6)
@@ -126,3 +124,16 @@ def test_a_payload_is_the_same_as_a_heavier_link():
     q = np.ones(6)
     for one, other in zip(RigidBody(UPENN, whole).terms(q, q), RigidBody(UPENN, halves).terms(q, q), strict=True):
         assert one == pytest.approx(other, abs=1e-14)
+
+
+@BOTH
+def test_along_other_coordinates_powers_are_the_same(model):
+    """q = B x: x'Mx' is the same energy, and b along x is B'b; rotors add theirs, weightless arms have none of it."""
+    body, rng = RigidBody(model, random_links(5)), np.random.default_rng(5)
+    B, x, xd, rotors = np.tril(rng.normal(size=(6, 6))), *rng.normal(size=(2, 6)), rng.uniform(0.1, 1.0, 6)
+    mass, bias = body.terms(B @ x, B @ xd)
+    along, along_bias = body.along(B, rotors.tolist()).terms(x, xd)
+    assert along == pytest.approx(B.T @ mass @ B + np.diag(rotors), rel=1e-12)
+    assert along_bias == pytest.approx(B.T @ bias, rel=1e-12)
+    light = body.along(B, rotors.tolist(), weight=False).terms(x, xd)[1]
+    assert light == pytest.approx(B.T @ (bias - body.gravity(B @ x)), rel=1e-10)

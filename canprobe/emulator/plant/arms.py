@@ -66,8 +66,8 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
         config.T_flange_probe_centre,
         config.base_offset_m,
         config.object,
-        config.radius_m,
-        config.stiffness_n_m3,
-        Rubbing(config.damping_s_m, d.friction),
+        radius=config.radius_m,
+        stiffness_n_m3=config.stiffness_n_m3,
+        rubbing=Rubbing(config.damping_s_m, d.friction),
     )
     return ArmEquations(body, cascade, touching, effects, held=held)

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import numpy.typing as npt
 
 from canprobe.emulator.plant.equations import ArmEquations
-from canprobe.emulator.plant.integrators import STEPS
+from canprobe.emulator.plant.held_step import held_rosenbrock2
+from canprobe.emulator.plant.integrators import STEPS, rosenbrock2
 from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.plant.reference import Reference
 from canprobe.robot.actuation import (
@@ -57,7 +57,10 @@ class DynamicArm:
         self.equations = equations
         self.t_ns = 0
         self._stepping, self._step = stepping, STEPS[stepping.method]
+        if self._step is rosenbrock2:
+            self._step = held_rosenbrock2
         self._scale = counts_per_radian(model)
+        self._scales: list[float] = self._scale.tolist()
         counts = joints_to_counts(model, q0)
         self._references = [Reference(c) for c in counts.tolist()]
         self._y = equations.resting(counts / self._scale)
@@ -65,6 +68,7 @@ class DynamicArm:
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
         self._now: tuple[int, Array] | None = None
+        self._torques: tuple[Array, list[float]] | None = None
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -82,7 +86,7 @@ class DynamicArm:
         self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns
-        self._now = None
+        self._now = self._torques = None
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -122,8 +126,9 @@ class DynamicArm:
             axis: 0 to 5.
         """
         y = self._state()
-        torque = float(self.equations.torque(1e-9 * self.t_ns, y)[axis])
-        permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
+        if self._torques is None or self._torques[0] is not y:
+            self._torques = y, self.equations.torque(1e-9 * self.t_ns, y)
+        permille = round(1000.0 * self._torques[1][axis] / CONTINUOUS_TORQUE_NM[axis])
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
@@ -137,8 +142,10 @@ class DynamicArm:
         """
         self._advance_to(self.t_ns)
         rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
-        self.equations.set_loop(axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille)
-        self._now = None
+        self.equations.loops.set_loop(
+            axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
+        )
+        self._now = self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
@@ -177,9 +184,9 @@ class DynamicArm:
     def _bend(self) -> None:
         """Some reference changes its slope here."""
         rows = [r.at(self._y_ns) for r in self._references]
-        self.equations.set_reference(
-            1e-9 * self._y_ns, *(np.array(column) / self._scale for column in zip(*rows, strict=True))
-        )
+        theta = [x / scale for (x, _), scale in zip(rows, self._scales, strict=True)]
+        slope = [v / scale for (_, v), scale in zip(rows, self._scales, strict=True)]
+        self.equations.loops.set_reference(1e-9 * self._y_ns, theta, slope)
         self._bend_ns = min(r.next_bend(self._y_ns) for r in self._references)
 
     def _stepped(self, end_ns: int) -> Array:

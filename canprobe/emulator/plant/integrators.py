@@ -25,7 +25,8 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 
-_GAMMA = 1.0 - sqrt(0.5)
+GAMMA = 1.0 - sqrt(0.5)
+"""Of ROS2."""
 _MOST_PARTS = 4096
 
 
@@ -98,8 +99,8 @@ def rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
 
 def _rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> tuple[Array, Array]:
     """The step, and how far its own first-order step lies off."""
-    rate, drift, solve = problem.linearised(t, y, _GAMMA * h)
-    drift *= _GAMMA * h
+    rate, drift, solve = problem.linearised(t, y, GAMMA * h)
+    drift *= GAMMA * h
     k1 = solve(rate + drift)
     k2 = solve(problem.rate(t + h, y + h * k1) - 2.0 * k1 - drift)
     return y + (1.5 * h) * k1 + (0.5 * h) * k2, (0.5 * h) * (k1 + k2)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from functools import cache
 from math import pi, sqrt
 
 import numpy as np
@@ -10,12 +11,12 @@ import numpy as np
 from canprobe.emulator.plant.pushing import Contact, OneTouch, Rubbing
 from canprobe.emulator.plant.pushing_many import ManyTouches
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, NEAR_M, force_laws
-from canprobe.robot.kinematics import forward_jacobian
+from canprobe.robot.kinematics import Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.puma260 import Array, PumaModel
+from canprobe.robot.straight_line import Value, compiled
 from canprobe.touch.objects import ObjectShape, Touches
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class Neighbourhood:
     """What ``ArmEquations`` asks for the contact.
 
@@ -30,40 +31,63 @@ class Neighbourhood:
         rubbing: damping and friction.
     """
 
-    model: PumaModel
-    joints_per_motor: Array
-    T_flange_probe: Array
-    base_offset: Array
-    shape: ObjectShape
-    radius: float
-    stiffness_n_m3: float
-    rubbing: Rubbing
+    def __init__(
+        self,
+        model: PumaModel,
+        joints_per_motor: Array,
+        T_flange_probe: Array,
+        base_offset: Array,
+        shape: ObjectShape,
+        *,
+        radius: float,
+        stiffness_n_m3: float,
+        rubbing: Rubbing,
+    ) -> None:
+        self.model, self.shape, self.radius = model, shape, radius
+        self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
+        self._T_flange_probe, self._joints_per_motor = T_flange_probe, joints_per_motor
+        self._tool: Vec = tuple(T_flange_probe[:3, 3].tolist())
+        self._base: Vec = tuple(base_offset.tolist())
+        self._back: tuple[float, ...] = tuple(joints_per_motor.ravel().tolist())
+        self._shares = [[(j, g) for j, g in enumerate(row) if g] for row in joints_per_motor.tolist()]
+        self._rows = _rows_for(tuple(float(g != 0.0) for g in self._back))
 
-    def __call__(self, theta: Array) -> Contact | None:
+    def __call__(self, theta: list[float]) -> Contact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
 
         Args:
             theta: (6,) motor coordinates, rad.
         """
-        T, J = forward_jacobian(self.model, self.joints_per_motor @ theta, self.T_flange_probe)
-        centre, J = T[:3, 3] + self.base_offset, J @ self.joints_per_motor
+        c = chain(self.model, [sum(g * theta[j] for j, g in row) for row in self._shares])
+        x, y, z = self._base
+        at = point_on_flange(c, self._tool)  # of the arm's own base
+        centre = at[0] + x, at[1] + y, at[2] + z
         foot = self.shape.closest(centre)
         depth = self.radius - foot.distance
         if depth < -NEAR_M:
             return None
         touches = self.shape.touches(centre, self.radius + NEAR_M)
         if touches is not None:
-            return self._many(theta, J, touches)
-        d1, d2 = foot.directions
+            return self._many(theta, touches)
         least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa.tolist()
         A, B = 0.5 * max(least, 1.0 / self.radius + k1), 0.5 * max(least, 1.0 / self.radius + k2)
-        # Velocity of the probe's point that touches: the centre's, and its rotation about the centre by an arm -n r.
-        rows = np.array((foot.normal, d1, d2)) @ J[:3]
-        rows[1:] += (max(depth, 0.0) - self.radius) * np.array((d2, -d1)) @ J[3:]
-        return OneTouch(theta, depth, rows, pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)), self.rubbing)
+        # The probe's point that touches lies by an arm -n r off its centre.
+        normal, tangents, arm = foot.normal.tolist(), foot.directions.ravel().tolist(), max(depth, 0.0) - self.radius
+        touched = at[0] + arm * normal[0], at[1] + arm * normal[1], at[2] + arm * normal[2]
+        x6, y6, z6 = point_jacobian(c, touched)
+        rows = self._rows(x6, y6, z6, normal, tangents, self._back)
+        return OneTouch(
+            theta,
+            depth,
+            (rows[:6], rows[6:12], rows[12:]),
+            pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)),
+            self.rubbing,
+        )
 
-    def _many(self, theta: Array, J: Array, touches: Touches) -> Contact:
+    def _many(self, theta: list[float], touches: Touches) -> Contact:
         """Several places at once."""
+        back = self._joints_per_motor
+        J = forward_jacobian(self.model, back @ theta, self._T_flange_probe)[1] @ back
         depth, n = self.radius - touches.distances, touches.normals
         d1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
         d1 /= np.linalg.norm(d1, axis=1)[:, None]
@@ -73,3 +97,19 @@ class Neighbourhood:
         rows[:, 1:] += arm * np.stack((d2, -d1), axis=1) @ J[3:]
         coefficient, exponent = force_laws(touches, self.radius, self.stiffness_n_m3)
         return ManyTouches(theta, depth, rows, coefficient=coefficient, exponent=exponent, rubbing=self.rubbing)
+
+
+@cache
+def _rows_for(back: tuple[float, ...]) -> Callable[..., tuple[float, ...]]:
+    """(18,) velocities along three directions per motor rate, of (6,) velocities along x, y and z per joint rate."""
+    return compiled("touch_rows", _touch_rows, {}, x=6, y=6, z=6, normal=3, tangents=6, back=back)
+
+
+def _touch_rows(
+    *, x: list[Value], y: list[Value], z: list[Value], normal: list[Value], tangents: list[Value], back: list[Value]
+) -> list[Value]:
+    rows = []
+    for a, b, c in (normal, tangents[:3], tangents[3:]):
+        joints = [a * u + b * v + c * w for u, v, w in zip(x, y, z, strict=True)]
+        rows += [sum((joints[i] * back[6 * i + j] for i in range(6)), 0.0) for j in range(6)]
+    return rows

@@ -7,6 +7,7 @@ friction follow from depth and velocities as in ``contact``. One touch is worked
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple, Protocol
@@ -15,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
-Six = list[float]
+Six = Sequence[float]
 
 SLIP_M_S = 1e-3
 """Sliding speed over which friction grows to its full size."""
@@ -66,47 +67,52 @@ class OneTouch:
     Args:
         theta: (6,) posture in motor coordinates, rad.
         depth: indentation there, m; negative for a gap.
-        rows: (3, 6) velocity of the touched point of the probe per motor rate: along the object's outward normal and
-            along two tangents, m.
+        rows: velocity of the touched point of the probe per motor rate, (6,) each: along the object's outward normal
+            and along two tangents, m.
         coefficient: force is ``coefficient depth^2``, N/m^2.
         rubbing: damping and friction.
+
+    Attributes:
+        n, s, t: the rows.
+        law: offset of the depth, coefficient, factor of damping, friction.
     """
 
-    def __init__(self, theta: Array, depth: float, rows: Array, coefficient: float, rubbing: Rubbing) -> None:
-        self._rows = rows
-        self._n, self._s, self._t = rows.tolist()
-        self._offset = depth + float(rows[0] @ theta)
-        self._coefficient = coefficient
-        self._damping, self._friction = 1.5 * rubbing.damping_s_m, rubbing.friction
+    def __init__(self, theta: Six, depth: float, rows: tuple[Six, Six, Six], coefficient: float, rubbing: Rubbing):
+        self.n, self.s, self.t = rows
+        self.law = depth + _dot(self.n, theta), coefficient, 1.5 * rubbing.damping_s_m, rubbing.friction
+
+    @property
+    def rows(self) -> Array:
+        """(3, 6) n, s, t."""
+        return np.array((self.n, self.s, self.t))
 
     def push(self, theta: Six, rate: Six) -> Array | None:
         """See ``Contact``."""
-        depth = self._offset - _dot(self._n, theta)
+        offset, coefficient, damping, friction = self.law
+        depth = offset - _dot(self.n, theta)
         if depth <= 0.0:
             return None
-        force = self._coefficient * depth * depth * max(0.0, 1.0 - self._damping * _dot(self._n, rate))
-        if self._friction == 0.0:
-            plain: Array = force * self._rows[0]
-            return plain
-        s, t = _dot(self._s, rate), _dot(self._t, rate)
-        drag = self._friction * force / sqrt(s * s + t * t + SLIP_M_S**2)
-        torque: Array = np.array((force, -drag * s, -drag * t)) @ self._rows
+        force = coefficient * depth * depth * max(0.0, 1.0 - damping * _dot(self.n, rate))
+        s, t = _dot(self.s, rate), _dot(self.t, rate)
+        drag = friction * force / sqrt(s * s + t * t + SLIP_M_S**2)
+        torque: Array = np.array((force, -drag * s, -drag * t)) @ self.rows
         return torque
 
     def slopes(self, theta: Six, rate: Six) -> Slopes | None:
         """See ``Contact``."""
-        depth = self._offset - _dot(self._n, theta)
+        offset, coefficient, hunt_crossley, friction = self.law
+        depth = offset - _dot(self.n, theta)
         if depth <= 0.0:
             return None
-        elastic = self._coefficient * depth * depth
-        factor = max(0.0, 1.0 - self._damping * _dot(self._n, rate))
-        stiffness, damping = 2.0 * elastic * factor / depth, self._damping * elastic if factor > 0.0 else 0.0
-        s, t = _dot(self._s, rate), _dot(self._t, rate)
+        elastic = coefficient * depth * depth
+        factor = max(0.0, 1.0 - hunt_crossley * _dot(self.n, rate))
+        stiffness, damping = 2.0 * elastic * factor / depth, hunt_crossley * elastic if factor > 0.0 else 0.0
+        s, t = _dot(self.s, rate), _dot(self.t, rate)
         square = s * s + t * t + SLIP_M_S**2
-        drag = self._friction * elastic * factor / sqrt(square)
+        drag = friction * elastic * factor / sqrt(square)
         across = -drag * s * t / square
         return Slopes(
-            self._rows,
+            self.rows,
             np.array(((stiffness, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))),
             np.array(
                 (

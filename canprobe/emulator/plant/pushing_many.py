@@ -20,11 +20,11 @@ class ManyTouches:
     """
 
     def __init__(
-        self, theta: Array, depth: Array, rows: Array, *, coefficient: Array, exponent: Array, rubbing: Rubbing
+        self, theta: Six, depth: Array, rows: Array, *, coefficient: Array, exponent: Array, rubbing: Rubbing
     ) -> None:
         self._rows = rows
         self._normal = np.ascontiguousarray(rows[:, 0])
-        self._offset = depth + self._normal @ theta
+        self._offset = depth + self._normal @ np.array(theta)
         self._coefficient, self._exponent = coefficient, exponent
         self._damping, self._friction = 1.5 * rubbing.damping_s_m, rubbing.friction
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from math import exp
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +18,12 @@ import numpy.typing as npt
 from canprobe.emulator.plant.field import SIDE, PressureField
 
 Array = npt.NDArray[np.float64]
-Image = npt.NDArray[np.uint8]
+Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
 
 _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
-_ADC_MAX = 255
+_FULL_SCALE = 255
+"""Counts of full scale, whatever the ADC resolves."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +41,7 @@ class TaxelConfig:
         noise: standard deviation per sample, in full scales.
         threshold: readings below this share of full scale become 0.
         dead: (row, column) of taxels that read 0.
+        adc_bits: of the ADC; 8 gives whole counts, more give parts of counts.
         samples: samples per taxel and axis of the pressure field.
     """
 
@@ -52,12 +55,18 @@ class TaxelConfig:
     noise: float = 0.005
     threshold: float = 0.02
     dead: tuple[tuple[int, int], ...] = ()
+    adc_bits: int = 8
     samples: int = 3
 
     @property
-    def threshold_counts(self) -> int:
-        """Smallest count that survives the threshold."""
-        return int(np.ceil(self.threshold * _ADC_MAX))
+    def adc_max(self) -> int:
+        """What the ADC says at full scale."""
+        return (1 << self.adc_bits) - 1
+
+    @property
+    def adc_threshold(self) -> int:
+        """Least that the ADC says above the threshold."""
+        return int(np.ceil(self.threshold * self.adc_max))
 
     def without(self, *effects: str) -> TaxelConfig:
         """The same array with some effects switched off.
@@ -134,7 +143,8 @@ class TaxelArray:
             pressure_factor: of the layer's damping.
 
         Returns:
-            (16, 16) counts, row i at v = (i - 7.5) pitch, column j at u = (j - 7.5) pitch.
+            (16, 16) counts of 255 at full scale, row i at v = (i - 7.5) pitch, column j at u = (j - 7.5) pitch; whole
+            numbers (uint8) of an ADC of 8 bits, else float.
         """
         return self.image_of(self.field.mean_pressure(uv, depth, kappa, directions_pad), t_s, pressure_factor)
 
@@ -187,17 +197,18 @@ class TaxelArray:
 
     def _convert(self, y: Array) -> Image:
         """Noise, ADC, threshold, dead taxels."""
-        counts = y * _ADC_MAX
+        top = self.config.adc_max
+        counts = y * top
         if self.config.noise > 0.0:
-            counts += (self.config.noise * _ADC_MAX) * self._rng.standard_normal((SIDE, SIDE))
+            counts += (self.config.noise * top) * self._rng.standard_normal((SIDE, SIDE))
         counts += 0.5  # the conversion below cuts off
         np.maximum(counts, 0.0, out=counts)
-        np.minimum(counts, _ADC_MAX + 0.5, out=counts)
-        image = counts.astype(np.uint8)
-        image *= image >= self.config.threshold_counts
+        np.minimum(counts, top + 0.5, out=counts)
+        read: npt.NDArray[Any] = counts.astype(np.uint8 if top == _FULL_SCALE else np.uint16)
+        read *= read >= self.config.adc_threshold
         if self._has_dead:
-            image[self._dead] = 0
-        return image
+            read[self._dead] = 0
+        return read if top == _FULL_SCALE else read * float(_FULL_SCALE) / top
 
 
 def _saturate(x: Array) -> Array:

@@ -21,7 +21,7 @@ from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import chain, point_velocity
+from canprobe.robot.kinematics import chain, point_on_flange, point_velocity
 from canprobe.robot.puma260 import Array, counts_to_joints
 from canprobe.touch.objects import ClosestPoint, Touches
 
@@ -270,13 +270,7 @@ class Plant:
         if self.arm is None:
             return _Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = chain(self.arm.model, q)
-        a, b, d = self._tool_origin
-        (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = c.x, c.y, c.z, c.flange
-        centre = (
-            p0 + x0 * a + y0 * b + z0 * d,
-            p1 + x1 * a + y1 * b + z1 * d,
-            p2 + x2 * a + y2 * b + z2 * d,
-        )
+        centre = point_on_flange(c, self._tool_origin)
         axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
         b0, b1, b2 = self._base
         return _Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))

@@ -10,6 +10,8 @@ from canprobe.emulator.plant.arms import make_arm, make_equations
 from canprobe.emulator.plant.config import DynamicSettings, PlantConfig
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping
 from canprobe.emulator.plant.equations import Effects
+from canprobe.emulator.plant.held_step import held_rosenbrock2
+from canprobe.emulator.plant.integrators import rosenbrock2
 from canprobe.emulator.plant.reference import NEVER, Reference
 from canprobe.emulator.plant.world import Plant
 from canprobe.robot.actuation import counts_per_radian, motors_per_joint
@@ -88,7 +90,7 @@ def test_the_push_of_the_object_is_the_force_through_the_jacobian():
     for a in (arm, free):
         a.equations.hold(a._y)
     pushed = arm.equations.rate(0.0, arm._y) - free.equations.rate(0.0, free._y)
-    mass, _ = arm.equations._rigid(arm._y[:6], arm._y[6:12])
+    mass, _ = arm.equations.mass()
     J = forward_jacobian(UPENN, c.q0, TOOL)[1][:3]
     expected = np.linalg.inv(motors_per_joint()).T @ J.T @ (truth["force"] * truth["contact_normal"])
     assert mass @ pushed[6:12] == pytest.approx(expected, rel=1e-9, abs=1e-12)
@@ -102,10 +104,10 @@ def test_friction_drags_against_the_sliding_and_never_feeds_it():
     y[6:9] = 0.02, -0.03, 0.05
     for a in (arm, smooth):
         a.equations.hold(y)
-    mass, _ = arm.equations._rigid(y[:6], y[6:12])
+    mass, _ = arm.equations.mass()
     drag = mass @ (arm.equations.rate(0.0, y) - smooth.equations.rate(0.0, y))[6:12]
     power = float(drag @ y[6:12])
-    sliding = np.linalg.norm(arm.equations._contact._rows[1:] @ y[6:12])
+    sliding = np.linalg.norm(arm.equations.contact.rows[1:] @ y[6:12])
     normal_force = Plant(c).truth()["force"]
     assert sliding > 5e-3
     assert power == pytest.approx(-0.3 * normal_force * sliding, rel=0.05)
@@ -118,7 +120,7 @@ def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
     y[6:12] = 0.004, -0.006, 0.01, 0.02, -0.03, 0.01
     y[14] += 20.0  # one motor at its torque limit
     e.hold(y)
-    e.set_reference(0.0, y[:6] + 1e-4, np.full(6, 0.1))
+    e.loops.set_reference(0.0, (y[:6] + 1e-4).tolist(), [0.1] * 6)
     slope = np.array([(e.rate(0.0, y + d) - e.rate(0.0, y - d)) / 2e-7 for d in 1e-7 * np.eye(18)]).T
     J = e.jacobian(0.0, y)
     left_out = np.zeros((18, 18))
@@ -129,6 +131,24 @@ def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
     assert e.linearised(0.0, y, 7e-4).solve(r) == pytest.approx(
         np.linalg.solve(np.eye(18) - 7e-4 * J, r), rel=1e-9, abs=1e-12
     )
+
+
+@pytest.mark.parametrize("torque", [0.0, 20.0, -20.0], ids=["free", "at its limit", "at the other"])
+@pytest.mark.parametrize("effects", [Effects(), Effects(contact=False), Effects(links=False, friction=False)])
+def test_the_step_in_straight_line_code_is_the_general_step(effects, torque):
+    c, rng = config(velocity_feed_forward=0.5), np.random.default_rng(1)
+    e = make_equations(c, effects)
+    for _ in range(5):
+        y = make_arm(c)._y + rng.normal(size=18) * np.repeat((1e-5, 0.02, 0.5), 6)
+        y[14] += torque
+        e.hold(y)
+        e.loops.set_reference(0.3, (y[:6] + rng.normal(size=6) * 1e-4).tolist(), rng.normal(size=6).tolist())
+        e.loops.set_loop(1, 5.0, 0.1, -0.7)
+        new = rosenbrock2(e, 0.31, y, 625e-6)
+        change = np.abs(new - y)
+        assert np.abs(held_rosenbrock2(e, 0.31, y, 625e-6) - new).max() < 1e-10 * change.max()
+        away = y - np.concatenate((0.01 * e.contact.rows[0], np.zeros(12))) if e.contact is not None else y
+        assert held_rosenbrock2(e, 0.31, away, 625e-6) == pytest.approx(rosenbrock2(e, 0.31, away, 625e-6), abs=1e-10)
 
 
 def test_torque_ends_at_its_limit_and_the_motor_arrives_all_the_same():

@@ -271,8 +271,32 @@ def test_idle_array_reads_zero_through_the_threshold():
 def test_nothing_between_zero_and_the_threshold():
     config = TaxelConfig()
     image = touch(array(config), 1.0)
-    assert config.threshold_counts == 6  # 2 % of 255 is 5.1
+    assert config.adc_threshold == 6  # 2 % of 255 is 5.1
     assert image[image > 0].min() >= 6
+
+
+@pytest.mark.parametrize("bits", [8, 12])
+def test_an_adc_rounds_to_its_own_steps(bits):
+    """Against the exact pressure: error uniform over one step, so an RMS of a step over the root of 12."""
+    a = array(replace(LINEAR_TAXELS, adc_bits=bits))
+    step, errors = 255 / (2**bits - 1), []
+    for force in np.linspace(0.5, 2.5, 81):
+        depth = depth_for_force(force, CYLINDER, R, K)
+        exact = a.field.mean_pressure((3e-4, 1e-4), depth, CYLINDER, turned(0.3)) * K / 100e3 * 255
+        image = touch(a, force, uv=(3e-4, 1e-4), directions=turned(0.3))
+        assert np.abs(image / step - np.rint(image / step)).max() < 1e-9
+        errors.append((image - exact)[exact > 0.0])
+    errors = np.concatenate(errors)
+    assert errors.std() == pytest.approx(step / math.sqrt(12), rel=0.06)
+    assert abs(errors.mean()) < 0.05 * step
+    assert touch(a, 50.0).max() == 255
+
+
+def test_a_finer_adc_has_the_same_noise_and_threshold_and_other_figures_less_rounding():
+    a = array(TaxelConfig(adc_bits=12).without("creep", "hysteresis"))
+    images = np.array([touch(a, 2.0, t_s=0.005 * k) for k in range(400)])
+    assert images[:, 6:10, 6:10].std(axis=0).mean() == pytest.approx(0.005 * 255, rel=0.05)
+    assert 0.02 * 255 <= images[images > 0].min() < 0.0205 * 255
 
 
 def test_saturation_bends_then_clips():

@@ -11,6 +11,7 @@ from canprobe.emulator.plant.contact import elastic_contact
 from canprobe.emulator.plant.equations import Effects
 from canprobe.emulator.plant.field import SIDE
 from canprobe.emulator.plant.integrators import rosenbrock2
+from canprobe.emulator.plant.pushing import OneTouch
 from canprobe.emulator.plant.resting import force_laws, total_force
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS
 from canprobe.emulator.plant.world import Plant
@@ -117,8 +118,7 @@ def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
 
 def equations_of(config, held=False):
     found = make_equations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
-    found.cascade.velocity[:] = 0.0
-    found._gain, found._integral, found.cascade.unwind = [0.0] * 6, [0.0] * 6, 0.0
+    found.loops.gain, found.loops.integral, found.loops.unwind = [0.0] * 6, [0.0] * 6, 0.0
     return found
 
 
@@ -127,19 +127,20 @@ def bounced(config, steps=700, h=4e-4, speed=0.05):
     e = equations_of(config)
     theta = joints_to_counts(UPENN, config.q0) / np.diag(UPENN.counts)
     e.hold(e.resting(theta))
-    away = e._contact._rows[0] if hasattr(e._contact, "_s") else e._contact._normal.sum(axis=0)
-    v = -np.linalg.solve(e._mass, away)
+    away = e.contact.rows[0] if isinstance(e.contact, OneTouch) else e.contact._normal.sum(axis=0)
+    v = -e.mass()[1] @ away
     v *= speed / abs(float(away @ v))
     y = np.concatenate((theta, v, np.zeros(6)))
 
     def kinetic(y):
-        return 0.5 * float(y[6:12] @ e._rigid(y[:6], y[6:12])[0] @ y[6:12])
+        e.hold(y)
+        return 0.5 * float(y[6:12] @ e.mass()[0] @ y[6:12])
 
     before, deepest = kinetic(y), 0.0
     for i in range(steps):
         y = rosenbrock2(e, i * h, y, h)
         e.hold(y)
-        push = e._contact.push(y[:6].tolist(), y[6:12].tolist()) if e._contact is not None else None
+        push = e.contact.push(y[:6].tolist(), y[6:12].tolist()) if e.contact is not None else None
         deepest = max(deepest, 0.0 if push is None else float(np.abs(push).max()))
         if push is None and i > 20:
             break

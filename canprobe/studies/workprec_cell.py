@@ -1,0 +1,250 @@
+"""The other half of study `workprec`: error of the whole cell against what it computes in a second.
+
+Each cell of the sweep is a scan of scene `cylinder` in lockstep: master, bus, emulated nodes and plant in one process.
+Its cost is processor time a second of the scan; its errors are those of the surface felt (curvature, normal) and of the
+true force. The plan is asked first: what a bus cannot carry is a row with the plan's reason, and is tried again with
+CAN FD for the taxels. What the drives send and get is classical all the same, so that a rate stays beyond a bus of
+1 Mbit/s. The knee is the cheapest combination whose errors are all small enough (`ENOUGH`). There is one scan a
+combination: two of a setting with other noise differ by some tenths of their errors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import numpy as np
+
+from canprobe.api import run as run_scene
+from canprobe.cell.tasks.touch import Phase
+from canprobe.errors import PlanError, SafetyStop
+from canprobe.planning import make_plan
+from canprobe.scene import PlantSettings, Scene
+from canprobe.scene_loader import load_scene
+from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.study_files import measuring_facts
+from canprobe.studies.sweep import Sweep
+from canprobe.touch.estimators import METHODS
+
+RATES_HZ = (100.0, 200.0, 400.0, 500.0, 1000.0, 2000.0)
+MODES = ("features", "window", "image")
+FIDELITIES = ("ideal", "dynamic")
+SENSOR_HZ = {500.0: 250.0}
+"""Of the tactile frames where 200 Hz, or the servo's rate if that is less, does not divide the servo's."""
+ENOUGH = {"curvature_percent": 2.0, "normal_deg": 0.2, "force_percent": 6.0}
+"""Errors that count as small enough: the force as the servo is to keep it at 25 mm/s; shape and normal assumed."""
+MEASURES = tuple(ENOUGH)
+COLUMNS = (
+    Column("rate_hz", "servo Hz", ".0f"),
+    Column("mode", "sensor"),
+    Column("bus", "bus"),
+    Column("method", "estimator"),
+    Column("fidelity", "plant"),
+    Column("cost_ms_per_s", "ms a second", ".0f"),
+    Column("curvature_percent", "curvature %", ".1f"),
+    Column("normal_deg", "normal deg", ".2f"),
+    Column("force_percent", "force %", ".1f"),
+    Column("ended", "ended"),
+    Column("reason", "why"),
+)
+Row = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What bus and plan have to carry."""
+
+    rate_hz: float
+    mode: str
+    fd: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One scan."""
+
+    setting: Setting
+    method: str
+    fidelity: str
+    duration_s: float
+    seed: int
+
+
+def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Ask the plan for every setting, and scan with what fits, one scan at a time."""
+    rates, modes = ((200.0, 500.0), MODES[1:2]) if quick else (RATES_HZ, MODES)
+    methods = ("recursive",) if quick else METHODS
+    first = [Setting(rate, mode, False) for rate, mode in product(rates, modes)]
+    why = dict(zip(first, sweep.map(refusal, first), strict=True))
+    again = [replace(s, fd=True) for s in first if why[s] is not None]
+    why |= dict(zip(again, sweep.map(refusal, again), strict=True))
+    fits = [s for s, reason in why.items() if reason is None]
+    todo = [
+        Case(s, method, fidelity, 1.0 if quick else 2.0, 1)
+        for s, method, fidelity in product(fits, methods, FIDELITIES)
+    ]
+    sweep.say(f"{len(todo)} scans, timed one after another; {len(why) - len(fits)} settings are refused by the plan")
+    answers = dict(zip(todo, sweep.time(measure, todo), strict=True))
+    rows = [_row(case, answer) for case, answer in answers.items()]
+    rows += [
+        {**_named(s), "method": "any", "fidelity": "any", "ended": "refused", "reason": reason}
+        for s, reason in why.items()
+        if reason is not None
+    ]
+
+    def draw(path: Path) -> None:
+        from canprobe.studies.workprec_cell_figure import draw_cell
+
+        draw_cell(rows, path)
+
+    return StudyResult("workprec_cell", COLUMNS, rows, findings(rows), measuring_facts(quick, 1), draw)
+
+
+def scene_of(setting: Setting) -> Scene:
+    """The scene with the default estimator and plant."""
+    scene = load_scene("cylinder")
+    assert scene.sensor is not None and scene.shape is not None
+    rate = setting.rate_hz
+    eds = "tactile_array_fd.eds" if setting.fd else scene.sensor.eds
+    sensor = replace(scene.sensor, mode=setting.mode, rate_hz=SENSOR_HZ.get(rate, min(rate, 200.0)), eds=eds)  # type: ignore[arg-type]
+    return replace(
+        scene,
+        cycle=replace(scene.cycle, rate_hz=rate),
+        sensor=sensor,
+        bus=replace(scene.bus, fd=setting.fd),
+        shape=replace(scene.shape, also=()),
+        task=replace(scene.task, clearance_mm=0.5),
+    )
+
+
+def refusal(setting: Setting) -> str | None:
+    """Why the plan refuses a setting; None where it fits."""
+    try:
+        make_plan(scene_of(setting))
+    except PlanError as error:
+        return str(error).splitlines()[0].partition("; ways out")[0]
+    return None
+
+
+def measure(case: Case) -> dict[str, Any]:
+    """Errors of a scan, and its cost in ms of processor time a second."""
+    scene = scene_of(case.setting)
+    assert scene.shape is not None
+    scene = replace(
+        scene,
+        shape=replace(scene.shape, method=case.method),  # type: ignore[arg-type]
+        plant=replace(scene.plant or PlantSettings(), fidelity=case.fidelity),  # type: ignore[arg-type]
+    )
+    spent: list[float] = []
+    try:
+        result = run_scene(
+            scene, files=False, seed=case.seed, duration_s=case.duration_s,
+            observers=[lambda seen: spent.append(process_time()) if seen.measurement is not None else None],
+        )  # fmt: skip
+    except SafetyStop as stop:
+        return {"ended": "stopped", "reason": stop.reason}
+    scan = np.flatnonzero(result.log["phase"] == Phase.SCAN)
+    seconds = float(result.log["t_s"][scan[-1]] - result.log["t_s"][scan[0]])
+    shape, contact = result.summary["shape"], result.summary["contact"]
+    return {
+        "ended": "done",
+        "cost_ms_per_s": 1e3 * (spent[scan[-1]] - spent[scan[0]]) / seconds,
+        "curvature_percent": shape["kappa_rms_error_percent"],
+        "normal_deg": shape["normal_rms_deg"],
+        "force_percent": 100.0 * contact["force_rms_error_n"] / contact["force_target_n"],
+    }
+
+
+def _named(setting: Setting) -> Row:
+    return {"rate_hz": setting.rate_hz, "mode": setting.mode, "bus": "FD" if setting.fd else "classical"}
+
+
+def _row(case: Case, answer: Row) -> Row:
+    return {**_named(case.setting), "method": case.method, "fidelity": case.fidelity, "reason": "", **answer}
+
+
+def good(rows: Iterable[Row], fidelity: str) -> list[Row]:
+    """The rows of a fidelity whose errors are all small enough, the cheapest first."""
+    mine = [r for r in rows if r["fidelity"] == fidelity and all(r.get(m) is not None for m in MEASURES)]
+    found = [r for r in mine if all(r[m] <= most for m, most in ENOUGH.items())]
+    return sorted(found, key=lambda r: float(r["cost_ms_per_s"]))
+
+
+def default_of(rows: Iterable[Row], fidelity: str) -> Row | None:
+    """The row of what scene `cylinder` does by default, on a plant of a fidelity."""
+    scene = load_scene("cylinder")
+    assert scene.sensor is not None and scene.shape is not None
+    mine = scene.cycle.rate_hz, scene.sensor.mode, scene.shape.method, fidelity
+    return next((r for r in rows if (r["rate_hz"], r["mode"], r["method"], r["fidelity"]) == mine), None)
+
+
+def findings(rows: Sequence[Row]) -> list[str]:
+    """The knee of each fidelity and the default beside it, what fidelity changes, and what did not come about."""
+    said: list[str] = []
+    for fidelity in FIDELITIES:
+        best, mine = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
+        said.append(f"Plant {fidelity}: {_knee(best)}.")
+        if mine is not None and mine is best:
+            said.append("  It is the default.")
+        elif mine is not None:
+            said.append(f"  It is not the default, {_told(mine)}{_times(mine, best)}.")
+    return [*said, *_of_the_plant(rows), *_not_done(rows)]
+
+
+def _knee(best: Row | None) -> str:
+    limits = f"{ENOUGH['curvature_percent']:g} %, {ENOUGH['normal_deg']:g}° and {ENOUGH['force_percent']:g} %"
+    if best is None:
+        return f"no combination is within {limits} of curvature, normal and force"
+    return f"the knee, the cheapest within {limits} of curvature, normal and force, is {_told(best)}"
+
+
+def _times(mine: Row, best: Row | None) -> str:
+    if best is None or mine["ended"] != "done":
+        return ""
+    return f": {mine['cost_ms_per_s'] / best['cost_ms_per_s']:.1f} × that cost"
+
+
+def _of_the_plant(rows: Sequence[Row]) -> list[str]:
+    """How much dearer the dynamic plant is, and what its errors are over those of the ideal one."""
+    key: Callable[[Row], tuple[Any, ...]] = lambda r: (r["rate_hz"], r["mode"], r["method"])  # noqa: E731
+    done = {(*key(r), r["fidelity"]): r for r in rows if r["ended"] == "done"}
+    pairs = [(r, done[*k[:3], "ideal"]) for k, r in done.items() if k[3] == "dynamic" and (*k[:3], "ideal") in done]
+    if not pairs:
+        return []
+    shares = {m: [a[m] / b[m] for a, b in pairs if a[m] is not None and b[m]] for m in ("cost_ms_per_s", *MEASURES)}
+    middle = {m: float(np.median(values)) for m, values in shares.items() if values}
+    names = dict(zip(("cost_ms_per_s", *MEASURES), ("cost", "curvature", "normal", "force"), strict=True))
+    told = ", ".join(f"{names[m]} {value:.2f} ×" for m, value in middle.items())
+    return [f"The dynamic plant over the ideal one, median of {len(pairs)} pairs: {told}."]
+
+
+def _not_done(rows: Sequence[Row]) -> list[str]:
+    """What was stopped and what was refused, shortly; the reasons are in the table."""
+    said = []
+    stopped = [r for r in rows if r["ended"] == "stopped"]
+    for fidelity in FIDELITIES:
+        mine = sorted({(r["mode"], r["method"]) for r in stopped if r["fidelity"] == fidelity})
+        count = sum(r["fidelity"] == fidelity for r in stopped)
+        if mine:
+            said.append(f"Stopped for safety, plant {fidelity}, {count} scans: {', '.join(map(' '.join, mine))}.")
+    for bus in ("classical", "FD"):
+        refused = [f"{r['rate_hz']:.0f} Hz {r['mode']}" for r in rows if r["ended"] == "refused" and r["bus"] == bus]
+        if refused:
+            said.append(f"Refused by the plan, bus {bus}: {', '.join(refused)}.")
+    return said
+
+
+def _told(row: Row) -> str:
+    what = f"{row['rate_hz']:.0f} Hz, {row['mode']}, {row['bus']}, {row['method']}"
+    if row["ended"] != "done":
+        return f"{what}, {row['ended']}: {row['reason']}"
+    if any(row[m] is None for m in MEASURES):
+        return f"{what}, {row['cost_ms_per_s']:.0f} ms a second, without an answer on the shape"
+    return (
+        f"{what}: {row['cost_ms_per_s']:.0f} ms a second for {row['curvature_percent']:.1f} % of curvature, "
+        f"{row['normal_deg']:.2f}° of normal, {row['force_percent']:.1f} % of force"
+    )
