@@ -35,10 +35,13 @@ class SurfaceGains:
     Args:
         height_hz: bandwidth of the height correction (Hz).
         tilt_hz: bandwidth of the normal's correction (Hz).
+        curvature_hz: bandwidth with which a new curvature is taken up (Hz): at once it would turn the normal ahead of
+            the last sample by its change times that distance, and the probe with it.
     """
 
     height_hz: float = 8.0
     tilt_hz: float = 6.0
+    curvature_hz: float = 4.0
 
 
 class LocalSurface:
@@ -56,7 +59,7 @@ class LocalSurface:
         self._point: Floats
         self._normal: Floats
         self.move_to(point, normal)
-        self._curvature: list[list[float]] = [[0.0] * 3] * 3
+        self._curvature = self._wanted = [[0.0] * 3] * 3
         self._gains = gains
 
     @property
@@ -113,6 +116,11 @@ class LocalSurface:
         tilt = 1 - math.exp(-2 * math.pi * self._gains.tilt_hz * dt)
         self._point = tuple([fi + mi * height * error for fi, mi in zip(foot, m, strict=True)])
         self._normal = _unit([mi + (ni - mi) * tilt for mi, ni in zip(m, n, strict=True)])
+        share = 1 - math.exp(-2 * math.pi * self._gains.curvature_hz * dt)
+        self._curvature = [
+            [k + share * (w - k) for k, w in zip(row, wanted, strict=True)]
+            for row, wanted in zip(self._curvature, self._wanted, strict=True)
+        ]
         return error
 
     def raise_by(self, height: float) -> None:
@@ -125,8 +133,8 @@ class LocalSurface:
         self._normal = _unit(normal.tolist())
 
     def set_curvature(self, tensor: Vector) -> None:
-        """Take the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
-        self._curvature = tensor.tolist()
+        """Go over to the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame, with the next samples."""
+        self._wanted = tensor.tolist()
 
 
 @dataclass(frozen=True, slots=True)
