@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
+SUPPORT = CONFTEST.parent / "support"
+WORKERS = ("-n", "2", "--dist", "loadgroup")
 
 ADDED = """
 _has_interface = lambda: False
@@ -72,7 +74,8 @@ def project(tmp_path: Path) -> Path:
     (tmp_path / "conftest.py").write_text(CONFTEST.read_text() + ADDED.format(stand_in=str(stand_in)))
     (tmp_path / "test_it.py").write_text(TESTS)
     (tmp_path / "test_native.py").write_text("import os\ndef test_outside():\n    assert 'INSIDE' not in os.environ\n")
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n    vcan: stand-in\naddopts = -p no:cacheprovider\n")
+    ini = f"[pytest]\nmarkers =\n    vcan: stand-in\naddopts = -p no:cacheprovider\npythonpath = {SUPPORT}\n"
+    (tmp_path / "pytest.ini").write_text(ini)
     return tmp_path
 
 
@@ -95,11 +98,12 @@ def counts(output: str) -> dict[str, int]:
     return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
 
 
-def test_outcomes_and_texts_come_back(project: Path) -> None:
-    status, output = run(project, STAND_IN="runs", CANPROBE_INSTALL="1")
+@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
+def test_outcomes_and_texts_come_back(project: Path, workers: tuple[str, ...]) -> None:
+    status, output = run(project, *workers, STAND_IN="runs", CANPROBE_INSTALL="1")
     assert status == 1
     assert counts(output) == {"passed": 5, "failed": 1, "skipped": 1, "xfailed": 1, "error": 1}
-    assert "arguments ['vcan', '--install', '--', 'true']" in output, "CANPROBE_INSTALL=1 installs before anything runs"
+    assert output.count("arguments ['vcan', '--install', '--', 'true']") == 1, "CANPROBE_INSTALL=1 installs, once"
     for text in ("assert 'vcan0' == 'vcan1'", "said before", "for its own reason", "RuntimeError: broken fixture"):
         assert text in output
 
@@ -120,8 +124,11 @@ def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> Non
 @pytest.mark.parametrize(
     ("required", "expected"), [("", {"passed": 1, "skipped": 8}), ("1", {"passed": 1, "error": 8})]
 )
-def test_without_a_vcan_they_are_skipped_loudly_or_fail(project: Path, required: str, expected: dict[str, int]) -> None:
-    status, output = run(project, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
+@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
+def test_without_a_vcan_they_are_skipped_loudly_or_fail(
+    project: Path, required: str, expected: dict[str, int], workers: tuple[str, ...]
+) -> None:
+    status, output = run(project, *workers, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
     assert (status, counts(output)) == (1 if required else 0, expected)
     assert "apt-get install -y something" in output
     assert ("8 tests were NOT RUN" in output) == (not required)
