@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import MonotonicClock
@@ -76,6 +77,11 @@ class Command:
             except OSError:
                 continue
         return found
+
+    def until_told(self, text: str) -> Command:
+        """Until this stands on stderr."""
+        wait_until(lambda: text in self.err, lambda: self.running, lambda: self.err)
+        return self
 
     def send(self, number: int) -> None:
         self._process.send_signal(number)

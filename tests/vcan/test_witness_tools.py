@@ -110,11 +110,7 @@ def send(frame: str) -> None:
 def emulator(start_shared: Any) -> Any:
     """A drive and a sensor from their EDS files, started once."""
     pairs = ("--eds", "puma260_joint", "--node-id", 5, "--eds", "tactile_array", "--node-id", 16)
-    command = start_shared("emulate", *pairs, "--channel", "vcan0")
-    while not command.err.startswith("serving nodes"):
-        assert command.running, command.err
-        time.sleep(0.1)
-    return command
+    return start_shared("emulate", *pairs, "--channel", "vcan0").until_told("serving nodes")
 
 
 @pytest.fixture
