@@ -86,9 +86,9 @@ class Command:
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 
-    def wait(self) -> int:
+    def wait(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; return the exit status. Nothing may be left of it."""
-        status = self._process.wait(PATIENCE_S)
+        status = self._process.wait(patience_s)
         assert self.children == []
         return status
 
