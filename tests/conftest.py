@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -66,11 +67,14 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> sharing.ByFi
     return sharing.ByFile(config, log)
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_configure_node(node: Any) -> None:
+    sharing.tell_worker(node.config, node.workerinput)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """The vcan tests first and one after the other: no cell on vcan0 meets another test's frames."""
     items.sort(key=lambda item: not _is_vcan(item))
-    for item in filter(_is_vcan, items):
-        item.add_marker(pytest.mark.xdist_group("vcan"))
+    sharing.list_vcan_tests(config, [item.nodeid for item in items if _is_vcan(item)])
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
@@ -161,14 +165,15 @@ class OuterRun:
     def _start(self, items: Iterable[pytest.Item]) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="canprobe-tests-", ignore_cleanup_errors=True)
         folder = Path(self._folder.name)
-        nodeids = [sharing.without_group(item.nodeid) for item in items]
+        nodeids = [item.nodeid for item in items]
         (folder / "items.json").write_text(json.dumps(nodeids))
         (folder / "reports.jsonl").touch()
         files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
         options = ["-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        end_with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # however we end
         with (folder / "output").open("wb") as output:
             self._process = subprocess.Popen(
-                [*_CANPROBE, "vcan", "--", sys.executable, "-m", "pytest", *options, *files],
+                [*end_with_us, *_CANPROBE, "vcan", "--", sys.executable, "-m", "pytest", *options, *files],
                 cwd=self._config.rootpath,
                 env={**os.environ, _INNER: str(folder)},
                 stdin=subprocess.DEVNULL,
@@ -180,15 +185,12 @@ class OuterRun:
 
     def _wait_for(self, item: pytest.Item) -> list[pytest.TestReport]:
         """Return the item's reports from the inner session; whatever is missing there is a failure here."""
-        mine = self._reports.setdefault(sharing.without_group(item.nodeid), [])
+        mine = self._reports.setdefault(item.nodeid, [])
         for line in self._lines:
             report = self._read(line)
-            theirs = self._reports.setdefault(report.nodeid, [])
-            theirs.append(report)
-            if theirs is mine and report.when == "teardown":
+            self._reports.setdefault(report.nodeid, []).append(report)
+            if report.nodeid == item.nodeid and report.when == "teardown":
                 break
-        for report in mine:
-            report.nodeid = item.nodeid
         if mine and mine[-1].when == "teardown":
             return mine
         return [*mine, self._missing(item)]

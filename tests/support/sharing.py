@@ -2,10 +2,19 @@
 
 from __future__ import annotations
 
+import functools
+import json
 import os
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
 
 import pytest
-from xdist.scheduler import LoadGroupScheduling
+from xdist.scheduler import LoadScopeScheduling
+
+_LIST = "canprobe_vcan_tests"
+_PATH = pytest.StashKey[Path]()
 
 
 def is_worker(config: pytest.Config) -> bool:
@@ -21,13 +30,30 @@ def count_workers(config: pytest.Config) -> int:
     return 0 if by_itself or processors == 1 else processors
 
 
-def without_group(nodeid: str) -> str:
-    """Return a test's name without the group that pytest-xdist has written behind it."""
-    return nodeid.removesuffix("@vcan")
+def tell_worker(config: pytest.Config, workerinput: dict[str, Any]) -> None:
+    """Tell a worker of this session where to list the vcan tests: only who collects tests sees their markers."""
+    if _PATH not in config.stash:
+        folder = tempfile.TemporaryDirectory(prefix="canprobe-tests-")
+        config.add_cleanup(folder.cleanup)
+        config.stash[_PATH] = Path(folder.name) / "vcan.json"
+    workerinput[_LIST] = str(config.stash[_PATH])
 
 
-class ByFile(LoadGroupScheduling):
-    """A worker takes a group, or a file, so that fixtures of a file are made once."""
+def list_vcan_tests(config: pytest.Config, nodeids: Iterable[str]) -> None:
+    """In a worker: write down which tests are vcan tests. Every worker writes the same."""
+    if is_worker(config):
+        path = Path(config.workerinput[_LIST])
+        new = path.with_suffix(f".{os.getpid()}")
+        new.write_text(json.dumps(list(nodeids)))
+        new.replace(path)
+
+
+class ByFile(LoadScopeScheduling):
+    """A worker takes a file, so that what its tests share is made once; the vcan tests count as one file."""
+
+    @functools.cached_property
+    def _vcan_tests(self) -> frozenset[str]:
+        return frozenset(json.loads(self.config.stash[_PATH].read_text()))
 
     def _split_scope(self, nodeid: str) -> str:
-        return super()._split_scope(nodeid).partition("::")[0]
+        return "vcan" if nodeid in self._vcan_tests else nodeid.partition("::")[0]
