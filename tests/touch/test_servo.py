@@ -131,6 +131,20 @@ def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
     assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))
 
 
+@pytest.mark.parametrize("steps", [1, 40])
+def test_a_correction_leaves_one_in_e_after_the_time_constant_of_its_bandwidth(steps):
+    """Bandwidth f is a first-order low pass of the time constant 1 / (2 π f), in however many samples."""
+    gains = SurfaceGains(height_hz=8.0, tilt_hz=6.0)
+    local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), gains)
+    for _ in range(steps):
+        local.correct(np.array((0.0, 0.0, 1e-3)), np.array((0.0, 0.0, 1.0)), 1 / (2 * np.pi * 8.0) / steps)
+    assert local.point[2] == pytest.approx(1e-3 * (1 - np.exp(-1)), rel=1e-9)
+    tilted = np.array((1e-4, 0.0, np.sqrt(1 - 1e-8)))
+    for _ in range(steps):
+        local.correct(local.point, tilted, 1 / (2 * np.pi * 6.0) / steps)
+    assert local.normal[0] == pytest.approx(1e-4 * (1 - np.exp(-1)), rel=1e-6)
+
+
 def test_raising_the_model_moves_it_outward_and_leaves_its_normal():
     n = np.array((0.6, 0.0, 0.8))
     surface = LocalSurface(np.array((0.01, 0.02, 0.03)), n, SurfaceGains())
