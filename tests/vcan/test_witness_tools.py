@@ -140,7 +140,7 @@ def read_log(path: Path) -> Frames:
 
 
 def slow_scene(path: Path) -> Path:
-    """The scene `press` at 100 Hz, its drives with the patience of `Bench.scene`: a slow machine must not decide here."""
+    """The scene `press` at 100 Hz with patient drives, as `Bench.scene`: a slow machine must not decide here."""
     text = re.sub(r"missed_syncs = .*\n", "", (SCENES / "press.toml").read_text())
     text = text.replace("[arm]\n", "[arm]\nmissed_syncs = 20\n").replace("[sensor]\n", "[sensor]\nrate_hz = 50\n")
     path.write_text(f"{text}\n[cycle]\nrate_hz = 100\n")
