@@ -1,8 +1,9 @@
 """Plumbing of the whole suite: tests marked `vcan` run on a real SocketCAN interface, in a guest machine if need be.
 
-Where this kernel has a vcan0, they simply run. Elsewhere one `canprobe vcan -- python -m pytest ...` runs all of them
-before the other tests, and each one's outcome there, with its duration and failure text, becomes its outcome here.
-Where no vcan can be had they are skipped, and the summary says what to type.
+Where this kernel has a vcan0, they simply run. Elsewhere one `canprobe vcan -- python -m pytest ...` runs all of them,
+and each one's outcome there, with its duration and failure text, becomes its outcome here. Where no vcan can be had
+they are skipped, and the summary says what to type. Folders of tests are shared between the processors (`sharing`):
+the vcan tests, one after the other, are the share of one worker, which waits for the guest on a processor of its own.
 
     CANPROBE_REQUIRE_VCAN=1   a missing vcan is a failure, never a skip
     CANPROBE_INSTALL=1        install the guest's Debian package if it is missing (needs root)
@@ -12,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,6 +25,7 @@ from typing import Any
 
 import hypothesis
 import pytest
+import sharing
 
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import InterfaceError
@@ -33,6 +36,7 @@ hypothesis.settings.load_profile("canprobe")
 _CHANNEL = "vcan0"
 _INNER = "CANPROBE_TEST_VCAN_FOLDER"
 _NO_VCAN = 125
+_NOT_RUN = "not run for want of a vcan"
 _CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 
 
@@ -49,20 +53,40 @@ def pytest_configure(config: pytest.Config) -> None:
     if folder := os.environ.get(_INNER):
         config.pluginmanager.register(InnerRun(config, Path(folder)))
     elif not _has_interface():
-        if os.environ.get("CANPROBE_INSTALL") == "1":
+        if os.environ.get("CANPROBE_INSTALL") == "1" and not sharing.is_worker(config):
             install = [*_CANPROBE, "vcan", "--install", "--", "true"]
             subprocess.run(install, cwd=config.rootpath, stdin=subprocess.DEVNULL, check=False)
         config.pluginmanager.register(OuterRun(config))
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """The vcan tests first, and alone: a cell at 400 Hz shares its processor with no other test."""
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    return 0 if _INNER in os.environ else sharing.count_workers(config)
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> sharing.ByFile:
+    return sharing.ByFile(config, log)
+
+
+def pytest_configure_node(node: Any) -> None:
+    sharing.tell_worker(node.config, node.workerinput)
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """The vcan tests first and one after the other: no cell on vcan0 meets another test's frames."""
     items.sort(key=lambda item: not _is_vcan(item))
+    sharing.list_vcan_tests(config, [item.nodeid for item in items if _is_vcan(item)])
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if _is_vcan(item):
         _require_interface()
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    reasons = [dict(report.user_properties).get(_NOT_RUN) for report in terminalreporter.stats.get("skipped", ())]
+    if why := [reason for reason in reasons if reason is not None]:
+        terminalreporter.section("vcan", sep="!", red=True, bold=True)
+        terminalreporter.line(f"{len(why)} tests were NOT RUN for want of a vcan. {why[-1]}", red=True)
 
 
 def _is_vcan(item: pytest.Item) -> bool:
@@ -106,7 +130,7 @@ class InnerRun:
 
 
 class OuterRun:
-    """The session without a vcan: start the inner one before all else, and report what that one found."""
+    """The session without a vcan: start the inner one for the first vcan test, and report what that one found."""
 
     def __init__(self, config: pytest.Config) -> None:
         self._config = config
@@ -114,29 +138,18 @@ class OuterRun:
         self._process: subprocess.Popen[bytes] | None = None
         self._reports: dict[str, list[pytest.TestReport]] = {}
         self._lines: Iterator[str] = iter(())
-        self._not_run = 0
-        self._why = ""
-
-    @pytest.hookimpl(tryfirst=True)
-    def pytest_runtestloop(self, session: pytest.Session) -> None:
-        items = [item for item in session.items if _is_vcan(item)]
-        if items and not session.testsfailed and not session.config.option.collectonly:
-            self._start(items)
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_runtest_protocol(self, item: pytest.Item) -> bool | None:
-        if not _is_vcan(item) or self._process is None:
+        if not _is_vcan(item):
             return None
+        if self._process is None:
+            self._start(filter(_is_vcan, item.session.items))
         item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
         for report in self._wait_for(item):
             item.ihook.pytest_runtest_logreport(report=report)
         item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
         return True
-
-    def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        if self._not_run:
-            terminalreporter.section("vcan", sep="!", red=True, bold=True)
-            terminalreporter.line(f"{self._not_run} tests were NOT RUN for want of a vcan. {self._why}", red=True)
 
     def pytest_unconfigure(self) -> None:
         if self._process is not None and self._process.poll() is None:
@@ -156,10 +169,11 @@ class OuterRun:
         (folder / "items.json").write_text(json.dumps(nodeids))
         (folder / "reports.jsonl").touch()
         files = dict.fromkeys(nodeid.partition("::")[0] for nodeid in nodeids)
-        options = ["-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        options = ["-n0", "-m", "vcan", f"--rootdir={self._config.rootpath}", f"--tb={self._config.option.tbstyle}"]
+        end_with_us = ["setpriv", "--pdeathsig", "TERM"] if shutil.which("setpriv") else []  # however we end
         with (folder / "output").open("wb") as output:
             self._process = subprocess.Popen(
-                [*_CANPROBE, "vcan", "--", sys.executable, "-m", "pytest", *options, *files],
+                [*end_with_us, *_CANPROBE, "vcan", "--", sys.executable, "-m", "pytest", *options, *files],
                 cwd=self._config.rootpath,
                 env={**os.environ, _INNER: str(folder)},
                 stdin=subprocess.DEVNULL,
@@ -193,10 +207,11 @@ class OuterRun:
         output = (Path(self._folder.name) / "output").read_text(errors="replace")
         required = os.environ.get("CANPROBE_REQUIRE_VCAN") == "1"
         if status == _NO_VCAN and not required:
-            self._not_run += 1
-            self._why = output.strip().rpartition("\n")[2]
+            why = output.strip().rpartition("\n")[2]
             path, line, _ = item.location
-            return _report(item, "skipped", (path, (line or 0) + 1, f"Skipped: {self._why}"))
+            report = _report(item, "skipped", (path, (line or 0) + 1, f"Skipped: {why}"))
+            report.user_properties = [(_NOT_RUN, why)]
+            return report
         tail = "\n".join(output.splitlines()[-40:])
         return _report(item, "failed", f"not reported where the vcan is; that session ended with {status}:\n{tail}")
 

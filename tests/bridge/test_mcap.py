@@ -11,6 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
+from runs import undrawn_run
 
 import canprobe
 import canprobe.errors
@@ -185,7 +186,7 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
 
 
 def test_a_log_without_a_shape_goes_into_a_file_too(tmp_path):
-    canprobe.run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
+    undrawn_run(canprobe.load_scene("free"), out=tmp_path, duration_s=0.1)
     with (tmp_path / "scene.toml").open("a") as scene:
         scene.write('\n[bridge]\nuse = ["ros2"]\n')  # fed the run, not its replay
     replayed = replay_into(tmp_path, ("mcap",))

@@ -10,6 +10,7 @@ import sys
 
 import pytest
 from mcap.reader import make_reader
+from waiting import wait_for_size
 
 import canprobe
 from canprobe.bridge import process as process_module
@@ -113,10 +114,8 @@ def test_an_interrupt_ends_run_and_bridge_with_a_whole_file(tmp_path):
     command = [sys.executable, "-m", "canprobe", "run", "free", "--duration", "600", "--bridge", "mcap"]
     run = subprocess.Popen([*command, "--out", tmp_path], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
     try:
-        while run.poll() is None:
-            if (tmp_path / "bus.log").exists() and (tmp_path / "bus.log").stat().st_size > 500_000:
-                run.send_signal(signal.SIGINT)
-                break
+        wait_for_size(tmp_path / "bus.log", 500_000, run)
+        run.send_signal(signal.SIGINT)
         _, error = run.communicate(timeout=60)
     finally:
         run.kill()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import CandumpWriter, RecordingPort
@@ -88,22 +89,16 @@ class Stalling:
         return command
 
 
-def undrawn_run(scene, out):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("canprobe.api._draw", lambda result, folder: None)
-        return canprobe.run(scene, out=out)
-
-
 @pytest.fixture(scope="session")
 def lockstep_run(tmp_path_factory):
     """A run in lockstep, with all its files."""
-    return undrawn_run(short_scan(), tmp_path_factory.mktemp("recorded") / "lockstep")
+    return undrawn_run(short_scan(), out=tmp_path_factory.mktemp("recorded") / "lockstep")
 
 
 @pytest.fixture(scope="session")
 def motion_run(tmp_path_factory):
     """The same without the contact patch, whose share in an answer is taken or left: a small change may decide it."""
-    return undrawn_run(short_scan(patch=False), tmp_path_factory.mktemp("recorded") / "motion")
+    return undrawn_run(short_scan(patch=False), out=tmp_path_factory.mktemp("recorded") / "motion")
 
 
 @pytest.fixture(scope="session")

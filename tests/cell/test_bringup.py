@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.cell.bringup import configuration_date
@@ -180,10 +181,10 @@ def renumbered(text):
 def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     scene = canprobe.load_scene("free")
     scene = replace(scene, arm=replace(scene.arm, eds=str(other_make(tmp_path))))
-    result = canprobe.run(scene, out=tmp_path / "out", duration_s=1.0)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=1.0)
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q"][:, 5]) > 0.01
-    assert canprobe.run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+    assert undrawn_run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
 def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):

@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import read_candump
@@ -22,7 +23,7 @@ STEP_NS = 100_000_000
 def recorded(tmp_path_factory):
     """A short press: its result, its frames, and the monitor at the end of the hold."""
     folder = tmp_path_factory.mktemp("press")
-    result = canprobe.run(load_scene("press"), out=folder, duration_s=0.3)
+    result = undrawn_run(load_scene("press"), out=folder, duration_s=0.3)
     frames = [(can_id, data, t_ns) for t_ns, _, can_id, data in read_candump(folder / "bus.log")]
     return result, frames
 

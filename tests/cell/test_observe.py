@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.api import Command
@@ -51,7 +52,7 @@ def test_an_observer_that_fails_is_left_out_and_the_run_goes_on(free, tmp_path):
         if observation.measurement is not None and observation.measurement.cycle == 5:
             raise ValueError("no disk")
 
-    result = canprobe.run(free, out=tmp_path, duration_s=0.1, observers=(fragile, watcher))
+    result = undrawn_run(free, out=tmp_path, duration_s=0.1, observers=(fragile, watcher))
     assert result.summary["completed"]
     assert [fault for fault in result.summary["faults"] if "fragile" in fault and "no disk" in fault]
     assert len(result.summary["faults"]) == 1
@@ -60,7 +61,7 @@ def test_an_observer_that_fails_is_left_out_and_the_run_goes_on(free, tmp_path):
 
 
 def test_without_observers_nothing_is_kept_and_nothing_is_said(free, tmp_path):
-    result = canprobe.run(free, out=tmp_path, duration_s=0.1)
+    result = undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert result.summary["cycle"]["observe_us"] is None and result.summary["bridges"] is None
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from waiting import wait_for_size
 
 from canprobe.bus.candump import read_candump
 from canprobe.bus.socketcan import has_socketcan
@@ -167,8 +168,7 @@ def test_a_folder_that_cannot_be_made(tmp_path):
 def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, tmp_path):
     process = start(tmp_path, "run", "cylinder", "--out", "results")
     results = tmp_path / "results"
-    while not (log := results / "bus.log").exists() or log.stat().st_size < 1 << 20:  # in the scan, by its volume
-        assert process.poll() is None, process.communicate()
+    wait_for_size(log := results / "bus.log", 1 << 20, process)  # in the scan, by its volume
     process.send_signal(number)
     out, err = process.communicate()
     assert (process.returncode, out) == (status, "")

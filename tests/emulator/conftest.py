@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from canopen.objectdictionary import ObjectDictionary
 from canopen.objectdictionary.eds import import_eds
+from sdo_words import SdoWords
 
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
@@ -103,7 +104,7 @@ def make_tiny_od() -> ObjectDictionary:
 
 
 @dataclass
-class Bench:
+class Bench(SdoWords):
     """One node, and the words to talk to it."""
 
     node: SlaveNode
@@ -126,33 +127,12 @@ class Bench:
         assert len(answers) == 1, answers
         return answers[0]
 
-    def write(self, index: int, sub: int, value: int, size: int) -> int:
-        """Expedited download; returns 0 or the abort code."""
-        command = {1: 0x2F, 2: 0x2B, 4: 0x23}[size]
-        head = bytes((command, index & 0xFF, index >> 8, sub)).hex()
-        return abort_code(self.ask(head + (value & 0xFFFFFFFF).to_bytes(4, "little").hex()))
-
-    def read(self, index: int, sub: int = 0) -> int:
-        """Expedited upload of an unsigned number; asserts that it worked."""
-        answer = bytes.fromhex(self.ask(bytes((0x40, index & 0xFF, index >> 8, sub)).hex() + "00000000"))
-        assert answer[0] & 0xF3 == 0x43, answer.hex()
-        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little")
-
-    def refusal(self, index: int, sub: int = 0) -> int:
-        """Abort code of an upload."""
-        return abort_code(self.ask(bytes((0x40, index & 0xFF, index >> 8, sub)).hex() + "00000000"))
-
     def nmt(self, command: int, t_ns: int | None = None) -> list[tuple[int, str]]:
         return self.send(0, bytes((command, self.node.node_id)).hex(), t_ns)
 
 
 def spell(frames: list[tuple[int, bytes]]) -> list[tuple[int, str]]:
     return [(can_id, data.hex()) for can_id, data in frames]
-
-
-def abort_code(answer: str) -> int:
-    data = bytes.fromhex(answer)
-    return int.from_bytes(data[4:], "little") if data[0] == 0x80 else 0
 
 
 @dataclass

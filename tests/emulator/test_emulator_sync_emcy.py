@@ -82,9 +82,9 @@ def test_cia301_emcy_register_bits(bench, code, register):
 def test_cia301_emcy_42_history(bench):
     assert (bench.read(0x1003), bench.refusal(0x1003, 1)) == (0, 0x08000024)
     for code in (0x1000, 0x2310, 0x3210, 0x4310):
-        bench.node.emcy.report(code, b"\x07")
+        bench.node.emcy.report(code, b"\x07\x09")
     assert bench.read(0x1003) == 3  # three entries in this EDS
-    assert [bench.read(0x1003, sub) for sub in (1, 2, 3)] == [0x00074310, 0x00073210, 0x00072310]
+    assert [bench.read(0x1003, sub) for sub in (1, 2, 3)] == [0x09074310, 0x09073210, 0x09072310]  # low byte first
     assert bench.write(0x1003, 0, 1, 1) == 0x06090030
     assert bench.write(0x1003, 0, 0, 1) == 0
     assert (bench.read(0x1003), bench.refusal(0x1003, 1)) == (0, 0x08000024)

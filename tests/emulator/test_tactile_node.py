@@ -196,6 +196,14 @@ def test_sensor_64_threshold_and_gain(make, plant):
     assert frame.header.overload
 
 
+def test_sensor_64_what_tare_and_gain_leave_is_rounded_to_whole_counts(make, plant):
+    plant.image = spot(5, 5, 101) + spot(6, 6, 103) + spot(7, 7, 2)
+    sensor = make(mode=TactileMode.IMAGE).go()
+    assert sensor.bench.write(0x2002, 0, 1250, 2) == 0
+    taxels = sensor.frames(1)[0].taxels
+    assert [int(taxels[i, i]) for i in (5, 6, 7)] == [126, 129, 2]  # 126.25, 128.75, 2.5: to the even one
+
+
 def test_sensor_64_tare_takes_the_mean_of_the_next_images(make, plant):
     sensor = make(mode=TactileMode.IMAGE, tare_images=2).go()
     assert sensor.bench.write(0x2003, 0, 1, 4) == 0x08000020

@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import read_candump
@@ -25,7 +26,7 @@ def fd_scene(name, mode="image", **bus):
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory):
     out = tmp_path_factory.mktemp("fd")
-    return canprobe.run(fd_scene("press"), out=out, duration_s=0.5), list(read_candump(out / "bus.log"))
+    return undrawn_run(fd_scene("press"), out=out, duration_s=0.5), list(read_candump(out / "bus.log"))
 
 
 def test_the_servo_runs_on_whole_images(pressed):

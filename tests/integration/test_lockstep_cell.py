@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import read_candump
@@ -54,18 +55,19 @@ def test_scene_runs_to_its_end_and_leaves_the_cell_safe(name):
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_frames_on_the_bus_are_exactly_those_planned(name, tmp_path):
+def test_frames_on_the_bus_and_files_are_exactly_those_planned(name, tmp_path):
     result = canprobe.run(canprobe.load_scene(name), out=tmp_path, duration_s=SHORT[name])
     seen = {can_id for _, _, can_id, _ in read_candump(tmp_path / "bus.log")}
     assert seen <= result.plan.frame_ids
     assert {pdo.cob_id for pdo in result.plan.pdos} <= seen
+    assert {path.name for path in tmp_path.iterdir()} == set(result.plan.outputs)
 
 
 def test_same_seed_same_log_other_seed_other_log(tmp_path):
     scene = canprobe.load_scene("press")
     logs = []
     for i, seed in enumerate((3, 3, 4)):
-        canprobe.run(scene, out=tmp_path / str(i), seed=seed, duration_s=0.3)
+        undrawn_run(scene, out=tmp_path / str(i), seed=seed, duration_s=0.3)
         logs.append((tmp_path / str(i) / "bus.log").read_bytes())
     assert logs[0] == logs[1]
     assert logs[0] != logs[2]
@@ -73,7 +75,7 @@ def test_same_seed_same_log_other_seed_other_log(tmp_path):
 
 
 def test_press_reaches_and_holds_the_force(tmp_path):
-    result = canprobe.run(canprobe.load_scene("press"), out=tmp_path, duration_s=1.0)
+    result = undrawn_run(canprobe.load_scene("press"), out=tmp_path, duration_s=1.0)
     contact = result.summary["contact"]
     assert contact["contact_fraction"] == 1.0
     assert contact["force_rms_error_n"] < 0.2

@@ -6,6 +6,7 @@ import dataclasses
 import json
 
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.cell.build import make_task
@@ -22,7 +23,7 @@ def timed(scene, **fields):
 def press(tmp_path_factory):
     folder = tmp_path_factory.mktemp("press")
     scene = canprobe.load_scene("press")
-    return canprobe.run(scene, out=folder, duration_s=1.0), folder
+    return undrawn_run(scene, out=folder, duration_s=1.0), folder
 
 
 def test_a_touch_is_as_planned_to_the_frame(press):

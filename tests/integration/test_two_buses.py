@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from runs import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import read_candump
@@ -27,7 +28,7 @@ def split_scene():
 @pytest.fixture(scope="module")
 def pressed(tmp_path_factory):
     out = tmp_path_factory.mktemp("split")
-    return canprobe.run(split_scene(), out=out, duration_s=0.3), list(read_candump(out / "bus.log"))
+    return undrawn_run(split_scene(), out=out, duration_s=0.3), list(read_candump(out / "bus.log"))
 
 
 def test_the_full_image_that_one_bus_could_not_carry_is_served_on_its_own(pressed):

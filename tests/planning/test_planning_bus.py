@@ -1,31 +1,18 @@
 """The bus part of a plan against the budget table of the cell, and what does not fit."""
 
-import dataclasses
 import importlib.resources
 import math
 import re
 
 import pytest
+from scenes import change, reasons
 
-from canprobe.errors import PlanError
 from canprobe.planning import make_plan
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.identifiers import identifier_problems
 from canprobe.planning.model import PlannedPdo
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene_loader import load_scene
-
-
-def change(scene, **sections):
-    """A scene with some fields of some sections replaced."""
-    changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
-    return dataclasses.replace(scene, **changed)
-
-
-def reasons(scene):
-    with pytest.raises(PlanError) as caught:
-        make_plan(scene)
-    return caught.value.problems
 
 
 @pytest.fixture(scope="module")

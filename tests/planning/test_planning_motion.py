@@ -5,24 +5,13 @@ import math
 
 import numpy as np
 import pytest
+from scenes import change, reasons
 
-from canprobe.errors import PlanError
 from canprobe.planning import make_plan
 from canprobe.planning.surface_path import surface_path
 from canprobe.scene import ObjectSettings
 from canprobe.scene_geometry import true_object
 from canprobe.scene_loader import load_scene, packaged_scenes
-
-
-def change(scene, **sections):
-    changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
-    return dataclasses.replace(scene, **changed)
-
-
-def reasons(scene):
-    with pytest.raises(PlanError) as caught:
-        make_plan(scene)
-    return caught.value.problems
 
 
 @pytest.fixture(scope="module")

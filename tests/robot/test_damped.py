@@ -47,3 +47,15 @@ def test_speed_limit_keeps_the_direction():
     assert np.max(np.abs(limited) / UPENN.qd_max) == pytest.approx(0.1)
     assert limited / np.linalg.norm(limited) == pytest.approx(free / np.linalg.norm(free))
     assert damped_step(J, 1e-3 * twist, qd_max=UPENN.qd_max) == pytest.approx(1e-3 * free)
+
+
+@pytest.mark.parametrize("smallest", [0.07, 0.04, 0.004])
+def test_damping_rises_by_its_law_below_the_threshold(smallest):
+    """A Jacobian of known singular values: every direction is damped by λ² = 0.05² (1 - (s / 0.08)²)."""
+    rng = np.random.default_rng(3)
+    U, V = (np.linalg.qr(rng.normal(size=(6, 6)))[0] for _ in range(2))
+    s = np.array([2.0, 1.5, 1.0, 0.7, 0.3, smallest])
+    lambda2 = 0.05**2 * (1 - (smallest / 0.08) ** 2)
+    twist = rng.normal(size=6)
+    rates = V @ (s / (s**2 + lambda2) * (U.T @ twist))
+    assert damped_step((U * s) @ V.T, twist, length_m=1.0) == pytest.approx(rates, rel=1e-9)

@@ -131,6 +131,34 @@ def test_rolling_share_turns_the_pole_with_the_normal_or_not(share, tilt):
     assert pole == pytest.approx((-np.sin(tilt), 0.0, -np.cos(tilt)))
 
 
+@pytest.mark.parametrize("steps", [1, 40])
+def test_a_correction_leaves_one_in_e_after_the_time_constant_of_its_bandwidth(steps):
+    """Bandwidth f is a first-order low pass of the time constant 1 / (2 π f), in however many samples."""
+    gains = SurfaceGains(height_hz=8.0, tilt_hz=6.0)
+    local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), gains)
+    for _ in range(steps):
+        local.correct(np.array((0.0, 0.0, 1e-3)), np.array((0.0, 0.0, 1.0)), 1 / (2 * np.pi * 8.0) / steps)
+    assert local.point[2] == pytest.approx(1e-3 * (1 - np.exp(-1)), rel=1e-9)
+    tilted = np.array((1e-4, 0.0, np.sqrt(1 - 1e-8)))
+    for _ in range(steps):
+        local.correct(local.point, tilted, 1 / (2 * np.pi * 6.0) / steps)
+    assert local.normal[0] == pytest.approx(1e-4 * (1 - np.exp(-1)), rel=1e-6)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.8, -0.8])
+def test_a_straight_path_over_a_slope_turns_where_it_turns_in_the_scan_plane(slope):
+    """A step over the slope is shorter in the plane by its cosine; the contact keeps its speed over the surface."""
+    n = np.array((0.0, -np.sin(slope), np.cos(slope)))
+    local = LocalSurface(np.zeros(3), n, SurfaceGains())
+    follower = PathFollower(make_strategy("straight", 0.03, 0.0))
+    servo = TactileServo(local, follower, axes=AXES, origin=np.zeros(3), probe_radius=RADIUS_P, rolling_share=0.0)
+    contacts = np.array([servo.step(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(1400)])
+    along = contacts @ AXES[0]
+    step = 0.025 * DT
+    assert (along.max(), along.min()) == pytest.approx((0.015, -0.015), abs=2 * step)
+    assert np.linalg.norm(np.diff(contacts, axis=0), axis=1) == pytest.approx(step, rel=1e-9)
+
+
 def test_raising_the_model_moves_it_outward_and_leaves_its_normal():
     n = np.array((0.6, 0.0, 0.8))
     surface = LocalSurface(np.array((0.01, 0.02, 0.03)), n, SurfaceGains())

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from waiting import wait_until
 
 from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import MonotonicClock
@@ -77,12 +78,17 @@ class Command:
                 continue
         return found
 
+    def until_told(self, text: str) -> Command:
+        """Until this stands on stderr."""
+        wait_until(lambda: text in self.err, lambda: self.running, lambda: self.err)
+        return self
+
     def send(self, number: int) -> None:
         self._process.send_signal(number)
 
-    def wait(self) -> int:
+    def wait(self, patience_s: float = PATIENCE_S) -> int:
         """Wait for the end; return the exit status. Nothing may be left of it."""
-        status = self._process.wait(PATIENCE_S)
+        status = self._process.wait(patience_s)
         assert self.children == []
         return status
 

@@ -21,10 +21,7 @@ ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 @pytest.fixture(scope="module")
 def served(start_shared: Any) -> Any:
     """`canprobe emulate cylinder`, started once; the last test of the module ends it."""
-    command = start_shared("emulate", "cylinder", "--channel", "vcan0")
-    while not command.err.startswith("serving nodes"):
-        assert command.running, command.err
-    return command
+    return start_shared("emulate", "cylinder", "--channel", "vcan0").until_told("serving nodes")
 
 
 def test_scan_lists_the_nodes_with_their_identity(served: Any, bench: Any) -> None:

@@ -13,12 +13,8 @@ ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
 def served(bench: Any) -> Any:
-    command = bench.start(
-        "emulate", "free", "--channel", "vcan0", "--nodes", "2-4", "--without-id", "3,4", "--store", "nodes"
-    )
-    while not command.err.startswith("serving nodes"):
-        assert command.running, command.err
-    return command
+    nodes = ("--nodes", "2-4", "--without-id", "3,4", "--store", "nodes")
+    return bench.start("emulate", "free", "--channel", "vcan0", *nodes).until_told("serving nodes")
 
 
 def scan(bench: Any, *words: str) -> Any:

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 
 CONFTEST = Path(__file__).parents[1] / "conftest.py"
+SUPPORT = CONFTEST.parent / "support"
+WORKERS = ("-n", "2", "--dist", "loadfile")
 
 ADDED = """
 _has_interface = lambda: False
@@ -25,6 +27,8 @@ if kind == "none":
     print("canprobe: vcan: type:  apt-get install -y something")
     sys.exit(125)
 print("arguments", sys.argv[1:])
+with open("started", "a") as file:
+    print(sys.argv, file=file)
 sys.exit(subprocess.call(sys.argv[sys.argv.index("--") + 1 :], env={**os.environ, "INSIDE": "1"}))
 """
 
@@ -71,8 +75,11 @@ def project(tmp_path: Path) -> Path:
     stand_in.write_text(STAND_IN)
     (tmp_path / "conftest.py").write_text(CONFTEST.read_text() + ADDED.format(stand_in=str(stand_in)))
     (tmp_path / "test_it.py").write_text(TESTS)
+    more = "import pytest\n\n@pytest.mark.vcan\ndef test_more(vcan0):\n    assert vcan0\n"
+    (tmp_path / "test_more.py").write_text(more)
     (tmp_path / "test_native.py").write_text("import os\ndef test_outside():\n    assert 'INSIDE' not in os.environ\n")
-    (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers =\n    vcan: stand-in\naddopts = -p no:cacheprovider\n")
+    ini = f"[pytest]\nmarkers =\n    vcan: stand-in\naddopts = -p no:cacheprovider\npythonpath = {SUPPORT}\n"
+    (tmp_path / "pytest.ini").write_text(ini)
     return tmp_path
 
 
@@ -95,11 +102,13 @@ def counts(output: str) -> dict[str, int]:
     return {word.rstrip("s"): int(number) for number, word in re.findall(r"(\d+) ([a-z]+)", last)}
 
 
-def test_outcomes_and_texts_come_back(project: Path) -> None:
-    status, output = run(project, STAND_IN="runs", CANPROBE_INSTALL="1")
+@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
+def test_outcomes_and_texts_come_back(project: Path, workers: tuple[str, ...]) -> None:
+    status, output = run(project, *workers, STAND_IN="runs", CANPROBE_INSTALL="1")
     assert status == 1
-    assert counts(output) == {"passed": 5, "failed": 1, "skipped": 1, "xfailed": 1, "error": 1}
-    assert "arguments ['vcan', '--install', '--', 'true']" in output, "CANPROBE_INSTALL=1 installs before anything runs"
+    assert counts(output) == {"passed": 6, "failed": 1, "skipped": 1, "xfailed": 1, "error": 1}
+    assert output.count("arguments ['vcan', '--install', '--', 'true']") == 1, "CANPROBE_INSTALL=1 installs, once"
+    assert (project / "started").read_text().count("'pytest'") == 1, "one guest for all files"
     for text in ("assert 'vcan0' == 'vcan1'", "said before", "for its own reason", "RuntimeError: broken fixture"):
         assert text in output
 
@@ -108,20 +117,23 @@ def test_selection_goes_in(project: Path) -> None:
     status, output = run(project, "test_it.py::test_inside[2]", "test_it.py::test_after", STAND_IN="runs")
     assert (status, counts(output)) == (0, {"passed": 2})
     status, output = run(project, "-m", "not vcan", STAND_IN="dies")
-    assert (status, counts(output)) == (0, {"passed": 1, "deselected": 8})
+    assert (status, counts(output)) == (0, {"passed": 1, "deselected": 9})
 
 
 def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> None:
     status, output = run(project, "-k", "inside or exits or after", STAND_IN="dies")
-    assert (status, counts(output)) == (1, {"passed": 2, "error": 2, "deselected": 5})
+    assert (status, counts(output)) == (1, {"passed": 2, "error": 2, "deselected": 6})
     assert "not reported where the vcan is; that session ended with 3" in output
 
 
 @pytest.mark.parametrize(
-    ("required", "expected"), [("", {"passed": 1, "skipped": 8}), ("1", {"passed": 1, "error": 8})]
+    ("required", "expected"), [("", {"passed": 1, "skipped": 9}), ("1", {"passed": 1, "error": 9})]
 )
-def test_without_a_vcan_they_are_skipped_loudly_or_fail(project: Path, required: str, expected: dict[str, int]) -> None:
-    status, output = run(project, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
+@pytest.mark.parametrize("workers", [(), WORKERS], ids=["one session", "workers"])
+def test_without_a_vcan_they_are_skipped_loudly_or_fail(
+    project: Path, required: str, expected: dict[str, int], workers: tuple[str, ...]
+) -> None:
+    status, output = run(project, *workers, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
     assert (status, counts(output)) == (1 if required else 0, expected)
     assert "apt-get install -y something" in output
-    assert ("8 tests were NOT RUN" in output) == (not required)
+    assert ("9 tests were NOT RUN" in output) == (not required)

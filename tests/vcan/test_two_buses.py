@@ -52,9 +52,7 @@ def second_bus() -> Iterator[SocketCanPort]:
 
 
 def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: Any, second_bus: Any) -> None:
-    arm = bench.start("emulate", "free", "--channel", "vcan0")
-    while not arm.err.startswith("serving nodes"):
-        assert arm.running, arm.err
+    arm = bench.start("emulate", "free", "--channel", "vcan0").until_told("serving nodes")
     scene = bench.folder / "split.toml"
     scene.write_text(SCENE)
     buses = ("--bus", "socketcan", "--channel", "can0=vcan0", "--channel", f"can1={SECOND}")

@@ -24,10 +24,7 @@ def served(start_shared: Any) -> Any:
     """Our own drive, a vendor's drive and a vendor's other device; the last test of the module ends them."""
     files = ("puma260_joint", PACKAGED), (MESSY / "drive402.eds", VENDORS), (MESSY / "types.eds", DATA)
     pairs = [word for path, node_id in files for word in ("--eds", path, "--node-id", node_id)]
-    command = start_shared("emulate", *pairs, "--channel", "vcan0")
-    while "serving nodes 5, 20, 30 on vcan0" not in command.err:
-        assert command.running, command.err
-    return command
+    return start_shared("emulate", *pairs, "--channel", "vcan0").until_told("serving nodes 5, 20, 30 on vcan0")
 
 
 @pytest.fixture

@@ -72,17 +72,7 @@ class DynamicArm:
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
-        """Give one motor a ramp; it holds the end afterwards. Replaces whatever was to come from t0 on.
-
-        A ramp that began in the past acts from the present time on.
-
-        Args:
-            axis: 0 to 5.
-            start_counts: reference at t0.
-            end_counts: reference at t1 and after.
-            t0_ns: start.
-            t1_ns: end; not after t0 for a step.
-        """
+        """Give one motor a ramp, see ``IdealArm.set_ramp``."""
         self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns

@@ -124,13 +124,6 @@ class Plant:
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Reference of one drive, see ``IdealArm.set_ramp``.
 
-        Args:
-            axis: 0 to 5.
-            start_counts: at t0.
-            end_counts: at t1 and after.
-            t0_ns: start.
-            t1_ns: end.
-
         Raises:
             RuntimeError: without an arm.
         """

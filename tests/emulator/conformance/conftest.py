@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
+from sdo_words import SdoWords
 
 from canprobe.bus.clock import MonotonicClock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
@@ -36,8 +37,8 @@ class Heard(NamedTuple):
     t_ns: int
 
 
-class Bench:
-    """A client of one node: sends hex, and says what must come next."""
+class Bench(SdoWords):
+    """A client of one node: sends hex, and says what must come next. After a read all that was sent is served."""
 
     def __init__(
         self, node: SlaveNode, port: Port, power_on: Callable[[], None], end: Callable[[], None], real_time: bool
@@ -97,25 +98,10 @@ class Bench:
         assert heard.can_id == base - 0x80 + self.node_id, heard
         return heard.text
 
-    def write(self, index: int, sub: int, value: int, size: int) -> int:
-        """Expedited download; 0 or the abort code."""
-        head = bytes(({1: 0x2F, 2: 0x2B, 4: 0x23}[size], index & 0xFF, index >> 8, sub)).hex()
-        return abort_code(self.ask(head + (value & 0xFFFFFFFF).to_bytes(4, "little").hex()))
-
     def set(self, *orders: tuple[int, int, int, int]) -> None:
         """Downloads that must be accepted."""
         for order in orders:
             assert self.write(*order) == 0, order
-
-    def read(self, index: int, sub: int = 0) -> int:
-        """Expedited upload of an unsigned number. Also: whatever was sent before has been served."""
-        answer = bytes.fromhex(self.ask(bytes((0x40, index & 0xFF, index >> 8, sub)).hex() + "00000000"))
-        assert answer[0] & 0xF3 == 0x43, answer.hex()
-        return int.from_bytes(answer[4 : 8 - (answer[0] >> 2 & 3)], "little")
-
-    def refusal(self, index: int, sub: int = 0) -> int:
-        """Abort code of an upload."""
-        return abort_code(self.ask(bytes((0x40, index & 0xFF, index >> 8, sub)).hex() + "00000000"))
 
     def nmt(self, command: int) -> int:
         return self.send(0, bytes((command, self.node_id)).hex())
@@ -131,11 +117,6 @@ class Bench:
         self.power_on()
         self.expect((0x700 + self.node_id, "00"))
         return self
-
-
-def abort_code(answer: str) -> int:
-    data = bytes.fromhex(answer)
-    return int.from_bytes(data[4:], "little") if data[0] == 0x80 else 0
 
 
 def _in_lockstep(node: SlaveNode, stack: ExitStack) -> Bench:

@@ -1,0 +1,25 @@
+"""Scenes with some fields replaced, and why a scene has no plan."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from canprobe.errors import PlanError
+from canprobe.planning import make_plan
+from canprobe.scene import Scene
+
+
+def change(scene: Scene, **sections: dict[str, Any]) -> Scene:
+    """A scene with some fields of some sections replaced."""
+    changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
+    return dataclasses.replace(scene, **changed)
+
+
+def reasons(scene: Scene) -> tuple[str, ...]:
+    """The problems of a scene that must have some."""
+    with pytest.raises(PlanError) as caught:
+        make_plan(scene)
+    return tuple(caught.value.problems)
