@@ -75,6 +75,8 @@ def missed_pdos(seen: Seen) -> int:
 
 def drive_late(seen: Seen) -> NodeError | None:
     """A drive has not told where it is for some cycles: the others must not go on without it."""
+    if max(seen.measurement.q_age, default=0) < seen.limits.hold_cycles:
+        return None
     for axis, age in zip(seen.drives.axes if seen.drives is not None else (), seen.measurement.q_age, strict=True):
         if age >= seen.limits.hold_cycles:
             return NodeError(axis.node_id, f"no usable TPDO for {age} cycles")
@@ -83,9 +85,9 @@ def drive_late(seen: Seen) -> NodeError | None:
 
 def drive_silent(seen: Seen) -> NodeError | None:
     """A drive's TPDO has been missing for too long."""
-    if seen.drives is None:
-        return None
     limit = seen.limits.missed_cycles
+    if seen.drives is None or max(seen.measurement.q_age, default=0) <= limit:
+        return None
     for axis, age in zip(seen.drives.axes, seen.measurement.q_age, strict=True):
         if age > limit:
             return NodeError(axis.node_id, f"lost: no usable TPDO for {age} cycles")
