@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from canprobe.bus.port import ControllerState
 from canprobe.cell.supervision import Contact, Seen
-from canprobe.cell.watch import EmcyEvent
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState
@@ -36,33 +35,24 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
         return None
     i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
-    why = "".join(f"; {e}" for e in [e for e in seen.watch.alarms if e.node_id == node_id][-1:])
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
-
-
-def is_communication(event: EmcyEvent) -> bool:
-    """Whether an emergency is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
-    return event.emcy.code >> 8 in (0x81, 0x82)
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{seen.watch.last_words(node_id)}")
 
 
 def device_emcy(seen: Seen) -> NodeError | None:
     """A device reports an error of its own."""
-    alarms = seen.watch.alarms
-    for event in alarms[seen.first_alarm :] if len(alarms) > seen.first_alarm else ():
-        if not is_communication(event):
-            return NodeError(event.node_id, str(event).partition(": ")[2])
-    return None
+    event = seen.watch.device_alarm
+    return NodeError(event.node_id, str(event).partition(": ")[2]) if event is not None else None
 
 
 def communication_emcys(seen: Seen) -> int:
     """Emergencies about frames."""
-    return sum(map(is_communication, seen.watch.alarms)) if seen.watch.alarms else 0
+    return seen.watch.communication
 
 
 def foreign_master(seen: Seen) -> SafetyStop | None:
     """Somebody else sends what only a master sends."""
     foreign = seen.watch.foreign
-    return SafetyStop(f"another master is on the bus: {foreign[0]}") if foreign else None
+    return SafetyStop(f"another master is on the bus: {foreign}") if foreign is not None else None
 
 
 # PDOs
@@ -185,6 +175,16 @@ def force(contact: Contact) -> SafetyStop | None:
     return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
 
 
+def force_hidden(contact: Contact) -> SafetyStop | None:
+    """The array has been saturated for so long that the force may be above the limit, and nobody knows."""
+    if contact.hidden_s * 1e9 <= contact.limits.hidden_ns:
+        return None
+    return SafetyStop(
+        f"the array is saturated and no stiffness was felt: the true force is above the {contact.force:.1f} N "
+        "measured; raise sensor.full_scale_kpa or lower task.force_n"
+    )
+
+
 def sensor_stale(contact: Contact) -> SafetyStop | None:
     """No tactile sample for too long."""
     age = contact.tactile_age
@@ -194,8 +194,24 @@ def sensor_stale(contact: Contact) -> SafetyStop | None:
 
 
 def contact_lost(contact: Contact) -> SafetyStop | None:
-    """No force where there must be one."""
+    """No force where there must be one, and nothing to be done about it."""
+    if contact.path and contact.limits.regain > 0.0:
+        return None
     return SafetyStop("contact lost") if contact.lost_s * 1e9 > contact.limits.lost_ns else None
+
+
+def contact_to_regain(contact: Contact) -> SafetyStop | None:
+    """No force where a scan must have one, which looks for it."""
+    if not contact.path or contact.lost_s * 1e9 <= contact.limits.lost_ns:
+        return None
+    return SafetyStop("contact lost")
+
+
+def contact_not_regained(contact: Contact) -> SafetyStop | None:
+    """The object is not where a lost contact was looked for."""
+    if contact.searched <= contact.limits.regain:
+        return None
+    return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
 
 
 def limit_reached(contact: Contact) -> SafetyStop | None:

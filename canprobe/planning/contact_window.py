@@ -33,7 +33,7 @@ def taxels_needed(force_n: float, probe: ProbeSettings) -> float:
 
 def window_choices(scene: Scene) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason; without a force to hold the largest first."""
-    if scene.probe is None or scene.task.kind not in ("scan", "press"):
+    if scene.probe is None or scene.task.kind not in ("scan", "press", "calibrate"):
         return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(WINDOWS))
     force, needed = scene.task.force_n, taxels_needed(scene.task.force_n, scene.probe)
     patch = (
