@@ -44,7 +44,7 @@ class TaxelImage:
     Attributes:
         t_ns: when it was sampled, on the clock of the samples.
         counts: (16, 16) uint8, row by row; zero outside the window.
-        window: (row, column) of the first taxel of an 8×8 window, None where the whole image came.
+        window: (row, column) of the first taxel of the window, None where the whole image came.
         overload: a taxel reached full scale.
     """
 

@@ -23,7 +23,8 @@ _COUNTERS: tuple[_Field, ...] = (("frame_counter", 8, False, ""), ("sync_counter
 _REST: tuple[_Field, ...] = (
     ("mode", 2, False, ""),
     ("overload", 1, False, ""),
-    ("reserved", 5, False, ""),
+    ("reserved", 1, False, ""),
+    ("window", 4, False, ""),
     ("sample_age", 16, False, "us"),
     ("crc", 16, False, ""),
 )

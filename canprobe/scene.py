@@ -9,7 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-from canprobe.scene_checks import Direction, Distinct, Only, Pattern, Range, ScenePath, Symmetric
+from canprobe.protocol.tactile import WINDOWS
+from canprobe.scene_checks import Direction, Distinct, OneOf, Only, Pattern, Range, ScenePath, Symmetric
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
@@ -99,6 +100,8 @@ class SensorSettings:
     emulated: bool = True
     channel: Annotated[str | None, Pattern(r"\S+", "without spaces")] = None  # a bus of its own; "auto" as it fits
     mode: TactileModeName = "window"
+    # taxels along the window that follows the contact; the full image is a mode of its own
+    window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
     rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     serial_number: SerialNumber | None = None  # 1018h:04; None: any

@@ -35,6 +35,19 @@ class Range:
 
 
 @dataclass(frozen=True, slots=True)
+class OneOf:
+    """One of a few numbers."""
+
+    values: tuple[int, ...]
+
+    def __str__(self) -> str:
+        return f"of {', '.join(map(str, self.values))}"
+
+    def accepts(self, value: int) -> bool:
+        return value in self.values
+
+
+@dataclass(frozen=True, slots=True)
 class Pattern:
     """Text that matches a regular expression as a whole."""
 

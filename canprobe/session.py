@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
+Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
 """Is told each step, in words."""
 
@@ -122,7 +123,7 @@ class Session:
         self.wall_ns = 0
         self._bus_start_ns = 0
         self._bus_time_ns = 0
-        self.traffic: dict[str, TrafficCounter] = {}
+        self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
         self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
@@ -212,8 +213,8 @@ class Session:
     def _open(self) -> Port:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _writer(self, channel: str, t0_ns: int) -> Callable[[int, bytes, int], None]:
-        write: Callable[[int, bytes, int], None] = lambda _id, _data, _t: None  # noqa: E731
+    def _writer(self, channel: str, t0_ns: int) -> Write:
+        write: Write = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
@@ -222,18 +223,21 @@ class Session:
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
             write = self.observers.tap(write)
-        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is counted afterwards, from the log
-            write = self._metered(channel, write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
+            return self._metered(channel, write if self.out is not None or self.observers is not None else None)
         counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
         self.traffic[channel] = counter
         return counter.write
 
-    def _metered(self, channel: str, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
-        meter = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+    def _metered(self, channel: str, write: Write | None) -> Write:
+        meter = self.traffic[channel] = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+        if write is None:
+            return meter.write
+        count, pass_on = meter.write, write
 
         def both(can_id: int, data: bytes, t_ns: int) -> None:
-            meter.write(can_id, data, t_ns)
-            write(can_id, data, t_ns)
+            count(can_id, data, t_ns)
+            pass_on(can_id, data, t_ns)
 
         return both
 

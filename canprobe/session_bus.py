@@ -9,7 +9,7 @@ from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.planning import Plan
 from canprobe.planning.wire_bits import exact_frame_bits
-from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene import BusSettings, Scene
 
@@ -69,7 +69,7 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
     rate = scene.bus.bit_error_rate
     errors = BitErrors(rate, scene.seed) if rate > 0 else None
     bus = scene.bus
-    length = partial(exact_frame_bits, bus=bus)
+    length = partial(exact_frame_bits, bus=bus) if bus.fd is True else exact_bits
     timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
     timed.fd = bus.fd is True
     return timed

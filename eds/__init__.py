@@ -28,6 +28,9 @@ MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 LONG_PDOS = 0x2007
 """Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
 LONG_PDOS_NAME = "Long PDOs (CAN FD)"
+WINDOW_SIZE = 0x2008
+"""Manufacturer's object of our arrays: taxels along the window that follows the contact."""
+WINDOW_SIZE_NAME = "Window size"
 _FOLDER = Path(__file__).resolve().parent
 
 
@@ -62,6 +65,11 @@ def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
 def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
     """Whether 2007h is that object here: the device can send PDOs in CAN FD frames."""
     return LONG_PDOS in od and od[LONG_PDOS].name == LONG_PDOS_NAME
+
+
+def has_window_size(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2008h is that object here; without it the window has 8×8 taxels."""
+    return WINDOW_SIZE in od and od[WINDOW_SIZE].name == WINDOW_SIZE_NAME
 
 
 def eds_file(source: str | os.PathLike[str]) -> Path:

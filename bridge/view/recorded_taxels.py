@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.candump import read_candump
-from canprobe.cell.build import TACTILE_DEADLINE_CYCLES
+from canprobe.cell.build import make_tactile
 from canprobe.planning import make_plan
 from canprobe.protocol.frames import SYNC_ID
-from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.scene import Scene
 
 TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
@@ -31,20 +30,16 @@ def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
         UsageError: a line that is not candump's.
     """
     assert scene.sensor is not None
-    mode = TactileMode[scene.sensor.mode.upper()]
-    if mode is TactileMode.FEATURES or not file.is_file():
+    if scene.sensor.mode == "features" or not file.is_file():
         return ()
-    plan = make_plan(scene)
-    pdos = plan.pdos_of(scene.sensor.node_id, "tpdo")
-    cob_ids = [pdo.cob_id for pdo in pdos]
-    sizes = [pdo.layout.length for pdo in pdos]
-    assembler = FrameAssembler(cob_ids, mode, TACTILE_DEADLINE_CYCLES * plan.sync.period_ns, sizes)
+    receiver = make_tactile(make_plan(scene))
+    assert receiver is not None
     start: int | None = None
     frames = []
-    for t_ns, _, can_id, data in read_candump(file, only={SYNC_ID, *cob_ids}):
+    for t_ns, _, can_id, data in read_candump(file, only={SYNC_ID, *receiver.cob_ids}):
         if start is None and can_id == SYNC_ID:
             start = t_ns
-        frame = assembler.push(can_id, data, t_ns)
+        frame = receiver.assembler.push(can_id, data, t_ns)
         if frame is not None and start is not None:
             frames.append(((t_ns - start) * 1e-9, frame.taxels))
     return tuple(frames)

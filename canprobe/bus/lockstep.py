@@ -23,7 +23,7 @@ from canprobe.protocol.frame_bits import FD_LENGTHS
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""
 
-_CLASSIC_BYTES = 8
+CLASSIC_BYTES = 8
 
 
 class Participant(Protocol):
@@ -145,6 +145,16 @@ class LockstepBus:
         finally:
             self._settling = False
 
+    def run_until_ns(self, until_ns: int) -> None:
+        """Carry everything due up to and including `until_ns`.
+
+        Raises:
+            BusError: the participants keep answering without an end.
+        """
+        while (due := self.next_deadline_ns()) is not None and due <= until_ns:
+            self.clock.move_ns(due)
+            self.settle()
+
     def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
         """Queue the frames of a port and carry everything due."""
         self._queue(node, frames)
@@ -200,7 +210,7 @@ class LockstepBus:
 
     def _check(self, node: BusNode, frame: Frame) -> None:
         can_id, data = frame
-        if len(data) > _CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
+        if len(data) > CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
             has = f"CAN FD has {', '.join(map(str, FD_LENGTHS[9:]))} above 8" if self.fd else "CAN has 8"
             raise BusError(f"{self.channel}: {name_of(node.owner)} sends {len(data)} bytes with {can_id:03X}; {has}")
 

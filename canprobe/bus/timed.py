@@ -19,7 +19,15 @@ from typing import Literal
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.controllers import Controllers
 from canprobe.bus.fault_confinement import ErrorCounters
-from canprobe.bus.lockstep import BusNode, LockstepBus, LockstepPort, Participant, arbitration_key, name_of
+from canprobe.bus.lockstep import (
+    CLASSIC_BYTES,
+    BusNode,
+    LockstepBus,
+    LockstepPort,
+    Participant,
+    arbitration_key,
+    name_of,
+)
 from canprobe.bus.port import Frame
 from canprobe.bus.wire_errors import WireErrors
 from canprobe.protocol.frame_bits import (
@@ -82,8 +90,6 @@ class TimedBus(LockstepBus):
         self._ready: list[_Entry] = []  # a heap
         self._order = 0
         self._flying: _Entry | None = None
-        self._planned: _Entry | None = None  # what flies next, unless something better is queued before
-        self._planned_end_ns = 0
         self._hit = False
         self._end_ns = self._free_ns = 0
         self._since_ns = 0  # when the first of those who are ready queued its frame
@@ -114,7 +120,7 @@ class TimedBus(LockstepBus):
         if self._flying is not None:
             wire: int | None = self._end_ns
         else:
-            wire = self._next_on_the_wire(first) if self._ready else None
+            wire = self._next_start() if self._ready else None
         if wire is not None and (first is None or wire < first):
             first = wire
         if self._controllers.troubled and self._flying is None:
@@ -123,29 +129,11 @@ class TimedBus(LockstepBus):
                 first = back
         return first
 
-    def _next_on_the_wire(self, first_due: int | None) -> int:
-        """When the next frame starts; or already when it ends, if until it starts nobody else can want to send.
-
-        Whoever calls for the next deadline lets time move on. What still comes before the start is taken in by then.
-        """
-        start = self._next_start()
-        if first_due is not None and first_due <= start:
-            return start
-        if self.errors is not None or self._controllers.troubled or len(self._nodes) < 2:
-            return start
-        entry = self._ready[0]
-        if entry is not self._planned:
-            self._planned = entry
-            self._planned_end_ns = start + self._bits_ns(self._length(*entry[3]) - INTERMISSION_BITS)
-        return self._planned_end_ns
-
     def settle(self) -> None:
         """Do what is due at the present instant: end of a frame, deadlines of participants, start of the next frame."""
         if self._settling:
             return
         t_ns = self.clock.now_ns()
-        if self._flying is None and self._ready:
-            self._catch_up(t_ns)
         self._settling = True
         if self._stale:
             self.next_deadline_ns()
@@ -169,16 +157,51 @@ class TimedBus(LockstepBus):
         finally:
             self._settling = False
 
-    def _catch_up(self, t_ns: int) -> None:
-        """Start the frame that went on the wire before `t_ns`, while nobody looked."""
-        if self._flying is None and self._ready:
-            start = self._next_start()
-            if start >= t_ns:
+    def run_until_ns(self, until_ns: int) -> None:
+        """Do everything due up to and including `until_ns`: in one pass while no bit can fail, else instant by instant.
+
+        Raises:
+            BusError: a participant's deadline never moves on, or more frames wait than may.
+        """
+        if len(self._nodes) > 1 and not self._settling and not self._controllers.troubled:
+            self._glide(until_ns)
+        super().run_until_ns(until_ns)
+
+    def _glide(self, until_ns: int) -> None:
+        """Frame after frame without errors, in the order of `settle`; ends early when errors come up."""
+        self._first_due = super().next_deadline_ns()
+        self._stale, self._settling = False, True
+        try:
+            while self.errors is None and not self._controllers.troubled:
+                due = self._first_due
+                if self._flying is None and self._ready:
+                    start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
+                    if start <= until_ns and (due is None or start < due):
+                        entry = heappop(self._ready)
+                        bits = self._length(*entry[3]) - INTERMISSION_BITS
+                        self._fly(entry, start, start + (bits * self._bit_ns or self._bits_ns(bits)))
+                if self._flying is not None and (due is None or self._end_ns <= due):
+                    if self._end_ns > until_ns:
+                        return
+                    self.clock.move_ns(self._end_ns)
+                    self._finish()
+                elif due is None or due > until_ns:
+                    return
+                else:
+                    self._serve(due)
+        finally:
+            self._settling = False
+
+    def _serve(self, due_ns: int) -> None:
+        """Let everybody speak whose deadline has come."""
+        self.clock.move_ns(due_ns)
+        t_ns = self.clock.now_ns()
+        for _ in range(self._max_frames):
+            self._advance_due(t_ns)
+            self._first_due = self._earliest()
+            if self._first_due is None or self._first_due > t_ns:
                 return
-            if self._ready[0] is self._planned:
-                self._fly(heappop(self._ready), start, self._planned_end_ns)
-            else:
-                self._start(start)
+        raise self._endless(t_ns, "deadlines that never move on, of " + self._names_due(t_ns))
 
     def send(self, node: BusNode, frames: Sequence[Frame]) -> None:
         """Queue the frames of a port; they go when the bus is free and theirs is the lowest identifier."""
@@ -198,14 +221,15 @@ class TimedBus(LockstepBus):
     def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
         if not frames or (self._controllers.troubled and self._controllers.is_off(node)):
             return  # a controller that is bus off takes no part
-        if not self._settling:
-            self._catch_up(self.clock.now_ns())
         for frame in frames:
-            self._check(node, frame)
-            if self._fifo and (node.outbox or self._is_ready(node)):
-                node.outbox.append(frame)
-            else:
-                self._compete(node, frame)
+            if len(frame[1]) > CLASSIC_BYTES:
+                self._check(node, frame)
+        if self._fifo:
+            node.outbox.extend(frames)
+            if not self._is_ready(node):
+                self._compete(node, (node.outbox.popleft(),))
+        else:
+            self._compete(node, frames)
         if len(self._ready) + len(node.outbox) > self._max_frames:
             self._ready.clear()
             raise self._endless(
@@ -216,12 +240,15 @@ class TimedBus(LockstepBus):
         flying = self._flying
         return (flying is not None and flying[2] is node) or any(entry[2] is node for entry in self._ready)
 
-    def _compete(self, node: BusNode, frame: Frame) -> None:
-        can_id = frame[0]
-        self._order += 1
-        if not self._ready:
+    def _compete(self, node: BusNode, frames: Sequence[Frame]) -> None:
+        ready, order = self._ready, self._order
+        if not ready:
             self._since_ns = self.clock.now_ns()
-        heappush(self._ready, (can_id << 21 if can_id <= 0x7FF else arbitration_key(can_id), self._order, node, frame))
+        for frame in frames:
+            order += 1
+            can_id = frame[0]
+            heappush(ready, (can_id << 21 if can_id <= 0x7FF else arbitration_key(can_id), order, node, frame))
+        self._order = order
 
     def _start(self, t_ns: int) -> bool:
         """Let the winner of the arbitration send; False where all who want to have to wait."""
@@ -243,7 +270,7 @@ class TimedBus(LockstepBus):
 
     def _fly(self, entry: _Entry, start_ns: int, end_ns: int) -> None:
         """Put a frame on the wire."""
-        self._flying, self._planned, self._hit = entry, None, False
+        self._flying, self._hit = entry, False
         self._end_ns = end_ns
         self._free_ns = end_ns + self._gap_ns
         self.busy_ns += self._free_ns - start_ns
@@ -282,16 +309,18 @@ class TimedBus(LockstepBus):
             return
         self.frames += 1
         if self._fifo and sender.outbox:
-            self._compete(sender, sender.outbox.popleft())
+            self._compete(sender, (sender.outbox.popleft(),))
+        off: Sequence[BusNode] = ()
         if self._controllers.troubled:
             self._controllers.succeed(sender, t_ns)
-        self._hand_over(sender, frame, t_ns)
+            off = self._controllers.off()
+        self._hand_over(sender, frame, t_ns, off)
 
-    def _hand_over(self, sender: BusNode, frame: Frame, t_ns: int) -> None:
+    def _hand_over(self, sender: BusNode, frame: Frame, t_ns: int, off: Sequence[BusNode]) -> None:
+        """Everybody hears a frame but its sender and those who are bus off."""
         can_id, data = frame
         if self.recorder is not None:
             self.recorder(can_id, data, t_ns)
-        off = self._controllers.off() if self._controllers.troubled else ()
         changed = False
         listeners = sender.listeners.get(can_id)
         for receive, receiver in self._listeners_of(sender, can_id) if listeners is None else listeners:
@@ -299,18 +328,18 @@ class TimedBus(LockstepBus):
                 continue
             answers = receive(can_id, data, t_ns)
             due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
-            changed = changed or due != receiver.due
-            receiver.due = due
+            if due != receiver.due:
+                receiver.due, changed = due, True
             if answers:
                 self._queue(receiver, answers)
         if changed:
             self._first_due = self._earliest()
-        if off:
-            self._deliver_to_ports(sender, (can_id, data, t_ns), off)
-            return
         stamped = (can_id, data, t_ns)
-        for put in sender.inboxes:
-            put(stamped)
+        if off:
+            self._deliver_to_ports(sender, stamped, off)
+        else:
+            for put in sender.inboxes:
+                put(stamped)
 
     def _deliver_to_ports(self, sender: BusNode, stamped: tuple[int, bytes, int], off: Sequence[BusNode]) -> None:
         for node in self._nodes:
@@ -351,7 +380,6 @@ class TimedBus(LockstepBus):
         return node
 
     def _remove(self, owner: Participant | LockstepPort) -> None:
-        self._catch_up(self.clock.now_ns())
         for node in [node for node in self._nodes if node.owner is owner]:
             self._silence(node)
             self._controllers.remove(node)

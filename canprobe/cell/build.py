@@ -105,7 +105,9 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
     pdos = plan.pdos_of(sensor.node_id, "tpdo")
     cob_ids = [pdo.cob_id for pdo in pdos]
     deadline = TACTILE_DEADLINE_CYCLES * plan.sync.period_ns
-    assembler = FrameAssembler(cob_ids, TactileMode[sensor.mode.upper()], deadline, [pdo.layout.length for pdo in pdos])
+    sizes = [pdo.layout.length for pdo in pdos]
+    mode = TactileMode[sensor.mode.upper()]
+    assembler = FrameAssembler(cob_ids, mode, deadline, sizes, window=int(sensor.window))
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
 
 

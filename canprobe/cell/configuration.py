@@ -7,7 +7,15 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.eds import LONG_PDOS, MISSED_SYNCS, has_long_pdos, has_missed_syncs, load_eds
+from canprobe.eds import (
+    LONG_PDOS,
+    MISSED_SYNCS,
+    WINDOW_SIZE,
+    has_long_pdos,
+    has_missed_syncs,
+    has_window_size,
+    load_eds,
+)
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
@@ -42,7 +50,7 @@ def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
 
 def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     dictionary = load_eds(node.eds, node.node_id)
-    specific = _drive_writes(plan, node) if node.kind == "drive" else _sensor_writes(plan)
+    specific = _drive_writes(plan, node) if node.kind == "drive" else _sensor_writes(plan, dictionary)
     wanted = [*_common_writes(plan), *specific]
     return NodeSetup(
         node_id=node.node_id,
@@ -123,9 +131,12 @@ def software_limits(model: PumaModel) -> tuple[Array, Array]:
     return np.floor(np.minimum(a, b).sum(axis=1)), np.ceil(np.maximum(a, b).sum(axis=1))
 
 
-def _sensor_writes(plan: Plan) -> list[Write]:
-    assert plan.scene.sensor is not None
-    writes = [Write(0x2000, 0, TactileMode[plan.scene.sensor.mode.upper()])]
+def _sensor_writes(plan: Plan, dictionary: Any) -> list[Write]:
+    sensor = plan.scene.sensor
+    assert sensor is not None
+    writes = [Write(0x2000, 0, TactileMode[sensor.mode.upper()])]
+    if sensor.mode == "window" and has_window_size(dictionary):
+        writes.append(Write(WINDOW_SIZE, 0, int(sensor.window)))
     # nothing touches the array yet; a listening cell knows no such moment
     if plan.scene.task.kind in ("scan", "press", "calibrate"):
         writes.append(Write(0x2003, 0, TARE, read_back=False))

@@ -14,9 +14,10 @@ import numpy as np
 from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
+from canprobe.eds import WINDOW_SIZE, WINDOW_SIZE_NAME
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
-from canprobe.emulator.entries import Value
+from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.node import OdOf, SlaveNode
 from canprobe.emulator.tactile_image import (
     Image,
@@ -26,10 +27,11 @@ from canprobe.emulator.tactile_image import (
     correct_finely,
     follow,
     is_overloaded,
+    middle,
 )
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
-from canprobe.protocol.tactile import SIDE, Features, TactileHeader, TactileMode, pack_frame
+from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_frame
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
@@ -66,7 +68,7 @@ class TactileApplication(Application):
         self._tare: NDArray[np.float64] | None = None
         self._taring: list[Raw] | None = None
         self._frames = 0
-        self._origin = (4, 4)
+        self._origin = middle()
         self._counter = 0
         self._triggered_ns: int | None = None
 
@@ -77,6 +79,11 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
+        entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
+        self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
+        if self._sized:
+            node.dictionary.on_check(WINDOW_SIZE, self._check_window)
+            node.dictionary.on_write(WINDOW_SIZE, self._begin_window)
 
     def keep(self) -> bytes:
         """The tare."""
@@ -93,7 +100,7 @@ class TactileApplication(Application):
         self._pipeline.clear()
         self._taring = None
         self._frames = 0
-        self._origin = (4, 4)
+        self._origin = middle(self._window())
 
     def entered(self, t_ns: int) -> None:
         """Sample at once on entering operational, so that the first frame shows something real."""
@@ -138,9 +145,10 @@ class TactileApplication(Application):
         settings = self._tare, number(GAIN, 0, 1000), number(THRESHOLD)
         image = correct(raw, *settings)
         overload = is_overloaded(raw) or is_overloaded(image)
-        self._origin = follow(image, self._origin)
+        window = self._window()
+        self._origin = follow(image, self._origin, window)
         row, column = self._origin if mode is TactileMode.WINDOW else (0, 0)
-        header = TactileHeader(self._frames, self._counter, row, column, mode, overload, age_us)
+        header = TactileHeader(self._frames, self._counter, row, column, mode, overload, age_us, window=window)
         self._frames = (self._frames + 1) % 256
         content: Image | Features = image
         if mode is TactileMode.FEATURES:
@@ -156,6 +164,19 @@ class TactileApplication(Application):
             for subindex, word in enumerate(words[1:], start=1):
                 dictionary.put(_CONTENT[mode], subindex, word)
         dictionary.put(HEADER, 0, words[0])
+
+    def _window(self) -> int:
+        """Taxels along the window; an array without the object has 8."""
+        return self._node.dictionary.number(WINDOW_SIZE, 0, WINDOW) if self._sized else WINDOW
+
+    def _check_window(self, subindex: int, value: Value) -> None:
+        if value not in WINDOWS:
+            raise SdoAbort(Abort.VALUE)
+        if self._node.state is NmtState.OPERATIONAL and value != self._window():
+            raise SdoAbort(Abort.DEVICE_STATE)
+
+    def _begin_window(self, subindex: int, value: Value) -> None:
+        self._origin = middle(self._window())
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []

@@ -13,7 +13,6 @@ Raw = NDArray[np.uint8] | NDArray[np.float64]
 FULL_SCALE = 255
 GAIN_ONE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
-_LAST_ORIGIN = SIDE - WINDOW
 _INDEX = np.arange(SIDE, dtype=np.float64)
 _SUMS = np.stack((np.ones(SIDE), _INDEX), axis=1)
 TAXEL_AREA_M2 = 1.5875e-3**2
@@ -63,22 +62,27 @@ def _moments(image: Raw) -> tuple[float, float, float]:
     return total, rows / total, columns / total
 
 
-def follow(image: Raw, origin: tuple[int, int]) -> tuple[int, int]:
-    """First taxel (row, column), 0..8 each, of the window round the contact.
+def middle(window: int = WINDOW) -> tuple[int, int]:
+    """First taxel (row, column) of a window in the middle of the pad."""
+    return (SIDE - window) // 2, (SIDE - window) // 2
+
+
+def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[int, int]:
+    """First taxel (row, column) of the window of so many taxels a side round the contact.
 
     The window stays while the contact's centroid is near its middle, and where it is without a contact.
     """
     total, row, column = _moments(image)
     if total == 0.0:
         return origin
-    return _shift(origin[0], row), _shift(origin[1], column)
+    return _shift(origin[0], row, window), _shift(origin[1], column, window)
 
 
-def _shift(origin: int, centroid: float) -> int:
-    ideal = centroid - (WINDOW - 1) / 2
+def _shift(origin: int, centroid: float, window: int) -> int:
+    ideal = centroid - (window - 1) / 2
     if abs(ideal - origin) <= _HYSTERESIS:
         return origin
-    return min(max(round(ideal), 0), _LAST_ORIGIN)
+    return min(max(round(ideal), 0), SIDE - window)
 
 
 def compute_features(image: Raw, full_scale_pa: float) -> Features:

@@ -22,7 +22,9 @@ def _no_sensor(scene: Scene) -> str | None:
 def _no_image(scene: Scene) -> str | None:
     if scene.sensor is None or scene.sensor.mode == "image":
         return None
-    return "the 8×8 window round the contact holds the patch" if scene.sensor.mode == "window" else _by_sensor(scene)
+    side = scene.sensor.window
+    why = f"the {side}×{side} window round the contact holds the patch"
+    return why if scene.sensor.mode == "window" else _by_sensor(scene)
 
 
 def _no_window(scene: Scene) -> str | None:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
+from canprobe.planning.contact_window import window_choices
 from canprobe.planning.model import Choice
 from canprobe.scene import Scene, TactileModeName
 
@@ -38,7 +39,7 @@ class _OpenKey:
 def _modes(scene: Scene) -> tuple[tuple[Any, str], ...]:
     why = {
         "image": "nothing is left out",
-        "window": "the 8×8 window round the contact holds the patch",
+        "window": "the window round the contact holds the patch",
         "features": "the sensor computes force, centroid and moments itself",
     }
     return tuple((mode, why[mode]) for mode in _MODES.get(scene.task.kind, _FOLLOWING))
@@ -71,6 +72,7 @@ def _bus(key: str) -> Callable[[Scene, Any], Scene]:
 
 _KEYS = (  # the last is varied first
     _OpenKey("sensor.mode", _modes, _sensor("mode")),
+    _OpenKey("sensor.window", window_choices, _sensor("window")),
     _OpenKey("sensor.channel", _channels, _sensor("channel")),
     _OpenKey(
         "bus.fd",
@@ -93,18 +95,25 @@ _KEYS = (  # the last is varied first
 def candidates(scene: Scene) -> Iterator[tuple[Scene, tuple[Choice, ...]]]:
     """Every scene that the open keys allow, the best first; the scene itself where nothing is open."""
     keys = [key for key in _KEYS if _value(scene, key.key) == AUTO]
+    window_open = any(key.key == "sensor.window" for key in keys)
     for options in itertools.product(*(key.options(scene) for key in keys)):
         candidate = scene
         choices = []
         for key, (value, why) in zip(keys, options, strict=True):
             candidate = key.put(candidate, value)
             choices.append(Choice(key.key, _written(value), why))
-        yield candidate, tuple(choices)
+        sensor = candidate.sensor
+        if not window_open or sensor is None or sensor.mode == "window":
+            yield candidate, tuple(choices)
+        elif sensor.window == window_choices(scene)[0][0]:  # a frame without a window is tried once
+            yield candidate, tuple(choice for choice in choices if choice.key != "sensor.window")
 
 
 def opened(scene: Scene) -> Scene:
     """The scene with every key left to the plan that stands at its default; what the sensor sends stays."""
-    for key in _KEYS[1:]:
+    for key in _KEYS:
+        if key.key in ("sensor.mode", "sensor.window"):
+            continue
         value = _value(scene, key.key)
         section = key.key.partition(".")[0]
         if getattr(scene, section) is not None and value in (None, False, "default"):
@@ -124,4 +133,4 @@ def _value(scene: Scene, path: str) -> Any:
 
 
 def _written(value: Any) -> str:
-    return str(value).lower() if isinstance(value, bool) else f'"{value}"'
+    return str(value).lower() if isinstance(value, bool | int) else f'"{value}"'

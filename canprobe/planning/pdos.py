@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+from canprobe.eds import has_window_size
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.model import Direction, PlannedPdo, SyncPlan
 from canprobe.planning.wire_bits import frame_bits
-from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry, PdoLayout
+from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.protocol.tactile import WINDOW, window_words
 from canprobe.protocol.timing import worst_case_bits
-from canprobe.scene import Scene, TactileModeName
+from canprobe.scene import Scene, SensorSettings
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
 POSITION, TARGET_POSITION = (0x6064, 0), (0x607A, 0)
@@ -25,11 +27,10 @@ CONTROLWORD_LOST_MS = 250
 EVERY_SYNC = 1
 ON_EVENT = 255
 
-TACTILE_OBJECTS: dict[TactileModeName, tuple[tuple[int, int], ...]] = {
-    "window": ((0x2120, 0), *((0x2110, row) for row in range(1, 9))),
-    "image": ((0x2120, 0), *((0x2100, half) for half in range(1, 33))),
-    "features": ((0x2130, 1), (0x2130, 2)),
-}
+HEADER, WINDOW_TAXELS, IMAGE_TAXELS, FEATURES = (0x2120, 0), 0x2110, 0x2100, 0x2130
+IMAGE_WORDS = 32
+FD_WORDS = (8, 6, 4, 3, 2, 1)
+"""Objects of 8 bytes that fill a CAN FD frame without a byte left over."""
 
 
 @dataclass(slots=True)
@@ -140,7 +141,8 @@ def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio
     if scene.bus.fd and not long:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
         planning.not_available.append(("CAN FD frames from the sensor", why))
-    for number, found in enumerate(_parcels(TACTILE_OBJECTS[sensor.mode], long), start=1):
+    _plan_window(planning, sensor, device)
+    for number, found in enumerate(_parcels(tactile_objects(sensor), long), start=1):
         entries = planning.entries(device, sensor.node_id, "tpdo", found)
         if entries:
             layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
@@ -149,11 +151,34 @@ def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio
             planning.add(device, replace(pdo, kind="tactile"))
 
 
+def tactile_objects(sensor: SensorSettings) -> tuple[tuple[int, int], ...]:
+    """The objects of a tactile frame, its header first."""
+    if sensor.mode == "features":
+        return (FEATURES, 1), (FEATURES, 2)
+    if sensor.mode == "image":
+        return HEADER, *((IMAGE_TAXELS, half) for half in range(1, IMAGE_WORDS + 1))
+    return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(sensor.window)) + 1))
+
+
+def _plan_window(planning: PdoPlanning, sensor: SensorSettings, device: Abilities) -> None:
+    """A sensor whose window cannot be set has one of 8×8 taxels."""
+    if sensor.mode != "window" or has_window_size(device.od):
+        return
+    why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
+    planning.not_available.append(("another window", why))
+    if sensor.window != WINDOW:
+        planning.problems.append(f"node {sensor.node_id}: {why}: sensor.window = {WINDOW}, not {sensor.window}")
+
+
 def _parcels(objects: Sequence[tuple[int, int]], long: bool) -> list[Sequence[tuple[int, int]]]:
     """Which objects go together into a PDO: the header alone, then one each, or as many as 64 bytes hold."""
     header, *rest = objects
-    size = FD_MAX_BITS // MAX_BITS if long else 1
-    return [(header,), *(rest[i : i + size] for i in range(0, len(rest), size))]
+    parcels: list[Sequence[tuple[int, int]]] = [(header,)]
+    while rest:
+        size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
+        parcels.append(rest[:size])
+        rest = rest[size:]
+    return parcels
 
 
 def _synchronous(

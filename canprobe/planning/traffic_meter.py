@@ -10,7 +10,7 @@ from canprobe.planning.measured import ClassTraffic, Kind, MeasuredTraffic
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus, PlannedPdo
 from canprobe.planning.traffic import SYNCHRONOUS, on_the_wire
 from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
-from canprobe.protocol.frame_bits import best_case_bits, worst_case_bits
+from canprobe.protocol.frame_bits import FD_LENGTHS, best_case_bits, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
 
@@ -92,11 +92,13 @@ class TrafficMeter:
     _by_counter: dict[int, int] = field(init=False, default_factory=dict)
     _header_id: int | None = field(init=False, default=None)
     _tactile_ns: int | None = field(init=False, default=None)
+    _unstuffed: dict[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
         buses = self.plan.buses
         self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
         self._expected = expected_messages(self.plan, self._bus)
+        self._unstuffed = {n: unstuffed_frame_bits(n, self.plan.scene.bus) for n in FD_LENGTHS}
         self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
@@ -109,6 +111,21 @@ class TrafficMeter:
                 self._before, self._counts = self._counts, {}
             self._by_counter[data[0] if data else 0] = t_ns
         self._cycle.append((can_id, data, t_ns))
+
+    @property
+    def frames(self) -> int:
+        """Frames so far, bring-up included."""
+        return sum(one.frames for one in self._all_counts())
+
+    @property
+    def bits(self) -> int:
+        """Their bits, counted as `exact` says."""
+        return sum(one.bits for one in self._all_counts())
+
+    def _all_counts(self) -> list[_Count]:
+        waiting: dict[int, _Count] = {}
+        self._tally(waiting)
+        return [*self._before.values(), *self._counts.values(), *waiting.values()]
 
     def report(self) -> MeasuredTraffic:
         """What was counted so far, beside the plan."""
@@ -131,28 +148,32 @@ class TrafficMeter:
         )
 
     def _count(self) -> None:
-        """Count the frames since the last SYNC."""
-        counts, bus, exact = self._counts, self.plan.scene.bus, self.exact
+        """Count the frames since the last SYNC, and how far behind it they were."""
+        counts, expectations = self._counts, self._expected
+        self._tally(counts)
         for can_id, data, t_ns in self._cycle:
+            expected = expectations.get(can_id)
+            if expected is None or expected.latest_ns is None:
+                continue
+            trigger = self._sync_ns if expected.kind != "tactile PDO" else self._trigger(expected, data)
+            if trigger is not None:
+                took, count = t_ns - trigger, counts[can_id]
+                count.late += took > expected.latest_ns
+                count.slowest_ns = max(count.slowest_ns, took)
+        self._cycle.clear()
+
+    def _tally(self, counts: dict[int, _Count]) -> None:
+        """Add the frames since the last SYNC."""
+        bus, exact, unstuffed = self.plan.scene.bus, self.exact, self._unstuffed
+        for can_id, data, _ in self._cycle:
             count = counts.get(can_id)
             if count is None:
                 count = counts[can_id] = _Count()
             count.frames += 1
-            count.bits += exact_frame_bits(can_id, data, bus) if exact else unstuffed_frame_bits(len(data), bus)
-            expected = self._expected.get(can_id)
-            if expected is None or expected.latest_ns is None:
-                continue
-            trigger = self._trigger(expected, data)
-            if trigger is not None:
-                took = t_ns - trigger
-                count.slowest_ns = max(count.slowest_ns, took)
-                count.late += took > expected.latest_ns
-        self._cycle.clear()
+            count.bits += exact_frame_bits(can_id, data, bus) if exact else unstuffed[len(data)]
 
     def _trigger(self, expected: Expected, data: bytes) -> int | None:
-        """When the SYNC behind a frame was through: the last one, or the one that a tactile header names."""
-        if expected.kind != "tactile PDO":
-            return self._sync_ns
+        """When the SYNC behind a tactile PDO was through: the one that its header names."""
         if expected.cob_id == self._header_id:
             self._tactile_ns = self._by_counter.get(data[1]) if len(data) == 8 else None
         return self._tactile_ns

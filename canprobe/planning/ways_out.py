@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.model import Traffic
 from canprobe.planning.open_keys import candidates, opened, second_channel, written_value
+from canprobe.protocol.tactile import WINDOWS
 from canprobe.scene import Scene, TactileModeName
 
 FD_ARRAY = "tactile_array_fd.eds"
@@ -41,6 +42,10 @@ def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
         "image": ("window", "features"),
         "window": ("features",),
     }
+    if scene.sensor.mode == "window":
+        for side in reversed([side for side in WINDOWS if side < int(scene.sensor.window)]):
+            sensor = dataclasses.replace(scene.sensor, window=side)
+            yield f"sensor.window = {side}", dataclasses.replace(scene, sensor=sensor)
     for mode in smaller.get(scene.sensor.mode, ()):
         yield f'sensor.mode = "{mode}"', dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode=mode))
     if scene.arm is not None:

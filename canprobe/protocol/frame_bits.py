@@ -11,13 +11,26 @@ RTSS 2014, whose formula lacks the stuff count that ISO added in 2015 (4 bits an
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+
+import numpy as np
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.crc import CRC15
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.protocol.stuffing import START_OF_FRAME, Table, feed, most_stuff_bits, tables
+from canprobe.protocol.stuffing import (
+    COUNT_SHIFT,
+    START_OF_FRAME,
+    cut_into_words,
+    feed,
+    last_rows,
+    most_stuff_bits,
+    state_of,
+    word_rows,
+)
 
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8
@@ -101,45 +114,84 @@ def exact_bits(can_id: int, data: bytes, *, dlc: int | None = None) -> int:
     Raises:
         ProtocolError: an identifier or a length that no frame has.
     """
-    code = len(data) if dlc is None else dlc
-    if not 0 <= code <= 15 or len(data) != (0 if can_id & RTR_FLAG else min(code, 8)):
-        raise ProtocolError(f"{can_id:X}: no classical frame has {len(data)} data bytes and the length code {code}")
-    bits, register, table, effects = _header(can_id, code)
-    for byte, effect in zip(data, effects, strict=True):
-        register ^= effect[byte]
-        table, stuffed = table[byte]
-        bits += stuffed
-    table, stuffed = table[register >> 7]
-    return bits + stuffed + table[256][register & 127]  # type: ignore[no-any-return]
+    return _length_of(can_id, len(data), dlc)(data)
+
+
+_Length = Callable[[bytes], int]
 
 
 @lru_cache(maxsize=4096)
-def _header(can_id: int, code: int) -> tuple[int, int, Table, tuple[tuple[int, ...], ...]]:
-    """What a frame's header settles.
+def _length_of(can_id: int, n_data: int, dlc: int | None) -> _Length:
+    """What measures the frames of one identifier and one length; it knows the header and its part of the CRC."""
+    code = n_data if dlc is None else dlc
+    if not 0 <= code <= 15 or n_data != (0 if can_id & RTR_FLAG else min(code, 8)):
+        raise ProtocolError(f"{can_id:X}: no classical frame has {n_data} data bytes and the length code {code}")
+    value, n_bits = _arbitration(can_id, code)
+    stuffing = feed(START_OF_FRAME, value, n_bits - 1)
+    bits = n_bits + (stuffing >> 4) + 8 * n_data + 15 + _TAIL
+    crc = CRC15.of(value << 8 * n_data, n_bits + 8 * n_data)
+    return (_of_four_words if n_data == 8 else _of_words)(n_data, bits, crc, state_of(stuffing))
 
-    Returns:
-        Its bits without those that data and CRC stuff, its CRC with data of 0, its stuffing, and what each data byte
-        does to the CRC.
-    """
+
+def _arbitration(can_id: int, code: int) -> tuple[int, int]:
+    """Start of frame to DLC: value and number of bits."""
     remote = 1 if can_id & RTR_FLAG else 0
     identifier = can_id & ~(EFF_FLAG | RTR_FLAG)
     if can_id & EFF_FLAG and 0 <= identifier <= 0x1FFFFFFF:
-        value = (identifier >> 18) << 27 | 0b11 << 25 | (identifier & 0x3FFFF) << 7 | remote << 6 | code
-        n_bits = 39
-    elif 0 <= identifier <= 0x7FF:
-        value, n_bits = identifier << 7 | remote << 6 | code, 19
-    else:
-        raise ProtocolError(f"{can_id:X} is no CAN identifier; one of 29 bits carries the flag {EFF_FLAG:X}")
-    n_bytes = 0 if remote else min(code, 8)
-    n_data = 8 * n_bytes
-    stuffing = feed(START_OF_FRAME, value, n_bits - 1)
-    bits = n_bits + (stuffing >> 4) + n_data + 15 + _TAIL
-    return bits, CRC15.of(value << n_data, n_bits + n_data), tables()[stuffing & 15], _crc15_bytes()[8 - n_bytes :]
+        return (identifier >> 18) << 27 | 0b11 << 25 | (identifier & 0x3FFFF) << 7 | remote << 6 | code, 39
+    if 0 <= identifier <= 0x7FF:
+        return identifier << 7 | remote << 6 | code, 19
+    raise ProtocolError(f"{can_id:X} is no CAN identifier; one of 29 bits carries the flag {EFF_FLAG:X}")
+
+
+def _of_words(n_data: int, bits: int, crc: int, state: int) -> _Length:
+    """Length with data of any length; `bits` and `crc` are those of the frame with data of 0, without its stuffing."""
+    cut, rows = cut_into_words(n_data)
+    words, last = tuple(zip(rows, _crc15_words(n_data), strict=True)), last_rows()
+
+    def length(data: bytes) -> int:
+        register, total, step = crc, 0, state
+        for value, (row, effect) in zip(cut(data), words, strict=True):
+            register ^= effect[value]
+            step = row[step][value]
+            total += step
+        return bits + (total >> COUNT_SHIFT) + last[step][register]
+
+    return length
+
+
+def _of_four_words(n_data: int, bits: int, crc: int, state: int) -> _Length:
+    """The same for 8 bytes, the usual PDO, in half of the time."""
+    cut, _ = cut_into_words(n_data)
+    rows, last = word_rows(), last_rows()
+    first = rows[state]
+    at_a, at_b, at_c, at_d = _crc15_words(n_data)
+
+    def length(data: bytes) -> int:
+        a, b, c, d = cut(data)
+        after_a = first[a]
+        after_b = rows[after_a][b]
+        after_c = rows[after_b][c]
+        after_d = rows[after_c][d]
+        stuffed = (after_a + after_b + after_c + after_d) >> COUNT_SHIFT
+        return bits + stuffed + last[after_d][crc ^ at_a[a] ^ at_b[b] ^ at_c[c] ^ at_d[d]]
+
+    return length
 
 
 @cache
-def _crc15_bytes() -> tuple[tuple[int, ...], ...]:
-    return CRC15.byte_tables(8)
+def _crc15_words(n_data: int) -> tuple[Sequence[int], ...]:
+    """What each word of so many bytes does to the CRC, an odd byte last."""
+    places = CRC15.byte_tables(8)[8 - n_data :]
+    words = tuple(_crc15_pair(n_data - at - 2) for at in range(0, n_data - 1, 2))
+    return words + places[n_data - n_data % 2 :]
+
+
+@cache
+def _crc15_pair(behind: int) -> Sequence[int]:
+    """What two bytes do to the CRC that have so many more behind them."""
+    first, second = (np.array(table, np.uint16) for table in CRC15.byte_tables(behind + 2)[:2])
+    return array("H", np.bitwise_xor.outer(first, second).tobytes())
 
 
 def fd_dlc(n_data: int) -> int:
@@ -174,10 +226,12 @@ def exact_fd_bits(can_id: int, data: bytes, *, brs: bool = True, esi: bool = Fal
     # the last bit before the CRC field is left out: the field begins with a stuff bit, whatever came before
     rest = ((esi << 4 | fd_dlc(len(data))) << 8 * len(data) | int.from_bytes(data, "big")) >> 1
     stuffing = feed(stuffing, rest >> 8 * len(data), 4)
-    count, table = (stuffing >> 4) - before, tables()[stuffing & 15]
-    for byte in (rest & (1 << 8 * len(data)) - 1).to_bytes(len(data), "big"):
-        table, stuffed = table[byte]
-        count += stuffed
+    step, total = state_of(stuffing), 0
+    cut, rows = cut_into_words(len(data))
+    for word, row in zip(cut((rest & (1 << 8 * len(data)) - 1).to_bytes(len(data), "big")), rows, strict=True):
+        step = row[step][word]
+        total += step >> COUNT_SHIFT
+    count = (stuffing >> 4) - before + total
     nominal, fast = n_bits + before + _FD_TAIL, _fd_data_phase(len(data)) + count
     return FrameLength(nominal, fast) if brs else FrameLength(nominal + fast)
 

@@ -5,10 +5,16 @@ A stuffing is one integer: stuff bits so far × 16 + state, the state being the 
 
 from __future__ import annotations
 
+from array import array
+from collections.abc import Callable, Sequence
 from functools import cache
-from typing import Any
+from struct import Struct
+
+import numpy as np
+from numpy.typing import NDArray
 
 RUN = 5
+_STATES = 10
 
 
 def _state(level: int, run: int) -> int:
@@ -35,20 +41,61 @@ def feed(stuffing: int, value: int, n_bits: int) -> int:
     return count << 4 | state
 
 
-Table = list[Any]
-"""What a byte does in one state: at its value (the next state's table, stuff bits); at 256 the stuff bits of 7 bits."""
+COUNT_SHIFT = 6
+Rows = tuple[Sequence[int], ...]
+"""What some bits do, by what the bits before them did and by their value: stuff bits × 64 + state after them.
+
+Sums of ten such numbers and more keep their stuff bits apart from the states. The first row is that of a state alone.
+"""
+
+
+def state_of(stuffing: int) -> int:
+    """The row with which to go on after `feed`."""
+    return stuffing & 15
 
 
 @cache
-def tables() -> list[Table]:
-    """By state; made when the first frame is measured."""
-    found: list[Table] = [[None] * 257 for _ in range(10)]
-    for state, table in enumerate(found):
-        for value in range(256):
-            after = feed(state, value, 8)
-            table[value] = (found[after & 15], after >> 4)
-        table[256] = tuple(feed(state, value, 7) >> 4 for value in range(128))
-    return found
+def byte_rows() -> Rows:
+    """Of 8 bits."""
+    return _aliased([array("H", row.tolist()) for row in _bits(8)])
+
+
+@cache
+def word_rows() -> Rows:
+    """Of 16 bits, highest first."""
+    first = _bits(8)
+    both = (first >> COUNT_SHIFT << COUNT_SHIFT)[:, :, None] + first[first & _STATE]
+    return _aliased([array("H", row.tobytes()) for row in both])
+
+
+@cache
+def last_rows() -> Rows:
+    """Of 15 bits that nothing follows: their stuff bits alone."""
+    first = _bits(8)
+    both = (first >> COUNT_SHIFT)[:, :, None] + (_bits(7) >> COUNT_SHIFT)[first & _STATE]
+    return _aliased([row.astype(np.uint8).tobytes() for row in both])
+
+
+_STATE = (1 << COUNT_SHIFT) - 1
+
+
+def _bits(n: int) -> NDArray[np.uint16]:
+    """By state and value."""
+    fed = np.array([[feed(state, value, n) for value in range(1 << n)] for state in range(_STATES)], np.uint16)
+    return (fed >> 4 << COUNT_SHIFT | fed & 15).astype(np.uint16)
+
+
+def _aliased(rows: Sequence[Sequence[int]]) -> Rows:
+    """Each row wherever its state is, whatever was counted before it."""
+    most = 16 // (RUN - 1)
+    return tuple(rows[min(at & _STATE, _STATES - 1)] for at in range((most << COUNT_SHIFT) + _STATES))
+
+
+@cache
+def cut_into_words(n_data: int) -> tuple[Callable[[bytes], tuple[int, ...]], tuple[Rows, ...]]:
+    """How data is cut into words, an odd byte last, and the rows of each."""
+    pairs, odd = divmod(n_data, 2)
+    return Struct(f">{pairs}H{odd}B").unpack, (word_rows(),) * pairs + (byte_rows(),) * odd
 
 
 def most_stuff_bits(pattern: str) -> int:

@@ -8,17 +8,21 @@ from canprobe.protocol.tactile_wire import (
     PDO_COUNT,
     SIDE,
     WINDOW,
+    WINDOWS,
     Features,
     TactileHeader,
     TactileMode,
     crc16_ccitt,
     pack_frame,
+    pdo_count,
+    window_words,
 )
 
 __all__ = [
     "PDO_COUNT",
     "SIDE",
     "WINDOW",
+    "WINDOWS",
     "Features",
     "FrameAssembler",
     "TactileFrame",
@@ -26,4 +30,6 @@ __all__ = [
     "TactileMode",
     "crc16_ccitt",
     "pack_frame",
+    "pdo_count",
+    "window_words",
 ]

@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import ProtocolError
-from canprobe.protocol.tactile_wire import PDO_COUNT, SIDE, WINDOW, Features, TactileHeader, TactileMode, crc16_ccitt
+from canprobe.protocol.tactile_wire import (
+    SIDE,
+    WINDOW,
+    Features,
+    TactileHeader,
+    TactileMode,
+    crc16_ccitt,
+    pdo_count,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +52,21 @@ class FrameAssembler:
         duplicates: taxel PDOs that came twice, and complete frames with the counter of the frame before.
         lost: frames of the sensor that were not published, from gaps of the frame counter (mod 256).
         orphans: taxel PDOs without an open frame.
-        malformed: PDOs of a wrong length, headers that mean nothing, frames of another mode.
+        malformed: PDOs of a wrong length, headers that mean nothing, frames of another mode or window.
     """
 
     __slots__ = (
-        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots",
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots", "_window",
         "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
     )  # fmt: skip
 
     def __init__(
-        self, cob_ids: Sequence[int], mode: TactileMode, deadline_ns: int, sizes: Sequence[int] | None = None
+        self,
+        cob_ids: Sequence[int],
+        mode: TactileMode,
+        deadline_ns: int,
+        sizes: Sequence[int] | None = None,
+        window: int = WINDOW,
     ) -> None:
         """Expect the given identifiers.
 
@@ -62,19 +75,20 @@ class FrameAssembler:
             mode: what the sensor is set to.
             deadline_ns: longest time from header to last PDO; two cycles as a rule.
             sizes: bytes of each PDO; 8 by default, up to 64 on CAN FD.
+            window: taxels along the window that the sensor is set to.
 
         Raises:
             ProtocolError: the PDOs do not add up to a frame of the mode, or an identifier is there twice.
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
         self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
-        needed = 8 * PDO_COUNT[mode]
+        needed = 8 * pdo_count(mode, window)
         if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
             raise ProtocolError(
                 f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "
                 f"got {cob_ids} with {self._sizes} bytes"
             )
-        self._mode = mode
+        self._mode, self._window = mode, window
         self._deadline_ns = deadline_ns
         self._parts: list[bytes | None] = []
         self._missing = 0  # 0: no frame is open
@@ -139,7 +153,7 @@ class FrameAssembler:
         if crc16_ccitt(body, crc16_ccitt(start[:6])) != header.crc:
             self.crc_errors += 1
             return None
-        if header.mode is not self._mode:
+        if header.mode is not self._mode or (header.mode is TactileMode.WINDOW and header.window != self._window):
             self.malformed += 1
             return None
         if header.frame_counter == self._last:
@@ -158,9 +172,10 @@ def _build(header: TactileHeader, body: bytes, t_ns: int) -> TactileFrame:
     if header.mode is TactileMode.FEATURES:
         features = Features.unpack(body, header.peak)
     else:
-        side = WINDOW if header.mode is TactileMode.WINDOW else SIDE
+        side = header.window if header.mode is TactileMode.WINDOW else SIDE
         row, col = header.origin_row, header.origin_col
-        taxels[row : row + side, col : col + side] = np.frombuffer(body, np.uint8).reshape(side, side)
+        counts = np.frombuffer(body, np.uint8, side * side).reshape(side, side)
+        taxels[row : row + side, col : col + side] = counts
         window = (row, col, side, side)
     taxels.flags.writeable = False
     return TactileFrame(header, taxels, window, features, t_ns)

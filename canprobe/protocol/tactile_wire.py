@@ -2,13 +2,15 @@
 
 Every frame begins with the same 8 bytes, little-endian:
 
-    byte 0  frame counter, +1 a frame, mod 256        byte 3     flags: bits 0..1 mode, bit 2 overload, others 0
+    byte 0  frame counter, +1 a frame, mod 256        byte 3     flags: bits 0..1 mode, 2 overload, 4..7 window
     byte 1  SYNC counter of the trigger (0: none)     bytes 4..5 sample age in µs: trigger SYNC minus sample time
     byte 2  window origin, row << 4 | column          bytes 6..7 CRC-16 over bytes 0..5 and all payload after
 
-In features mode byte 2 is the peak taxel instead: features have no window. Then follow, by mode,
-window: 8 payloads, a row of 8 taxels each; image: 32 payloads, the left then the right half of each of 16 rows; lowest
-byte = lowest column. Features: one payload, a 64-bit little-endian word from its least significant bit upward:
+In features mode byte 2 is the peak taxel instead: features have no window. The flags' window is the number of taxels
+along it, 0 for 8 and outside window mode; bit 3 is 0. Then follow, by mode, window: its taxels row by row, 8 to a
+payload, zeros behind the last one (of 8×8 taxels: 8 payloads, a row each); image: 32 payloads, the left then the right
+half of each of 16 rows; lowest byte = lowest column. Features: one payload, a 64-bit little-endian word from its least
+significant bit upward:
 
     field   bits  scale         range, saturating          field   bits  scale          range, saturating
     force   12    1/400 N       0..10.2375 N               var_rr  10    1/64 taxel²    0..15.98 taxel²
@@ -32,7 +34,9 @@ from numpy.typing import NDArray
 from canprobe.errors import ProtocolError
 
 SIDE = 16  # taxels along the pad
-WINDOW = 8  # taxels along the window
+WINDOW = 8  # taxels along the window, where nothing else is said
+WINDOWS = (4, 6, 8, 10, 12)
+"""Taxels along the window that a sensor can be set to."""
 _FORM = struct.Struct("<BBBBHH")
 _OVERLOAD = 0x04
 _FORCE_SCALE, _CENTROID_SCALE, _MOMENT_SCALE = 400.0, 128.0, 64.0
@@ -57,7 +61,17 @@ class TactileMode(IntEnum):
 
 
 PDO_COUNT = {TactileMode.FEATURES: 2, TactileMode.WINDOW: 9, TactileMode.IMAGE: 33}
-"""PDOs of a frame, header included."""
+"""PDOs of a frame, header included; with a window of 8×8 taxels."""
+
+
+def window_words(side: int) -> int:
+    """Payloads of 8 taxels that a window of side × side taxels fills."""
+    return -(-side * side // 8)
+
+
+def pdo_count(mode: TactileMode, window: int = WINDOW) -> int:
+    """PDOs of a frame, header included."""
+    return 1 + window_words(window) if mode is TactileMode.WINDOW else PDO_COUNT[mode]
 
 
 def crc16_ccitt(data: bytes, crc: int = 0) -> int:
@@ -76,11 +90,12 @@ class TactileHeader:
     Attributes:
         frame_counter: 0..255.
         sync_counter: SYNC counter of the trigger, 1..240; 0 without a counter.
-        origin_row, origin_col: window's first taxel in the full pad, 0..8; in features mode together the peak.
+        origin_row, origin_col: window's first taxel in the full pad; in features mode together the peak.
         mode: what follows.
         overload: a taxel reached full scale.
         sample_age_us: trigger SYNC minus sample time, µs.
         crc: over the six bytes before it and the payloads after; `pack_frame` computes it.
+        window: taxels along the window.
     """
 
     frame_counter: int
@@ -91,6 +106,7 @@ class TactileHeader:
     overload: bool
     sample_age_us: int
     crc: int = 0
+    window: int = WINDOW
 
     @property
     def peak(self) -> int:
@@ -105,7 +121,8 @@ class TactileHeader:
         """
         if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
             raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
-        flags = self.mode | (_OVERLOAD if self.overload else 0)
+        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != WINDOW else 0
+        flags = self.mode | (_OVERLOAD if self.overload else 0) | size
         fields = (self.frame_counter, self.sync_counter, self.peak, flags, self.sample_age_us, self.crc)
         try:
             return _FORM.pack(*fields)
@@ -122,15 +139,28 @@ class TactileHeader:
         if len(data) != _FORM.size:
             raise ProtocolError(f"tactile header: expected 8 bytes, got {len(data)}")
         counter, sync, origin, flags, age, crc = _FORM.unpack(data)
-        if flags & 0x03 not in PDO_COUNT or flags & ~0x07:
+        if (read := _FLAGS.get(flags)) is None:
             raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
-        header = cls(counter, sync, origin >> 4, origin & 0x0F, TactileMode(flags & 3), bool(flags & 4), age, crc)
+        header = cls(counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD), age, crc, read[1])
         _check_origin(header)
         return header
 
 
+_FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD)} | {
+    TactileMode.WINDOW | overload | side << 4: (TactileMode.WINDOW, side)
+    for side in WINDOWS
+    if side != WINDOW
+    for overload in (0, _OVERLOAD)
+}
+"""What byte 3 can be: mode and taxels along the window."""
+
+
 def _check_origin(header: TactileHeader) -> None:
-    limit = {TactileMode.FEATURES: SIDE - 1, TactileMode.WINDOW: SIDE - WINDOW, TactileMode.IMAGE: 0}[header.mode]
+    if header.window not in WINDOWS:
+        raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
+    limit = {TactileMode.FEATURES: SIDE - 1, TactileMode.WINDOW: SIDE - header.window, TactileMode.IMAGE: 0}[
+        header.mode
+    ]
     if max(header.origin_row, header.origin_col) > limit:
         origin = (header.origin_row, header.origin_col)
         raise ProtocolError(f"tactile header: {header.mode.name.lower()} cannot begin at taxel {origin}")
@@ -195,14 +225,16 @@ def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features)
         if header.mode is not TactileMode.FEATURES:
             raise ProtocolError(f"features given to a frame of mode {header.mode.name}")
         return content.pack()
-    if content.dtype != np.uint8 or content.shape not in ((SIDE, SIDE), (WINDOW, WINDOW)):
-        raise ProtocolError(f"taxels: expected uint8 (16, 16) or (8, 8), got {content.dtype} {content.shape}")
+    side = header.window
+    if content.dtype != np.uint8 or content.shape not in ((SIDE, SIDE), (side, side)):
+        raise ProtocolError(f"taxels: expected uint8 (16, 16) or ({side}, {side}), got {content.dtype} {content.shape}")
     if header.mode is TactileMode.WINDOW and content.shape == (SIDE, SIDE):
         row, col = header.origin_row, header.origin_col
-        content = content[row : row + WINDOW, col : col + WINDOW]
-    if content.shape != {TactileMode.WINDOW: (WINDOW, WINDOW), TactileMode.IMAGE: (SIDE, SIDE)}.get(header.mode):
+        content = content[row : row + side, col : col + side]
+    if content.shape != {TactileMode.WINDOW: (side, side), TactileMode.IMAGE: (SIDE, SIDE)}.get(header.mode):
         raise ProtocolError(f"taxels of shape {content.shape} given to a frame of mode {header.mode.name}")
-    return content.tobytes()
+    data = content.tobytes()
+    return data + bytes(-len(data) % 8)
 
 
 def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
@@ -210,8 +242,8 @@ def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> 
 
     Args:
         header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
-        content: taxels uint8, the full pad (16, 16), of which window mode sends its window, or that window (8, 8);
-            or features.
+        content: taxels uint8, the full pad (16, 16), of which window mode sends its window, or that window; or
+            features.
 
     Raises:
         ProtocolError: content and mode do not match, or a field does not fit.

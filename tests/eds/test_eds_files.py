@@ -325,7 +325,7 @@ def test_sensor_sends_the_window_as_delivered():
     assert [words[0] for _, _, words in entries[9:]] == [0x21000040 + (n << 8) for n in range(9, 33)]
 
 
-@pytest.mark.parametrize("index, count", [(0x2100, 32), (0x2110, 8), (0x2130, 2)])
+@pytest.mark.parametrize("index, count", [(0x2100, 32), (0x2110, 18), (0x2130, 2)])
 def test_sensor_data_are_64_bit_entries(index, count):
     array = eds.load_eds("tactile_array", 16)[index]
     assert array[0].default == count

@@ -18,7 +18,7 @@ TABLE = {
     "bowl": (8.0, 1.5),
     "wave": (5.0, 30.0),  # 7 1/m at most, and it changes within the memory
     "steel": (13.0, 3.0),
-    "foam": (16.0, 10.0),
+    "foam": (8.0, 8.0),
     "miscalibrated": (28.0, 15.0),
 }
 

@@ -84,7 +84,7 @@ def test_the_score_sees_a_hang_a_crash_and_a_torn_log(monkeypatch):
         raise ZeroDivisionError("nobody thought of it")
 
     monkeypatch.setattr(touch.TouchTask, "step", crash)
-    monkeypatch.setattr("canprobe.session.TrafficCounter.frames", property(lambda self: 1))
+    monkeypatch.setattr("canprobe.session.TrafficMeter.frames", property(lambda self: 1))
     failures = carry_out(FaultCase(0, FEATURES, "", ()))["failures"]
     assert any("ZeroDivisionError" in failure for failure in failures)
     assert any(failure.startswith("log:") for failure in failures)

@@ -17,6 +17,7 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchSettings, TouchTask
 from canprobe.planning.model import Plan
+from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import Scene, ServoSettings, TaskSettings
 from canprobe.scene_geometry import T_flange_probe, scan_axes
@@ -162,7 +163,7 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
     model = moment_model(
         array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
         scene.probe.stiffness_n_m3,
-        windowed=scene.sensor.mode == "window",
+        windowed=scene.sensor.mode == "window" and int(scene.sensor.window) <= WINDOW,
     )
     return PatchedEstimator(estimator, PatchCurvature(model), memory)
 

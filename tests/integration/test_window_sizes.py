@@ -1,0 +1,163 @@
+"""Another window end to end in lockstep: plan, configuration over SDO, frames on the bus, force and shape from them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+import canprobe
+import canprobe.eds
+from canprobe.cell.configuration import make_setups
+from canprobe.emulator.plant.contact import elastic_contact
+from canprobe.errors import PlanError, SceneError
+from canprobe.planning import make_plan
+from canprobe.planning.contact_window import patch_radius_m, taxels_needed, window_choices
+from canprobe.planning.pdos import tactile_objects
+from canprobe.scene import ProbeSettings
+from canprobe.scene_loader import parse_scene
+from canprobe.scene_writer import dump_scene
+
+PDOS = {4: 3, 6: 6, 8: 9, 10: 14, 12: 19}
+
+
+def change(scene, **sections):
+    return dataclasses.replace(
+        scene, **{name: dataclasses.replace(getattr(scene, name), **keys) for name, keys in sections.items()}
+    )
+
+
+def tactile(plan):
+    return [pdo for pdo in plan.pdos if pdo.kind == "tactile"]
+
+
+@pytest.fixture(scope="module")
+def press():
+    return change(canprobe.load_scene("press"), arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"})
+
+
+@pytest.mark.parametrize("side", [4, 6, 10])
+def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
+    scene = change(press, sensor={"window": side})
+    result = canprobe.run(scene, out=tmp_path, duration_s=0.4)
+    assert len(tactile(result.plan)) == PDOS[side]
+    measured = canprobe.measure_traffic(tmp_path, result.plan)
+    assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
+    (one,) = (one for one in measured.classes if one.kind == "tactile PDO")
+    assert one.frames == pytest.approx(one.planned_frames, rel=0.02) and one.late == 0
+    assert result.summary["cycle"]["torn_frames"] == 0
+    (setup,) = (setup for setup in make_setups(result.plan) if setup.node_id == 16)
+    assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
+
+
+def test_a_larger_window_feels_more_of_a_soft_contact():
+    """The truth is the plant's: 8×8 taxels cut the patch of a soft pad, 10×10 less of it."""
+    foam = canprobe.load_scene("foam")
+    assert make_plan(foam).scene.sensor.window == 10
+    contacts = [
+        canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
+        for scene in (change(foam, sensor={"window": 8}), foam)
+    ]
+    assert contacts[1]["force_rms_error_n"] < 0.5 * contacts[0]["force_rms_error_n"]
+    assert contacts[1]["force_rms_error_n"] < 0.1
+
+
+# --- the choice -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("force, stiffness, radius_mm", [(2.0, 1.27e8, 40.0), (2.0, 2.3e7, 40.0), (0.5, 1e9, 20.0)])
+def test_the_planned_patch_is_the_plants_on_a_plane(force, stiffness, radius_mm):
+    probe = ProbeSettings(radius_mm=radius_mm, stiffness_n_m3=stiffness)
+    radius = patch_radius_m(force, probe)
+    contact = elastic_contact(radius**2 / (2e-3 * radius_mm), (0.0, 0.0), radius_mm * 1e-3, stiffness)
+    assert contact.force == pytest.approx(force, rel=1e-12)
+    assert (contact.a, contact.b) == (pytest.approx(radius), pytest.approx(radius))
+    assert taxels_needed(force, probe) == pytest.approx(2e3 * radius / 1.5875 + 1.5)
+
+
+def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_ones():
+    press = canprobe.load_scene("press")
+    orders = {
+        2.0: [10, 8, 6, 4, 12],  # 6.7 taxels across and 1.5 for following
+        0.2: [6, 4, 8, 10, 12],  # 10^(1/4) less
+    }
+    for force, sides in orders.items():
+        assert [side for side, _ in window_choices(change(press, task={"force_n": force}))] == sides
+    assert "10.6 mm across and asks for 8.2 taxels" in window_choices(press)[0][1]
+    assert [side for side, _ in window_choices(canprobe.load_scene("listen"))] == [12, 10, 8, 6, 4]
+
+
+def test_auto_takes_what_fits_and_says_why():
+    cylinder = change(canprobe.load_scene("cylinder"), sensor={"window": "auto"})
+    tight = make_plan(cylinder)
+    assert tight.scene.sensor.window == 8
+    assert "the largest that fits, cutting its rim" in tight.choices[0].why
+    grouped = make_plan(change(cylinder, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
+    assert grouped.scene.sensor.window == 10 and len(tactile(grouped)) == 14
+    assert "the smallest that holds it" in grouped.choices[0].why
+    listening = make_plan(change(canprobe.load_scene("listen"), sensor={"mode": "window", "window": "auto"}))
+    assert listening.scene.sensor.window == 12
+    features = make_plan(change(cylinder, sensor={"mode": "features"}))
+    assert features.choices == (), "there is no window to choose"
+
+
+def test_what_does_not_fit_names_the_windows_that_do():
+    with pytest.raises(PlanError, match=r"5695 µs of the 5000 µs in 2 cycles; ways out: sensor.window = 8 \(87 %"):
+        make_plan(change(canprobe.load_scene("cylinder"), sensor={"window": 12}))
+
+
+def test_on_can_fd_every_word_of_every_window_has_its_place():
+    scene = change(canprobe.load_scene("cylinder"), sensor={"eds": "tactile_array_fd.eds"}, bus={"fd": True})
+    lengths = {4: [8, 16], 6: [8, 32, 8], 8: [8, 64], 10: [8, 64, 32, 8], 12: [8, 64, 64, 16]}
+    for side, expected in lengths.items():
+        plan = make_plan(change(scene, sensor={"window": side}))
+        pdos = sorted(tactile(plan), key=lambda pdo: pdo.number)
+        assert [pdo.layout.length for pdo in pdos] == expected
+        objects = [(entry.index, entry.subindex) for pdo in pdos for entry in pdo.entries]
+        assert objects == list(tactile_objects(plan.scene.sensor))
+
+
+def test_a_sensor_without_the_object_keeps_8(tmp_path):
+    """An older array: the same file without 2008h."""
+    eds = (canprobe.eds.eds_path("tactile_array")).read_text()
+    start = eds.index("[2008]")
+    older = eds[:start] + eds[eds.index("\n\n", start) + 2 :]
+    count = eds.index("SupportedObjects=12\n1=0x2000")
+    older = older[:count] + older[count:].replace("SupportedObjects=12", "SupportedObjects=11", 1).replace(
+        "8=0x2008\n9=0x2100\n10=0x2110\n11=0x2120\n12=0x2130", "8=0x2100\n9=0x2110\n10=0x2120\n11=0x2130", 1
+    )
+    path = tmp_path / "older.eds"
+    path.write_text(older)
+    scene = change(canprobe.load_scene("press"), sensor={"eds": str(path), "window": "auto"})
+    plan = make_plan(scene)
+    assert plan.scene.sensor.window == 8
+    assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (
+        plan.not_available
+    )
+    (setup,) = (setup for setup in make_setups(plan) if setup.node_id == 16)
+    assert not any(write.index == 0x2008 for write in setup.writes) and 0x2008 not in setup.lacks
+    with pytest.raises(PlanError, match=r"sensor\.window = 8, not 6"):
+        make_plan(change(scene, sensor={"window": 6}))
+    result = canprobe.run(plan.scene, files=False, duration_s=0.1)
+    assert result.summary["completed"] and result.summary["cycle"]["torn_frames"] == 0
+
+
+@pytest.mark.parametrize(
+    ("line", "complaint"),
+    [
+        ("window = 7", "an integer of 4, 6, 8, 10, 12"),
+        ("window = 16", "an integer of 4, 6, 8, 10, 12"),
+        ('window = "big"', '"auto"'),
+        ('mode = "features"\nwindow = 8', "mode"),
+    ],
+)
+def test_the_key_is_strict(line, complaint):
+    with pytest.raises(SceneError, match=complaint):
+        parse_scene(f'[scene]\nname = "x"\n[task]\nkind = "listen"\n[sensor]\n{line}\n')
+
+
+@pytest.mark.parametrize("value", ["4", "12", '"auto"'])
+def test_the_key_comes_back_as_it_was_written(value):
+    scene = parse_scene(f'[scene]\nname = "x"\n[task]\nkind = "listen"\n[sensor]\nwindow = {value}\n')
+    assert parse_scene(dump_scene(scene)) == scene
+    assert str(scene.sensor.window) == value.strip('"')
