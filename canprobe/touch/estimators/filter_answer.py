@@ -11,10 +11,10 @@ from canprobe.touch._arrays import Array, inverted, lower_root, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
-from canprobe.touch.evidence import evidence_of
+from canprobe.touch.evidence import curvature_covariance, evidence_of
 from canprobe.touch.misfit import misfit_notes
 from canprobe.touch.nonlinear import DIFFUSE
-from canprobe.touch.quadric import UNIT, curvature_jacobian
+from canprobe.touch.quadric import UNIT
 from canprobe.touch.rank import Decision, decide, nothing_observed
 
 
@@ -102,5 +102,4 @@ def _solution(a: Anchor, decision: Decision, deviation: Array) -> Solution:
     root = inverted(a.M @ deviation)
     if decision.rank < 3:
         return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
-    D = curvature_jacobian(a.c) @ a.M @ deviation
-    return Solution(a.c, D @ D.T, decision, has_prior=False, root=root)
+    return Solution(a.c, curvature_covariance(a.c, a.M @ deviation), decision, has_prior=False, root=root)
