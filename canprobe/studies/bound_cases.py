@@ -20,7 +20,7 @@ REGION: Mapping[str, float] = MappingProxyType({"path": 1.0, "bound": 0.2, "κσ
 """Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
 point, rad), and error of the quadric without noise (its prior, and cubic terms of the surface) over the bound.
 
-Source: `canprobe study region`, a pilot with seeds of its own.
+From what a local quadric can mean; `canprobe study region`, a pilot with seeds of its own, says how far in each holds.
 """
 
 

@@ -1,4 +1,4 @@
-"""Study `region`: a pilot of `bound` that chooses the region in which a local quadratic bound means something.
+"""Study `region`: a pilot of `bound` that chooses a region in which a local quadratic bound means something.
 
 The cases of `bound`, and more that go to the edges, with seeds of their own. For each limit of the region (path over
 radius, bound over size, κσ_p, cubic terms over the bound) the cases that are inside by all the others are sorted into
@@ -6,7 +6,7 @@ levels of it. A level holds where both estimators have the error, bias and cover
 observed. The limit is the upper end of the last level before the first that does not hold, and never beyond what
 `MEANT` says, from where on K is not what the bound is about.
 
-What was chosen stands in `bound_cases.REGION`; this study says whether it still would be.
+What is in use stands in `bound_cases.REGION`; where the pilot chooses another limit, the table says why.
 """
 
 from __future__ import annotations
