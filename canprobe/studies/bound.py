@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.studies.bound_cases import Case, all_cases, quick_cases, reasons_outside
+from canprobe.studies.bound_cases import Case, all_cases, criteria, quick_cases, reasons_outside
 from canprobe.studies.bound_scores import METHODS, Answer, answer_of, findings, length, score, verdict
 from canprobe.studies.ground import FROBENIUS
 from canprobe.studies.study import Column, StudyResult
@@ -33,6 +33,8 @@ from canprobe.touch.prior import Prior
 SEEDS, BLOCK = 200, 20
 """Seeds a case, and how many of them make a cell of the sweep."""
 MODEL = ("touch", "studies/bound.py", "studies/bound_cases.py", "studies/bound_scores.py", "studies/ground.py")
+AT = "at_"
+"""Before the names of `bound_cases.criteria` in a row."""
 COLUMNS = (
     Column("surface", "surface"),
     Column("path", "path"),
@@ -59,13 +61,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
     """The study of some cases with so many seeds each."""
-    sweep.say(f"{len(cases)} cases, {seeds} seeds each")
-    blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
-    cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
-    answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
-    for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
-        answers[case, method] += found
-    rows = [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
+    rows = measure_rows(cases, range(seeds), sweep)
 
     def draw(path: Path) -> None:
         from canprobe.studies.bound_figure import draw_bound
@@ -73,6 +69,17 @@ def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = Fa
         draw_bound(rows, path)
 
     return StudyResult("bound", COLUMNS, rows, findings(rows), measuring_facts(quick, seeds, MODEL), draw)
+
+
+def measure_rows(cases: list[Case], seeds: range, sweep: Sweep) -> list[dict[str, Any]]:
+    """The table of some cases with these seeds each."""
+    sweep.say(f"{len(cases)} cases, {len(seeds)} seeds each")
+    blocks = [(first, min(BLOCK, seeds.stop - first)) for first in seeds[::BLOCK]]
+    cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
+    answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
+    for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
+        answers[case, method] += found
+    return [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
 
 
 def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
@@ -97,12 +104,13 @@ def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[dict[str, An
     bound = math.sqrt(float(FROBENIUS @ np.diag(C)))
     exact = fit(ground.points, ground.normals, quadric=True)
     model_bias = length(ground.error(exact.T_frame_contact, exact.K)) / bound
-    why = reasons_outside(case, ground, C, model_bias)
+    values = criteria(case, ground, C, model_bias)
+    why = reasons_outside(values)
     shared = {
         "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
         **sigma_values(case.sigma_point, case.sigma_normal),
-        "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)), "model_bias": model_bias,
-        "inside": not why, "outside_for": ", ".join(why) or "–",
+        "bound_per_m": bound, "size_of_K_per_m": float(np.linalg.norm(ground.K)),
+        **{AT + name: value for name, value in values.items()}, "inside": not why, "outside_for": ", ".join(why) or "–",
     }  # fmt: skip
     for method, mine in answers.items():
         row = shared | {"method": method} | score(mine, bound)

@@ -1,14 +1,12 @@
-"""The cases of study `bound`, and the region in which a local quadratic bound means something.
-
-The thresholds of the region were fixed before any run of this table, from what a local quadric can mean.
-"""
+"""The cases of study `bound`, and the region in which a local quadratic bound means something."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
+from types import MappingProxyType
 
 import numpy as np
 
@@ -16,12 +14,14 @@ from canprobe.studies.ground import PATHS, SURFACES, Array, Ground, make_ground
 
 SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
-LARGEST_BOUND, LEAST_SIZE = 0.2, 50.0
-"""Inside, the bound on each entry of K is at most so much of ‖K‖, or of a least size, 1/m."""
-LARGEST_TILT = 5e-3
-"""Largest κσ_p: the turn of the normal over the noise of a point, rad."""
-LARGEST_BIAS = 1.0 / 3.0
-"""Largest error of the quadric without noise (its prior, and cubic terms of the surface) over the bound."""
+LEAST_SIZE = 50.0
+"""A surface's size of K below which its bound is measured by this, 1/m."""
+REGION: Mapping[str, float] = MappingProxyType({"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0})
+"""Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
+point, rad), and error of the quadric without noise (its prior, and cubic terms of the surface) over the bound.
+
+From what a local quadric can mean; `canprobe study region`, a pilot with seeds of its own, says how far in each holds.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,15 +59,17 @@ def quick_cases() -> Iterator[Case]:
         yield Case(surface, PATHS[i % 2], size, min(size, LONGEST_M), *NOISES[i % 3])
 
 
-def reasons_outside(case: Case, ground: Ground, C: Array, model_bias: float) -> list[str]:
-    """Why a local quadratic bound means little in a case; empty inside the region."""
+def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
+    """What `REGION` limits, of a case."""
     size = float(np.linalg.norm(ground.K))
-    tightest = float(np.abs(np.linalg.eigvalsh(ground.K)).max())
-    entry = math.sqrt(float(np.diag(C).max()))
-    tests = {
-        "path": case.surface != "plane" and case.length > case.size * (1.0 + 1e-9),
-        "bound": not entry <= LARGEST_BOUND * max(size, LEAST_SIZE),
-        "κσ": tightest * case.sigma_point > LARGEST_TILT * (1.0 + 1e-9),
-        "cubic": not model_bias <= LARGEST_BIAS,
+    return {
+        "path": 0.0 if case.surface == "plane" else case.length / case.size,
+        "bound": math.sqrt(float(np.diag(C).max())) / max(size, LEAST_SIZE),
+        "κσ": float(np.abs(np.linalg.eigvalsh(ground.K)).max()) * case.sigma_point,
+        "cubic": model_bias,
     }
-    return [name for name, outside in tests.items() if outside]
+
+
+def reasons_outside(values: Mapping[str, float]) -> list[str]:
+    """Why a local quadratic bound means little in a case with such `criteria`; empty inside the region."""
+    return [name for name, limit in REGION.items() if not values[name] <= limit * (1.0 + 1e-9)]

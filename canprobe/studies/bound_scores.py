@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.studies.bound_cases import LARGEST_BIAS
 from canprobe.studies.ground import FROBENIUS, Array, Ground
 from canprobe.touch.estimate import SurfaceEstimate
 
 METHODS = ("ml", "recursive")
 POOLED_RATIO, CASE_RATIO = {"ml": 1.1, "recursive": 1.25}, {"ml": 1.25, "recursive": 1.4}
+LARGEST_BIAS = 1.0 / 3.0
+"""Of K over the bound."""
 CHI2_95_OF_3 = 7.815
 Answer = list[float] | None
 """Error of K11, K12, K22, its squared length in standard deviations, and the claimed ‖·‖²; None where not observed."""

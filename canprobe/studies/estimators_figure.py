@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,7 @@ def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
 
 def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     named: set[str] = set()
+    ends: list[tuple[float, float, str]] = []
     for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
         line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
         x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
@@ -56,10 +58,9 @@ def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
             x, y, s=sizes, color=COLOURS[method], label=None if method in named else method, zorder=3, linewidths=0
         )
         named.add(method)
-        if lag is not None and x:
-            axes.annotate(
-                f"lag {lag}", (x[-1], y[-1]), textcoords="offset points", xytext=(7, -2), fontsize=7, color=BOUND
-            )
+        if lag is not None and x and math.isfinite(y[-1]):
+            ends.append((y[-1], x[-1], str(lag)))
+    _name_lags(axes, sorted(ends))
     for r in rows:
         if r["method"] == "ml":
             _draw_bound(axes, r["bound_percent"], str(r["window_samples"]), r["window_samples"] == 40)
@@ -73,6 +74,21 @@ def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.grid(color=FAINT, linewidth=0.6)
     for side in ("top", "right"):
         axes.spines[side].set_visible(False)
+
+
+def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+    """A name at the end of each line; one for those that end together."""
+    together: list[list[tuple[float, float, str]]] = []
+    for end in ends:
+        if together and end[0] < 1.25 * together[-1][-1][0]:
+            together[-1].append(end)
+        else:
+            together.append([end])
+    for lines in together:
+        y = math.sqrt(lines[0][0] * lines[-1][0])
+        text = "lag " + ", ".join(sorted((lag for *_, lag in lines), key=int))
+        at = (max(x for _, x, _ in lines), y)
+        axes.annotate(text, at, textcoords="offset points", xytext=(7, -2), fontsize=7, color=BOUND)
 
 
 def _draw_bound(axes: Axes, percent: float, text: str, named: bool) -> None:

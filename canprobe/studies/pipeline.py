@@ -33,8 +33,8 @@ from canprobe.studies.sweep import Sweep
 from canprobe.touch._arrays import Array
 from canprobe.touch.contact import ContactSample
 
-SCENES = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "torus")
-CALIBRATION, VERIFICATION = range(3), range(100, 106)
+SCENES = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "torus", "wave")
+CALIBRATION, VERIFICATION = range(2), range(100, 105)
 DURATION_S = 10.0
 MODEL = ("touch", "robot", "protocol", "planning", "cell", "emulator", "scenes", "studies/pipeline.py")
 CHI2_95_OF_3, TWO_SIDED_95 = 7.815, 1.96

@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, solved
+from canprobe.touch._arrays import Array, inverted, solved
 from canprobe.touch.estimate import Solution
+from canprobe.touch.evidence import curvature_covariance
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.quadric import curvature_jacobian, transport
+from canprobe.touch.quadric import transport
 from canprobe.touch.rank import Decision, turned
 
 
@@ -83,6 +84,4 @@ def solution(a: Anchor, root: Array, decision: Decision, has_prior: bool) -> Sol
     here = solved(a.M.T, root.T).T
     if decision.rank < 3 and not has_prior:
         return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior, here)
-    D = curvature_jacobian(a.c) @ a.M
-    X = np.linalg.solve(root.T, D.T)
-    return Solution(a.c, X.T @ X, decision, has_prior, here)
+    return Solution(a.c, curvature_covariance(a.c, a.M @ inverted(root)), decision, has_prior, here)

@@ -14,7 +14,7 @@ from canprobe.touch.anchor import anchor, solution
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
 from canprobe.touch.evidence import evidence_of
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.misfit import correct
+from canprobe.touch.misfit import CERTAIN, correct, misfit_notes
 from canprobe.touch.noise import Correlation, Noise
 from canprobe.touch.nonlinear import DIFFUSE, fit
 from canprobe.touch.prior import Prior, path_extent
@@ -25,8 +25,6 @@ _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 
 _MEAN_OF = 8
-_CERTAIN = 0.99
-"""Probability of a misfit from which an estimate mentions it."""
 
 
 class Touches(NamedTuple):
@@ -112,14 +110,13 @@ def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> S
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
     if result.decision.rank == 3 and not quadric:
         corrected = correct(result.c, result.root, d, touches.whitener())
-        certain = corrected.misfit > _CERTAIN
-        if corrected.trusted and (result.converged or not certain):
+        trusted = corrected.trusted and (result.converged or corrected.misfit <= CERTAIN)
+        notes += misfit_notes(corrected.misfit, trusted=trusted)
+        if trusted:
             c, root = corrected.c, corrected.root
             result = result._replace(c=c, root=root, free=c, free_root=root)
-            notes += ("no quadric: corrected for cubic and quartic terms",) if certain else ()
         else:
             result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
-            notes += ("no quadric: K varies too much along the path to be observed",)
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, np.zeros(3), length)
     free = anchor(result.free, T, np.zeros(3), length)

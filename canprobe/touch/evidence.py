@@ -37,8 +37,7 @@ def evidence_of(c: Array, deviation: Array, spread: Array | None, length: float)
             not spread for is weighed down (`rank.spread_share`). None where that has been seen to.
         length: m.
     """
-    D = TO_Q[:, None] * curvature_jacobian(c) @ deviation
-    information = inverted(D @ D.T)
+    information = inverted(np.outer(TO_Q, TO_Q) * curvature_covariance(c, deviation))
     if spread is not None:
         share = spread_share(spread)
         information = share @ information @ share
@@ -48,3 +47,24 @@ def evidence_of(c: Array, deviation: Array, spread: Array | None, length: float)
 def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
     """(3,) the mean weighted with the information of both, which together must be definite."""
     return solved(a.information + b.information, a.information @ a.q + b.information @ b.q)
+
+
+def curvature_covariance(c: Array, deviation: Array) -> Array:
+    """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
+
+    What c13, c23, c33 put K off by is proportional to K. Where the K found is mostly its own noise so is that part: its
+    square is too large by the noise's, which on a plane is all of it. It counts by the share of |K|² that is not noise,
+    1 − 3/χ², χ² that of K = 0 with c13, c23, c33 known.
+
+    Args:
+        c: (9,) parameters in the contact frame.
+        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+
+    Source: James and Stein, "Estimation with quadratic loss", 1961 (positive part).
+    """
+    D, others = curvature_jacobian(c) @ deviation, deviation[3:6]
+    cross = D @ others.T
+    by_others = cross @ solved(others @ others.T, cross.T)
+    own = D @ D.T - by_others
+    chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
+    return np.asarray(own + max(0.0, 1.0 - 3.0 / max(chi2, 3.0)) * by_others, dtype=np.float64)

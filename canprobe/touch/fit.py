@@ -48,8 +48,8 @@ def fit_surface(
         lag: for "chen1996".
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
             covariance grows by it; None for independent samples.
-        quadric: for "ml": the surface is known to be one. Otherwise its cubic and quartic terms are corrected for
-            where they show and allowed for in the covariance where they could hide (`misfit`).
+        quadric: for "ml" and "recursive": the surface is known to be one. Otherwise its cubic and quartic terms are
+            corrected for where they show and allowed for in the covariance where they could hide (`misfit`).
 
     Returns:
         The estimate; what the points did not observe is marked, not guessed.
@@ -72,7 +72,7 @@ def fit_surface(
     if method == "ml":
         return fit_ml(touches, prior, quadric=quadric)
     if method == "recursive":
-        return _run_filter(touches, prior)
+        return _run_filter(touches, prior, quadric)
     if correlation is not None:
         raise UsageError(f"correlation: expected none for {method!r}, which has no noise model, got {correlation}")
     if method == "chord":
@@ -84,7 +84,7 @@ def fit_surface(
     raise unknown_method(method)
 
 
-def _run_filter(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
+def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
     point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
     memory = max(touches.distance, touches.extent)
     estimator = RecursiveEstimator(
@@ -94,6 +94,7 @@ def _run_filter(touches: Touches, prior: Prior | None) -> SurfaceEstimate:
         window=len(point),
         prior=prior,
         correlation=touches.correlation,
+        quadric=quadric,
     )
     for sample in _samples(touches, point, normal):
         estimator.add(sample)

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch._arrays import Array
+from canprobe.touch.misfit import term_rows
 from canprobe.touch.nonlinear import robust, size_of, solve_rows
-from canprobe.touch.quadric import Design, rows
+from canprobe.touch.quadric import Design, linearise, rows
 from canprobe.touch.rank import Decision, spread_of
 
 _SHORTER = (1.0, 0.25)
@@ -24,6 +25,7 @@ class Linearised(NamedTuple):
         c: (9,) parameters.
         cost: robust, with the prior's part and the log-determinant of the noise.
         J: (n, 3, 9) whitened, weighted rows.
+        r: (n, 3) their residuals.
         weight: (n,) of the samples.
         target: (9,) solution of the linearised problem.
         root: (9, 9) of its information.
@@ -33,6 +35,7 @@ class Linearised(NamedTuple):
     c: Array
     cost: float
     J: Array
+    r: Array
     weight: Array
     target: Array
     root: Array
@@ -43,6 +46,11 @@ class Linearised(NamedTuple):
         """Squared length of the way to the target, in standard deviations."""
         way = self.root @ (self.target - self.c)
         return float(way @ way)
+
+    def residuals_at(self, c: Array) -> Array:
+        """Minus the residuals (n, 3) at other parameters (9,) nearby."""
+        result: Array = -self.r - self.J @ (c - self.c)
+        return result
 
 
 def linearised(c: Array, d: Design, prior: tuple[Array, Array]) -> Linearised:
@@ -58,12 +66,10 @@ def linearised(c: Array, d: Design, prior: tuple[Array, Array]) -> Linearised:
     assumed = prior[0] @ c - prior[1]
     cost += log_det + float(assumed @ assumed)
     w = np.sqrt(weight)[:, None]
-    J *= w[:, :, None]
+    r, J = r * w, J * w[:, :, None]
     A = J.reshape(-1, 9)
-    target, root, decision = solve_rows(
-        A, A @ c - (r * w).reshape(-1), prior, spread_of(d.X, d.point_variance), size_of(c)
-    )
-    return Linearised(c, cost, J, weight, target, root, decision)
+    target, root, decision = solve_rows(A, A @ c - r.reshape(-1), prior, spread_of(d.X, d.point_variance), size_of(c))
+    return Linearised(c, cost, J, r, weight, target, root, decision)
 
 
 def gauss_newton(now: Linearised, d: Design, prior: tuple[Array, Array]) -> Linearised:
@@ -79,3 +85,9 @@ def gauss_newton(now: Linearised, d: Design, prior: tuple[Array, Array]) -> Line
         if there.step <= max(now.step, SETTLED):
             return there
     return now
+
+
+def with_terms(now: Linearised, d: Design) -> Array:
+    """Rows (n, 3, 18) of the parameters and of the terms that a quadric leaves out (`terms`), weighted alike."""
+    E = term_rows(linearise(now.c, d), d) * np.sqrt(now.weight)[:, None, None]
+    return np.concatenate([now.J, E], axis=2)

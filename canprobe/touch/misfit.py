@@ -17,7 +17,6 @@ likelihood of a linear model.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +24,8 @@ import numpy as np
 from canprobe.touch._arrays import Array, inverted, upper_root
 from canprobe.touch.noise import mixed
 from canprobe.touch.nonlinear import robust
-from canprobe.touch.quadric import UNIT, Design, gradient_rows, linearise, value_rows
+from canprobe.touch.quadric import UNIT, Design, Linearised, gradient_rows, linearise, value_rows
+from canprobe.touch.terms import DEGREE, terms
 
 NONE, USUAL, TAIL = 0.75, 0.22, 0.03
 """Prior weights of: no misfit; a usual one; one that is only believed when seen."""
@@ -37,13 +37,10 @@ LEFT_OUT = 0.25
 """Higher terms over what cubic and quartic ones changed, per unit of ‖K‖ · length."""
 TRUST = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""
+CERTAIN = 0.99
+"""Probability of a misfit from which an estimate mentions it."""
 _NEVER_LESS = 0.1
 """‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
-_POWER_Y = np.array([0, 1, 2, 3, 0, 1, 2, 3, 4])
-_DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
-_POWER_X = _DEGREE - _POWER_Y
-_FACTOR = np.sqrt([math.comb(int(n), int(k)) for n, k in zip(_DEGREE, _POWER_Y, strict=True)])
-"""Makes the prior the same in all directions."""
 _PRIOR = np.concatenate(
     [[NONE], np.full(len(CHANGES), USUAL / len(CHANGES)), np.full(len(EVIDENCE), TAIL / len(EVIDENCE))]
 )
@@ -65,6 +62,53 @@ class Corrected(NamedTuple):
     trusted: bool
 
 
+class Averaged(NamedTuple):
+    """The parameters of a quadric, averaged over what it leaves out.
+
+    Attributes:
+        shift: (9,) what to add to them.
+        spread: (9, 9) covariance that the terms add to theirs.
+        share: (9,) how much of each direction of the terms the data settle: mean variance left.
+        misfit, trusted: as of `Corrected`.
+    """
+
+    shift: Array
+    spread: Array
+    share: Array
+    misfit: float
+    trusted: bool
+
+
+def scales(curvature: float) -> Array:
+    """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
+    return np.where(DEGREE == 3, 1.0, 0.25 * max(curvature, _NEVER_LESS))
+
+
+def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
+    """Average over the variance of the terms, given in directions in which the data's information is diagonal.
+
+    Args:
+        m: (9,) information about them.
+        s: (9,) its score; terms `s / m` fit best.
+        carried: (9, 9) what a unit of each puts the parameters off by, with the sign turned.
+        curvature: ‖K‖ · length.
+    """
+    usual = np.square(np.array(CHANGES) * curvature**2 / 6.0)
+    variance = np.concatenate([[0.0], usual, EVIDENCE / max(float(m.max()), 1e-300)])[:, None]
+    share = variance / (1.0 + variance * m)
+    weight = _PRIOR * _relative(0.5 * (s * s * share - np.log1p(variance * m)).sum(axis=1))
+    weight /= weight.sum()
+    shifts = -(share * s) @ carried.T
+    mean = weight @ shifts
+    apart = shifts - mean
+    left = weight @ share
+    spread = (carried * left) @ carried.T + (apart.T * weight) @ apart
+    changed = float(weight @ np.square(shifts[:, 6:] / UNIT).sum(axis=1))
+    spread[6:, 6:] += np.diag(UNIT**2) * (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed
+    trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
+    return Averaged(mean, spread, left, 1.0 - float(weight[0]), trusted)
+
+
 def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corrected:
     """Average a converged fit, everything observed, over the misfit of its quadric.
 
@@ -78,24 +122,19 @@ def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corr
     inverse = inverted(root)
     H = inverse @ inverse.T
     curvature = float(np.linalg.norm(c[6:] / UNIT))
-    E *= np.where(_DEGREE == 3, 1.0, 0.25 * max(curvature, _NEVER_LESS))
+    E *= scales(curvature)
     carried = H @ (J.T @ E)  # terms a put the quadric off by −carried a
     m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the nine parameters and their prior cannot explain of them
-    m, s, carried = np.maximum(m, 0.0), U.T @ (carried.T @ slack - E.T @ r), carried @ U
-    usual = np.square(np.array(CHANGES) * curvature**2 / 6.0)
-    variance = np.concatenate([[0.0], usual, EVIDENCE / max(float(m[-1]), 1e-300)])[:, None]
-    share = variance / (1.0 + variance * m)
-    weight = _PRIOR * _relative(0.5 * (s * s * share - np.log1p(variance * m)).sum(axis=1))
-    weight /= weight.sum()
-    shifts = -(share * s) @ carried.T
-    mean = weight @ shifts
-    apart = shifts - mean
-    C = H + (carried * (weight @ share)) @ carried.T + (apart.T * weight) @ apart
-    changed = float(weight @ np.square(shifts[:, 6:] / UNIT).sum(axis=1))
-    C[6:, 6:] += np.diag(UNIT**2) * (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed
-    lower = np.asarray(np.linalg.cholesky(C), dtype=np.float64)
-    trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
-    return Corrected(c + mean, upper_root(inverted(lower)), 1.0 - float(weight[0]), trusted)
+    s = U.T @ (carried.T @ slack - E.T @ r)
+    found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature)
+    lower = np.asarray(np.linalg.cholesky(H + found.spread), dtype=np.float64)
+    return Corrected(c + found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
+
+
+def term_rows(at: Linearised, d: Design) -> Array:
+    """Whitened rows (n, 3, 9) of the terms at the likely places of samples."""
+    found = terms(at.X[:, 0], at.X[:, 1])
+    return at.jacobian(found[:, 0], at.V[:, :, :2] @ found[:, 1:], d)
 
 
 def _relative(log_likelihood: Array) -> Array:
@@ -111,7 +150,7 @@ def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array,
     at = linearise(c, d)
     weight = robust(np.einsum("ij,ij->i", at.r, at.r))[0][:, None, None]
     J = at.jacobian(value_rows(at.X), gradient_rows(at.X, at.V), d)
-    joined = np.concatenate([J, at.jacobian(*_terms(at.X, at.V), d), at.r[:, :, None]], axis=2)
+    joined = np.concatenate([J, term_rows(at, d), at.r[:, :, None]], axis=2)
     rows, fitted = joined * weight, joined[:, :, [*range(9), -1]] * np.sqrt(weight)
     if independent is not None:
         rows, fitted = mixed(independent, rows), mixed(independent, fitted)
@@ -120,10 +159,8 @@ def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array,
     return J, E, r, J.T @ r - fitted[:, :9].T @ fitted[:, 9]
 
 
-def _terms(X: Array, V: Array) -> tuple[Array, Array]:
-    """Values (n, k) and derivatives along vectors V (n, 3, 3) of the monomials at places X (n, 3), (n, 3, k)."""
-    x, y = X[:, :1], X[:, 1:2]
-    F = _FACTOR * x**_POWER_X * y**_POWER_Y
-    along_x = _FACTOR * _POWER_X * x ** np.maximum(_POWER_X - 1, 0) * y**_POWER_Y
-    along_y = _FACTOR * _POWER_Y * x**_POWER_X * y ** np.maximum(_POWER_Y - 1, 0)
-    return F, V[:, :, :1] * along_x[:, None] + V[:, :, 1:2] * along_y[:, None]
+def misfit_notes(misfit: float, *, trusted: bool) -> tuple[str, ...]:
+    """What a reader should know about a misfit."""
+    if not trusted:
+        return ("no quadric: K varies too much along the path to be observed",)
+    return ("no quadric: corrected for cubic and quartic terms",) if misfit > CERTAIN else ()

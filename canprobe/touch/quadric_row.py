@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 Row = list[float]
 
 
+class SampleRows(NamedTuple):
+    """Whitened rows of one sample.
+
+    Attributes:
+        rows: three of ten: the Jacobian and, last, minus the residual.
+        place: x, y at which the sample most likely was.
+        weights: three of three: the whitened row of any further term of f from its value and derivatives by x and y.
+    """
+
+    rows: tuple[Row, Row, Row]
+    place: tuple[float, float]
+    weights: tuple[Row, Row, Row]
+
+
 def sample_rows(  # noqa: PLR0915 - one formula, unrolled
     c: Sequence[float], x: Sequence[float], n: Sequence[float], point_variance: float, normal_variance: float
-) -> tuple[Row, Row, Row]:
-    """Whitened rows of one sample with isotropic noise.
+) -> SampleRows:
+    """The rows of one sample with isotropic noise.
 
     Args:
         c: nine parameters in the order of `quadric`.
         x, n: point and outward normal in the working frame, dimensionless.
         point_variance, normal_variance: per axis, dimensionless.
-
-    Returns:
-        Three rows of ten: the Jacobian and, last, minus the residual.
     """
     c14, c24, c44, c13, c23, c33, c11, c12, c22 = c
     px, py, pz = x
@@ -77,7 +89,9 @@ def sample_rows(  # noqa: PLR0915 - one formula, unrolled
     m = l21 / l22
     Jb = [sb * (j - bend_b * i) - m * a for j, i, a in zip(Jb, J0, Ja, strict=True)]
     s0 = w0 * inverse
-    return [*[s0 * j for j in J0], -w0 * r0], [*Ja, -ra], [*Jb, -rb]
+    wa = [-sa * bend_a, sa * ax, sa * ay]
+    wb = [-sb * bend_b - m * wa[0], sb * bx - m * wa[1], sb * by - m * wa[2]]
+    return SampleRows(([*[s0 * j for j in J0], -w0 * r0], [*Ja, -ra], [*Jb, -rb]), (px, py), ([s0, 0.0, 0.0], wa, wb))
 
 
 def _unit_gradient(c: Sequence[float], px: float, py: float, pz: float) -> tuple[float, float, float, float]:

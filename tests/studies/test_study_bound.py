@@ -85,7 +85,7 @@ def test_inside_the_region_the_estimators_are_at_the_bound(rows):
 def test_outside_the_region_ml_is_honest(rows):
     """A torus's cubic terms are ten times the bound; on the sphere the points' noise turns normals by 20 mrad."""
     torus, sphere = (r for r in rows if not r["inside"] and r["method"] == "ml")
-    assert torus["model_bias"] > 5.0
+    assert torus["at_cubic"] > 5.0
     assert torus["ratio"] < 2.5
     for row in (torus, sphere):
         assert row["coverage"] >= 0.82, row

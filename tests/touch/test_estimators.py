@@ -80,7 +80,7 @@ def test_one_row_is_the_row_of_the_batch(truth):
     c[:3] = [0.01, -0.02, 0.001]
     batch = quadric.rows(c, quadric.design(p / 0.02, n, make_noise(160, 1e-2, 3e-3)))
     for i in rng.choice(160, 20):
-        row = np.array(sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), 1e-4, 9e-6))
+        row = np.array(sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), 1e-4, 9e-6).rows)
         assert np.allclose(row[:, 9], -batch.r[i], rtol=1e-9, atol=1e-9)
         assert np.allclose(row[:, :9], batch.J[i], rtol=1e-9, atol=1e-6)
 

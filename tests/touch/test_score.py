@@ -47,7 +47,7 @@ def test_a_batch_goes_on_as_steps():
     correlation, rng = Correlation(1e-3, 0.7), np.random.default_rng(1)
     first, then = rng.normal(size=(6, 3, 9)), rng.normal(size=(2, 3, 9))
     score = Score(PRIOR, correlation)
-    score.start(np.eye(9), first, 1e-3)
+    score.start(first, 1e-3)
     score.take(then.reshape(-1, 9), 0.4e-3, 0.9)
     places = np.concatenate([np.linspace(0.0, 1e-3, 6), [1.2e-3, 1.4e-3]])
     weights = np.array(6 * [0.9] + 2 * [1.0])

@@ -11,7 +11,8 @@ from canprobe.touch._arrays import Array
 from canprobe.touch.noise import Noise
 from canprobe.touch.nonlinear import CHI2_999
 from canprobe.touch.quadric import Design, design
-from canprobe.touch.quadric_row import sample_rows
+from canprobe.touch.quadric_row import SampleRows, sample_rows
+from canprobe.touch.terms import terms
 
 
 class Touch(NamedTuple):
@@ -23,8 +24,8 @@ class Touch(NamedTuple):
     sigma_normal: float
 
 
-def equations(c: Array, T_base_work: Array, length: float, touch: Touch) -> Array:
-    """Rows (3, 10) of one contact at parameters (9,): whitened Jacobian and minus the residual.
+def equations(c: Array, T_base_work: Array, length: float, touch: Touch) -> SampleRows:
+    """The rows of one contact at parameters (9,).
 
     Args:
         c: parameters in the working frame, in units of `length`.
@@ -35,11 +36,22 @@ def equations(c: Array, T_base_work: Array, length: float, touch: Touch) -> Arra
     R, origin = T_base_work[:3, :3], T_base_work[:3, 3]
     x = ((touch.point - origin) @ R / length).tolist()
     n = (touch.normal @ R).tolist()
-    return np.array(sample_rows(c.tolist(), x, n, (touch.sigma_point / length) ** 2, touch.sigma_normal**2))
+    return sample_rows(c.tolist(), x, n, (touch.sigma_point / length) ** 2, touch.sigma_normal**2)
 
 
-def squared_innovation(rows: Array, inverse: Array) -> float:
+def joined(contacts: Sequence[SampleRows]) -> tuple[Array, Array]:
+    """Rows of parameters and terms (`terms`) of contacts (n, 3, 18), and minus the residuals (n, 3)."""
+    own = np.array([c.rows for c in contacts])
+    x, y = np.array([c.place for c in contacts]).T
+    rows = np.empty((len(contacts), 3, 18))
+    rows[:, :, :9] = own[:, :, :9]
+    rows[:, :, 9:] = np.array([c.weights for c in contacts]) @ terms(x, y)
+    return rows, own[:, :, 9]
+
+
+def squared_innovation(contact: SampleRows, inverse: Array) -> float:
     """Squared innovation of one contact, χ² of 3, under an inverse root (9, 9) of the information."""
+    rows = np.array(contact.rows)
     predicted = rows[:, :9] @ inverse
     total = 0.0
     for residual, row in zip(rows[:, 9].tolist(), predicted, strict=True):

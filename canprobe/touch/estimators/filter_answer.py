@@ -3,16 +3,37 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, inverted, lower_root, solved, upper_root
+from canprobe.touch._arrays import Array, inverted, lower_root, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
-from canprobe.touch.evidence import evidence_of
-from canprobe.touch.quadric import UNIT, curvature_jacobian
-from canprobe.touch.rank import Decision, decide
+from canprobe.touch.evidence import curvature_covariance, evidence_of
+from canprobe.touch.misfit import misfit_notes
+from canprobe.touch.nonlinear import DIFFUSE
+from canprobe.touch.quadric import UNIT
+from canprobe.touch.rank import Decision, decide, nothing_observed
+
+
+class _Answer(NamedTuple):
+    """Where an answer is given and how sure it is.
+
+    Attributes:
+        anchor: at the contact.
+        decision: on the data.
+        spread: (2, 2) of the points in the tangent plane over the variance of their noise.
+        deviation: (9, 9) root of the covariance of the filter's parameters.
+        notes: what a reader should know.
+    """
+
+    anchor: Anchor
+    decision: Decision
+    spread: Array
+    deviation: Array
+    notes: tuple[str, ...]
 
 
 def filter_estimate(
@@ -25,6 +46,7 @@ def filter_estimate(
     samples: float,
     prior: str,
     notes: tuple[str, ...],
+    quadric: bool,
 ) -> SurfaceEstimate:
     """The answer at the foot of a point.
 
@@ -33,23 +55,17 @@ def filter_estimate(
         point: (3,) in base, m.
         spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
         innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
+        quadric: the surface is one exactly; else what a quadric leaves out is allowed for (`left_out`).
     """
-    L = state.length
-    a = anchor(state.c, state.T, state.place(point), L)
-    tangent = a.T_frame_contact[:3, :2]
-    size = 2.0 * math.sqrt(a.c[6] ** 2 + 2.0 * a.c[7] ** 2 + a.c[8] ** 2)
-    q = a.M[6:] @ state.inverse / UNIT[:, None]
-    flat = tangent.T @ spread @ tangent
-    decision = decide(inverted(upper_root(q.T)).T, flat, size)
-    noise = state.inverse.T @ state.score.matrix @ state.inverse
-    noise_root = lower_root(noise)
-    evidence = evidence_of(a.c, a.M @ state.inverse @ noise_root, flat, L)
+    found = _answered(state, point, spread, quadric=quadric)
+    a, decision = found.anchor, found.decision
+    evidence = evidence_of(a.c, a.M @ found.deviation, found.spread, state.length)
     known = decision.vectors[:, decision.passed]
     a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
     singular = np.linalg.svd(state.root, compute_uv=False)
     return build_estimate(
-        _solution(state, a, decision, noise_root),
-        length=L,
+        _solution(a, decision, found.deviation),
+        length=state.length,
         T_frame_contact=a.T_frame_contact,
         condition_number=float(singular[0] / singular[-1]),
         innovation=innovation,
@@ -57,15 +73,33 @@ def filter_estimate(
         samples=samples,
         method="recursive",
         prior=prior,
-        notes=notes,
+        notes=notes + found.notes,
         evidence=evidence,
     )
 
 
-def _solution(state: InformationFilter, a: Anchor, decision: Decision, noise_root: Array) -> Solution:
-    """With the sandwich covariance where all is observed."""
-    root = solved(a.M.T, state.root.T).T
+def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric: bool) -> _Answer:
+    """With the sandwich covariance, amended where all is observed."""
+    place = state.place(point)
+    a = anchor(state.c, state.T, place, state.length)
+    tangent = a.T_frame_contact[:3, :2]
+    flat = tangent.T @ spread @ tangent
+    q = a.M[6:] @ state.inverse / UNIT[:, None]
+    decision = decide(inverted(upper_root(q.T)).T, flat, float(np.linalg.norm(a.c[6:] / UNIT)))
+    noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
+    notes: tuple[str, ...] = ()
+    if decision.rank == 3 and not quadric:
+        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place)
+        notes = misfit_notes(amended.misfit, trusted=amended.trusted)
+        if not amended.trusted:
+            return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
+        a = anchor(amended.c, state.T, place, state.length)
+        noise += state.root @ amended.covariance @ state.root.T
+    return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)
+
+
+def _solution(a: Anchor, decision: Decision, deviation: Array) -> Solution:
+    root = inverted(a.M @ deviation)
     if decision.rank < 3:
         return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
-    D = curvature_jacobian(a.c) @ a.M @ state.inverse @ noise_root
-    return Solution(a.c, D @ D.T, decision, has_prior=False, root=solved(noise_root, root))
+    return Solution(a.c, curvature_covariance(a.c, a.M @ deviation), decision, has_prior=False, root=root)

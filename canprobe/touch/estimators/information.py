@@ -8,7 +8,7 @@ import numpy as np
 
 from canprobe.touch._arrays import Array, inverted, upper_root
 from canprobe.touch.anchor import foot
-from canprobe.touch.estimators.score import Score
+from canprobe.touch.estimators.left_out import LeftOut
 from canprobe.touch.frames import homogeneous, transported_rotation
 from canprobe.touch.noise import Correlation
 from canprobe.touch.nonlinear import DIFFUSE
@@ -33,7 +33,7 @@ class InformationFilter:
         c: (9,) parameters (`quadric`).
         root: (9, 9) `rootᵀ root` is their information.
         inverse: (9, 9) of `root`.
-        score: what the noise of the rows does to them.
+        left_out: what the rows say about the terms that a quadric has not, and what their noise does.
     """
 
     def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
@@ -41,7 +41,7 @@ class InformationFilter:
         self.root: Array
         self.inverse: Array
         self._prior_rows = _prior_rows(prior, length)
-        self.score = Score(self._prior_rows.T @ self._prior_rows, correlation)
+        self.left_out = LeftOut(self._prior_rows.T @ self._prior_rows, correlation)
         self.begin(np.eye(4))
 
     def begin(self, T: Array) -> None:
@@ -49,34 +49,39 @@ class InformationFilter:
         self.T = T
         self.c = np.zeros(9)
         self._set_root(self._prior_rows)
-        self.score.reset()
+        self.left_out.reset()
 
-    def adopt(self, T: Array, c: Array, root: Array, J: Array, travelled: float) -> None:
+    def adopt(  # noqa: PLR0917 - what a batch solution is
+        self, T: Array, c: Array, root: Array, rows: Array, residuals: Array, travelled: float
+    ) -> None:
         """Take over a batch solution.
 
         Args:
             T: (4, 4) its working frame.
             c: (9,) its parameters.
             root: (9, 9) of its information.
-            J: (n, 3, 9) its whitened, weighted rows, evenly spread over the path.
+            rows: (n, 3, 18) its whitened, weighted rows, evenly spread over the path.
+            residuals: (n, 3) minus theirs, at c.
             travelled: length of that path, m.
         """
         self.T, self.c = T, c.copy()
         self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
-        self.score.start(self.root, J, travelled)
+        self.left_out.start(rows, residuals, travelled)
 
-    def take(self, rows: Array, moved: float) -> None:
-        """Forget over a step of the path (m), then take in weighted rows (3n, 10): one QR."""
+    def take(self, rows: Array, residuals: Array, moved: float) -> None:
+        """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
+        rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length)
         lost = math.sqrt(1.0 - kept) * self._prior_rows
         stacked = np.empty((18 + len(rows), 10))
         stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
         stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
-        stacked[18:] = rows
+        stacked[18:, :9], stacked[18:, 9] = rows[:, :9], residuals
         full = upper_root(stacked)
         self._set_root(full[:9, :9])
-        self.c = self.c + self.inverse @ full[:9, 9]
-        self.score.take(rows[:, :9], moved, kept)
+        step = self.inverse @ full[:9, 9]
+        self.c = self.c + step
+        self.left_out.take(rows, residuals, step, moved, kept)
 
     def place(self, point: Array) -> Array:
         """A point (3,) of base in the working frame, dimensionless."""
@@ -94,7 +99,7 @@ class InformationFilter:
         self.c[:3] = 0.0
         back = inverted(M)
         self.root, self.inverse = self.root @ back, M @ self.inverse
-        self.score.carry(back)
+        self.left_out.carry(back, float(x[0]), float(x[1]))
         R = self.T[:3, :3]
         self.T = homogeneous(R @ turned, self.T[:3, 3] + R @ (self.length * x))
 

@@ -21,7 +21,7 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.change import ChangeTest
-from canprobe.touch.estimators.equations import Touch, equations, squared_innovation, weight_of
+from canprobe.touch.estimators.equations import Touch, equations, joined, squared_innovation, weight_of
 from canprobe.touch.estimators.filter_answer import filter_estimate
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.start import Start
@@ -29,6 +29,7 @@ from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.noise import Correlation
 from canprobe.touch.prior import Prior
+from canprobe.touch.quadric_row import SampleRows
 
 STEP = 0.025
 """Travel between two updates over the memory."""
@@ -50,9 +51,9 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """A contact against what the filter says: its equations (3, 10), squared innovation and weight."""
+    """A contact against what the filter says: its equations, squared innovation and weight."""
 
-    rows: Array
+    rows: SampleRows
     square: float
     weight: float
 
@@ -67,6 +68,7 @@ class RecursiveEstimator:
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
         correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
             is what such an answer has under correlated noise.
+        quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`left_out`).
     """
 
     def __init__(
@@ -78,10 +80,12 @@ class RecursiveEstimator:
         window: int = 160,
         prior: Prior | None = None,
         correlation: Correlation | None = None,
+        quadric: bool = False,
     ) -> None:
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
+        self._quadric = quadric
         self._crowd = CROWD * positive("window", window) / memory_m
         self._prior = Prior.weak(memory_m) if prior is None else prior
         if math.isfinite(self._prior.sigma_curvature):
@@ -129,6 +133,7 @@ class RecursiveEstimator:
             samples=self._spread.weight,
             prior=self._prior.name,
             notes=self._notes(),
+            quadric=self._quadric,
         )
 
     def _notes(self) -> tuple[str, ...]:
@@ -160,8 +165,9 @@ class RecursiveEstimator:
         """Take a step (m) into the filter."""
         weight = np.array([c.weight for c in compared])
         crowd = self._weigh(moved, weight)
-        rows = np.concatenate([c.rows for c in compared])
-        self._filter.take(rows * np.sqrt(crowd * weight).repeat(3)[:, None], moved)
+        rows, residuals = joined([c.rows for c in compared])
+        root = np.sqrt(crowd * weight)[:, None]
+        self._filter.take(rows * root[:, :, None], residuals * root, moved)
         if self._last is not None:
             self._filter.follow(self._last.point)
 
@@ -179,7 +185,7 @@ class RecursiveEstimator:
             self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
             return
         c = found.target if start.settled else found.c
-        self._filter.adopt(start.T, c, found.root, found.J, start.travelled)
+        self._filter.adopt(start.T, c, found.root, start.rows, found.residuals_at(c), start.travelled)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
         if start.over:
             self._start, self._settled = None, True

@@ -18,7 +18,7 @@ import numpy as np
 from canprobe.touch._arrays import Array
 from canprobe.touch.estimators.equations import Touch, batch_design
 from canprobe.touch.frames import homogeneous, tangent_rotation
-from canprobe.touch.linearised import SETTLED, Linearised, gauss_newton, linearised
+from canprobe.touch.linearised import SETTLED, Linearised, gauss_newton, linearised, with_terms
 from canprobe.touch.nonlinear import linear_start
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric import Design
@@ -46,6 +46,7 @@ class Start:
     Attributes:
         T: (4, 4) working frame of the solution to base, m.
         solution: None before there is one.
+        rows: (n, 3, 18) of its parameters and of what a quadric leaves out.
         settled: the solution is one: its last step was small, and all of K was observed or the stretch is over.
         travelled: path so far, m.
     """
@@ -53,6 +54,7 @@ class Start:
     def __init__(self, length: float, prior: Prior) -> None:
         self.T = np.eye(4)
         self.solution: Linearised | None = None
+        self.rows = np.zeros((0, 3, 18))
         self.settled = False
         self.travelled = 0.0
         self._length = length
@@ -88,7 +90,7 @@ class Start:
             fresh = linearised(self._linear(d), d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
         better = gauss_newton(now, d, self._prior)
-        self.solution = better
+        self.solution, self.rows = better, with_terms(better, d)
         known = self.settled or better.decision.rank == 3 or stretch_over
         self.settled = known and better.step < SETTLED
 

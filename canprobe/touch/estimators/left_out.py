@@ -1,0 +1,113 @@
+"""What a filter knows about the terms that a quadric leaves out, in constant time and memory.
+
+The filter fits a quadric. Beside it, its samples' rows of the cubic and quartic terms are summed with those of its
+parameters, forgotten alike and carried from frame to frame: as much as `misfit` needs of a batch. The terms are what
+the samples say at terms of zero; they are never put into the filter, only into its answers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch._arrays import Array, eigen, inverted, solved
+from canprobe.touch.estimators.score import Score
+from canprobe.touch.misfit import averaged, scales
+from canprobe.touch.noise import Correlation
+from canprobe.touch.quadric import UNIT
+from canprobe.touch.terms import shifted
+
+_REGULAR = 1e-9
+"""What keeps the covariance of the terms' score regular, over its mean."""
+
+
+class Amended(NamedTuple):
+    """An answer of a filter, averaged over what its quadric leaves out.
+
+    Attributes:
+        c: (9,) parameters.
+        covariance: (9, 9) of what the terms add to that of the noise; symmetric, not definite by itself.
+        misfit: probability of there being one.
+        trusted: the change of K is small enough for a linear step.
+    """
+
+    c: Array
+    covariance: Array
+    misfit: float
+    trusted: bool
+
+
+class LeftOut:
+    """Sums over the rows of parameters and terms.
+
+    Args:
+        prior: (9, 9) information of what is always known about the parameters.
+        correlation: of the rows along the path; None for independent samples.
+
+    Attributes:
+        score: (`Score`) covariance of the score of parameters and terms.
+    """
+
+    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+        wide = np.zeros((18, 18))
+        wide[:9, :9] = prior
+        self.score = Score(wide, correlation)
+        self.reset()
+
+    def reset(self) -> None:
+        """No samples."""
+        self.score.reset()
+        self._information = np.zeros((18, 18))
+        self._slope = np.zeros(9)
+
+    def start(self, rows: Array, residuals: Array, travelled: float) -> None:
+        """Take a batch's rows (n, 3, 18) and minus residuals (n, 3), evenly spread over a path (m)."""
+        self.score.start(rows, travelled)
+        flat = rows.reshape(-1, 18)
+        self._information = flat.T @ flat
+        self._slope = flat[:, 9:].T @ residuals.reshape(-1)
+
+    def take(self, rows: Array, residuals: Array, step: Array, moved: float, kept: float) -> None:
+        """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
+        self.score.take(rows, moved, kept)
+        self._information = kept * self._information + rows.T @ rows
+        self._slope = kept * self._slope + rows[:, 9:].T @ residuals - self._information[9:, :9] @ step
+
+    def carry(self, back: Array, x: float, y: float) -> None:
+        """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
+        A, Q = shifted(x, y)
+        away = inverted(A)
+        wide = np.zeros((18, 18))
+        wide[:9, :9], wide[:9, 9:], wide[9:, 9:] = back, -(back @ Q) @ away, away
+        self.score.carry(wide)
+        self._information = wide.T @ self._information @ wide
+        self._slope = away.T @ self._slope
+
+    def amend(self, c: Array, H: Array, place: Array) -> Amended:
+        """Average an answer over the terms.
+
+        Args:
+            c: (9,) parameters of the filter.
+            H: (9, 9) inverse of their information.
+            place: (3,) where the answer is wanted, in the filter's frame.
+        """
+        curvature = float(np.linalg.norm(c[6:] / UNIT))
+        D = scales(curvature)
+        N, M = self._information[:9, 9:] * D, self._information[9:, 9:] * np.outer(D, D)
+        S = self.score.matrix
+        S_cc, S_ca, S_aa = S[:9, :9], S[:9, 9:] * D, S[9:, 9:] * np.outer(D, D)
+        HN = H @ N
+        shared = S_ca - S_cc @ HN
+        V = S_aa - S_ca.T @ HN - HN.T @ shared  # of y = m a + noise, all that the samples say about the terms
+        V += _REGULAR * np.trace(V) * np.eye(9)
+        m = M - N.T @ HN
+        weighted = solved(V, m)
+        values, U = eigen(m @ weighted)
+        s = U.T @ (weighted.T @ (D * self._slope))
+        off = -HN
+        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
+        off = off @ U
+        found = averaged(np.maximum(values, 0.0), s, -off, curvature)
+        both = H @ shared @ (weighted @ U * found.share) @ off.T
+        return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
