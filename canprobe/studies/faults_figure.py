@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.emulator.faults import FaultKind
-from canprobe.studies.fault_runs import FORCE_MAX_N
+from canprobe.studies.fault_scenes import FORCE_MAX_N
 
 COLOURS = {
     "completed": "#4c9f70",
