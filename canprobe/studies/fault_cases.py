@@ -17,8 +17,9 @@ SENSOR_SHARE = 0.3
 Windows = Mapping[str, tuple[int, int]]
 """Phase → when it begins and ends in a run without faults, ns."""
 _KINDS = tuple(FaultKind)
-_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE)
-"""What the wire corrupts on the way to a node, its CRC drops; what a node itself corrupts has the right CRC."""
+_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
+"""A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; one that is corrupted here stands for
+what goes wrong behind it: in a controller's memory, a driver, a gateway."""
 _NEED_TIME = (FaultKind.BABBLE, FaultKind.DELAY, FaultKind.REORDER)
 """Kinds whose effect is that of frames in each other's way, or of their order."""
 

@@ -25,6 +25,7 @@ class Scenario:
         rate_hz: of SYNC and sensor.
         duration_s: of the task itself.
         mode: of the sensor; None where the scene has none.
+        speed_share: of the joints' speed limits, enough for the task: beyond it a drive takes a target for wrong.
     """
 
     share: float
@@ -32,6 +33,7 @@ class Scenario:
     rate_hz: float
     duration_s: float
     mode: str | None
+    speed_share: float = 0.1
 
 
 SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
@@ -40,7 +42,7 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
         "free": Scenario(0.15, "free", 100.0, 0.3, None),
         "press, features": Scenario(0.5, "press", 100.0, 0.1, "features"),
         "press, window": Scenario(0.1, "press", 200.0, 0.1, "window"),
-        "cylinder": Scenario(0.15, "cylinder", 200.0, 0.2, "window"),
+        "cylinder": Scenario(0.15, "cylinder", 200.0, 0.2, "window", 0.35),
     }
 )
 """A lower rate than 400 Hz makes a run cheaper and the cell slower to react: reaction times are counted in cycles."""
@@ -57,7 +59,7 @@ def scenario_scene(name: str, timed: bool) -> Scene:
         task=task,
         bus=replace(scene.bus, timed=timed),
         cycle=replace(scene.cycle, rate_hz=scenario.rate_hz),
-        limits=replace(scene.limits, force_max_n=FORCE_MAX_N),
+        limits=replace(scene.limits, force_max_n=FORCE_MAX_N, joint_speed_share=scenario.speed_share),
     )
     if scene.arm is not None:
         scene = replace(scene, arm=replace(scene.arm, missed_syncs=5))

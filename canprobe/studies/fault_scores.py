@@ -8,11 +8,13 @@ Between a fault and the reaction the probe is driven on in one of two ways:
 - torn: k drives stand still and the others follow their targets, until `drive_silent` stops them. Joint i alone moves
   the probe into the object by cᵢ = n·Jᵢ q̇ᵢ, so that without the set S it sinks in at Σcᵢ − Σ_S cᵢ: at most Σcᵢ and
   the k most negative cᵢ turned round. The greatest of any cycle counts, over the targets of a run without faults.
+- wrong: one drive is given a target that was corrupted. Further away than 607Fh allows it is not followed (reference
+  limit); nearer, the motor i goes that far, ωᵢ T for one cycle, and the probe by n·Jᵢ ωᵢ T.
 
-To each time belong one cycle until the last target is reached and the drives' lag behind a ramp, 2 ζ/ω. The force grows
-with the square of the indentation, F = (δ/δ₁)² with δ₁ at 1 N, and may be at its limit when the fault begins:
+To the first two times belong one cycle until the last target is reached and the drives' lag behind a ramp, 2 ζ/ω. The
+force grows with the square of the indentation, F = (δ/δ₁)² with δ₁ at 1 N, and may be at its limit at the fault:
 
-    F ≤ (√F_limit + d / δ₁)²,  d the longer of both ways for one fault, their sum for more.
+    F ≤ (√F_limit + d / δ₁)²,  d the longest of the ways for one fault, their sum for more.
 
 The contact's damping adds α δ̇, a hundredth at these speeds, which is left out.
 Source: Hunt and Crossley 1975 for the damping; `canprobe.touch.contact.indentation_from_force` for δ₁.
@@ -29,6 +31,7 @@ from numpy.typing import NDArray
 
 from canprobe.bus.candump import read_candump
 from canprobe.cell.conditions import BY_KEY
+from canprobe.cell.configuration import motor_speed_limit
 from canprobe.cell.limits import limits_of
 from canprobe.cell.supervision import Limits
 from canprobe.cell.tasks.touch import Phase
@@ -57,17 +60,20 @@ class Peak:
         depth_at_1n: m.
         blind: how far the probe sinks in without the sensor, m.
         torn: how far it does with 0, 1, 2, … drives standing still, m.
+        wrong: how far it does by one wrong target, m.
     """
 
     force_limit: float
     depth_at_1n: float
     blind: float
     torn: tuple[float, ...]
+    wrong: float = 0.0
 
     def force(self, faults: int) -> float:
         """The highest force of a run with so many faults, N."""
         torn = self.torn[min(faults, len(self.torn) - 1)]
-        sinks = max(self.blind, torn) if faults < 2 else self.blind + torn
+        ways = (self.blind, torn, self.wrong)
+        sinks = max(ways) if faults < 2 else sum(ways)
         return (math.sqrt(self.force_limit) + sinks / self.depth_at_1n) ** 2
 
 
@@ -85,7 +91,20 @@ def peak_of(session: Session) -> Peak | None:
         indentation_from_force(1.0, scene.probe.stiffness_n_m3, scene.probe.radius_mm * 1e-3, kappa),
         scene.task.approach_mm_s * 1e-3 * blind_s,
         tuple((_torn_speeds(session) * torn_s).tolist()),
+        _wrong_reach(session),
     )
+
+
+def _wrong_reach(session: Session) -> float:
+    """How far (m) the probe sinks in where one motor goes as far in a cycle as its drive lets it."""
+    scene, period_ns = session.scene, session.plan.sync.period_ns
+    assert scene.arm is not None and scene.probe is not None
+    model, share = MODELS[scene.arm.model], scene.limits.joint_speed_share
+    counts = [motor_speed_limit(model, axis, share, period_ns) * period_ns * 1e-9 for axis in range(6)]
+    q = session.cell.log.arrays()["q_target_rad"]
+    angles = q[np.isfinite(q).all(axis=1)][-1]
+    T, J = forward_jacobian(model, angles, T_flange_probe(scene.probe))
+    return float(np.abs(T[:3, 2] @ J[:3] @ model.joints_per_count * counts).max())
 
 
 def _torn_speeds(session: Session) -> Vector:
