@@ -55,13 +55,13 @@ class Health:
         node_id, watch = node.node_id, self._watch
         state = watch.states.get(node_id)
         drive = self._drive(node, measurement)
-        emcy = next((e.emcy for e in reversed(watch.emergencies) if e.node_id == node_id), None)
+        event = watch.last_emcy.get(node_id)
         silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
         level, message = WELL, "operational"
         if silent:
             level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
-        elif emcy is not None and emcy.code != NO_ERROR:
-            level, message = FAILED, f"EMCY {emcy.code:04X}h, {describe(emcy.code)}"
+        elif event is not None and event.emcy.code != NO_ERROR:
+            level, message = FAILED, f"EMCY {event.emcy.code:04X}h, {describe(event.emcy.code)}"
         elif drive in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE):
             level, message = FAILED, "drive fault"
         elif state is not NmtState.OPERATIONAL:

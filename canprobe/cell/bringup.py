@@ -190,10 +190,10 @@ class BringUp:
 
     def _listen(self) -> None:
         self._say("listen for another master")
-        self._network.pump_until(lambda: bool(self._watch.foreign), self._times.listen)
-        if self._watch.foreign:
+        self._network.pump_until(lambda: self._watch.foreign is not None, self._times.listen)
+        if self._watch.foreign is not None:
             raise BusError(
-                f"{self._network.port.channel}: {self._watch.foreign[0]}: another master is at work here; stop it first"
+                f"{self._network.port.channel}: {self._watch.foreign}: another master is at work here; stop it first"
             )
 
     def _boot(self) -> None:

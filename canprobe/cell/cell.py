@@ -83,7 +83,6 @@ class Cell:
         self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
-        self._alarms = 0
         self._holding = False
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
@@ -123,7 +122,6 @@ class Cell:
                 kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
-            self.supervisor.seen.first_alarm = len(self.watch.alarms)
         except BaseException:
             self.close()
             raise
@@ -183,10 +181,11 @@ class Cell:
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
             i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
+            node_id = self.drives.axes[i].node_id
             raise NodeError(
-                self.drives.axes[i].node_id,
+                node_id,
                 f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
-                + "".join(f"; {event}" for event in self.watch.alarms[-1:]),
+                + self.watch.last_words(node_id),
             )
 
     def _await_rest(self) -> None:
@@ -266,11 +265,9 @@ class Cell:
         retreat(str(finding.error))
 
     def _note_alarms(self) -> None:
-        alarms = self.watch.alarms
-        while self._alarms < len(alarms):
+        for event in self.watch.news():
             if len(self.faults) < FAULTS_KEPT:
-                self.faults.append(str(alarms[self._alarms]))
-            self._alarms += 1
+                self.faults.append(str(event))
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}

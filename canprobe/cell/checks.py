@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from canprobe.bus.port import ControllerState
 from canprobe.cell.supervision import Contact, Seen
-from canprobe.cell.watch import EmcyEvent
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState
@@ -36,33 +35,24 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
         return None
     i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
-    why = "".join(f"; {e}" for e in [e for e in seen.watch.alarms if e.node_id == node_id][-1:])
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{why}")
-
-
-def is_communication(event: EmcyEvent) -> bool:
-    """Whether an emergency is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
-    return event.emcy.code >> 8 in (0x81, 0x82)
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{seen.watch.last_words(node_id)}")
 
 
 def device_emcy(seen: Seen) -> NodeError | None:
     """A device reports an error of its own."""
-    alarms = seen.watch.alarms
-    for event in alarms[seen.first_alarm :] if len(alarms) > seen.first_alarm else ():
-        if not is_communication(event):
-            return NodeError(event.node_id, str(event).partition(": ")[2])
-    return None
+    event = seen.watch.device_alarm
+    return NodeError(event.node_id, str(event).partition(": ")[2]) if event is not None else None
 
 
 def communication_emcys(seen: Seen) -> int:
     """Emergencies about frames."""
-    return sum(map(is_communication, seen.watch.alarms)) if seen.watch.alarms else 0
+    return seen.watch.communication
 
 
 def foreign_master(seen: Seen) -> SafetyStop | None:
     """Somebody else sends what only a master sends."""
     foreign = seen.watch.foreign
-    return SafetyStop(f"another master is on the bus: {foreign[0]}") if foreign else None
+    return SafetyStop(f"another master is on the bus: {foreign}") if foreign is not None else None
 
 
 # PDOs
@@ -75,6 +65,8 @@ def missed_pdos(seen: Seen) -> int:
 
 def drive_late(seen: Seen) -> NodeError | None:
     """A drive has not told where it is for some cycles: the others must not go on without it."""
+    if max(seen.measurement.q_age, default=0) < seen.limits.hold_cycles:
+        return None
     for axis, age in zip(seen.drives.axes if seen.drives is not None else (), seen.measurement.q_age, strict=True):
         if age >= seen.limits.hold_cycles:
             return NodeError(axis.node_id, f"no usable TPDO for {age} cycles")
@@ -83,9 +75,9 @@ def drive_late(seen: Seen) -> NodeError | None:
 
 def drive_silent(seen: Seen) -> NodeError | None:
     """A drive's TPDO has been missing for too long."""
-    if seen.drives is None:
-        return None
     limit = seen.limits.missed_cycles
+    if seen.drives is None or max(seen.measurement.q_age, default=0) <= limit:
+        return None
     for axis, age in zip(seen.drives.axes, seen.measurement.q_age, strict=True):
         if age > limit:
             return NodeError(axis.node_id, f"lost: no usable TPDO for {age} cycles")

@@ -22,11 +22,8 @@ Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
 _COMMAND_OBJECTS = (0x6040, 0x607A)
-
-
-def is_enabled(statusword: int) -> bool:
-    """Whether a statusword tells operation enabled; see `state_of` for the others."""
-    return statusword & 0x6F == DriveState.OPERATION_ENABLED.value
+_STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
+"""Of a statusword that tells operation enabled; see `state_of` for the other states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +144,7 @@ class DriveGroup:
             self.malformed += 1  # and missed, unless another one comes
             return
         word, counts, self.torque_permille[i] = values
-        enabled = is_enabled(word) and is_enabled(self.statuswords[i])
+        enabled = word & _STATE_BITS == _ENABLED and self.statuswords[i] & _STATE_BITS == _ENABLED
         self.statuswords[i] = word
         self._heard[i] = self._cycle
         self._pending -= 1
@@ -189,6 +186,17 @@ class DriveGroup:
         """CiA 402 state of each drive, from its last statusword."""
         return tuple([state_of(word) for word in self.statuswords])
 
+    @property
+    def enabled(self) -> bool:
+        """Every drive tells operation enabled.
+
+        Raises:
+            ProtocolError: a statusword that is none.
+        """
+        if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
+            return True  # as in every cycle of operation
+        return self.all_in(DriveState.OPERATION_ENABLED)
+
     def all_in(self, *states: DriveState) -> bool:
         """Every drive is in one of ``states``."""
         return all(state in states for state in self.states)
@@ -221,7 +229,7 @@ class DriveGroup:
             data = b""
             for axis, layout, picks in frame.parts:
                 part = layout.pack(*[values[axis][pick] for pick in picks])
-                data = bytes(a | b for a, b in zip(data, part, strict=True)) if data else part
+                data = _overlaid(data, part) if data else part
             if frame.every_cycle or self._due(frame.cob_id, data):
                 frames.append((frame.cob_id, data))
         return frames
@@ -233,3 +241,8 @@ class DriveGroup:
             return False
         self._sent[cob_id] = (data, self._cycle)
         return True
+
+
+def _overlaid(data: bytes, part: bytes) -> bytes:
+    """What two drives of one frame are told: each leaves zeros where the other's values are."""
+    return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")

@@ -8,7 +8,6 @@ from canprobe.bus.port import TimedFrame
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.tactile import TactileReceiver
-from canprobe.protocol.cia402 import DriveState
 
 SYNCS_REMEMBERED = 240
 """Where the SYNC has no counter."""
@@ -88,7 +87,7 @@ class Intake:
             q_age=drives.ages(),
             torque_permille=tuple(drives.torque_permille),
             statuswords=tuple(drives.statuswords),
-            enabled=drives.all_in(DriveState.OPERATION_ENABLED),
+            enabled=drives.enabled,
             tactile=sample,
             tactile_age=age,
         )

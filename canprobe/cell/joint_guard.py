@@ -50,54 +50,67 @@ class JointGuard:
     def __init__(self, limits: Limits) -> None:
         self.slowed = 0
         self._limits = limits
-        self._target: Vector | None = None
-        self._q: Vector | None = None
+        self._speed, self._count = _numbers(limits.joint_speed), _numbers(limits.count)
+        self._range = list(zip(_numbers(limits.joint_low), _numbers(limits.joint_high), strict=True))
+        self._target: list[float] | None = None
+        self._q: list[float] | None = None
         self._t_ns = 0
 
     def measure(self, measurement: Measurement) -> str | None:
         """What a joint did since the last cycle that none can do; None where all is well or nothing new is known."""
-        speed, count = self._limits.joint_speed, self._limits.count
-        if measurement.q is None or speed is None or count is None or any(measurement.q_age):
+        if measurement.q is None or not self._speed or not self._count or any(measurement.q_age):
             return None
-        before, self._q = self._q, measurement.q
+        before, self._q = self._q, measurement.q.tolist()
         passed_s = (measurement.t_ns - self._t_ns + self._limits.period_ns) * 1e-9
         self._t_ns = measurement.t_ns
         if before is None:
             return None
-        moved = np.abs(measurement.q - before)
-        beyond = moved - MEASURED_SHARE * speed * passed_s - COUNTS * count
-        if not (beyond > 0).any():
+        moved = [abs(q - was) for q, was in zip(self._q, before, strict=True)]
+        share = MEASURED_SHARE * passed_s
+        beyond = [
+            m - share * speed - COUNTS * count for m, speed, count in zip(moved, self._speed, self._count, strict=True)
+        ]
+        if max(beyond) <= 0.0:
             return None
-        joint = int(np.argmax(beyond))
+        joint = beyond.index(max(beyond))
         degrees = math.degrees(moved[joint])
         return f"joint {joint + 1} reports a motion of {degrees:.1f} deg in one cycle, more than it can make"
 
     def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
         """The target that may be sent for ``q_target`` (6,), rad."""
         limits = self._limits
-        if limits.joint_low is None or limits.joint_high is None or limits.joint_speed is None:
+        if not self._range or not self._speed:
             return GuardedTarget(q_target)
         target = np.asarray(q_target, dtype=np.float64)
-        if target.shape != limits.joint_low.shape or not np.isfinite(target).all():
+        wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
+        if not all(map(math.isfinite, wanted)):
             return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")
-        outside = (target < limits.joint_low) | (target > limits.joint_high)
-        if outside.any():
-            joint = int(np.flatnonzero(outside)[0])
-            return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(target[joint]):.1f} deg, its stop")
+        inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
+        if not all(inside):
+            joint = inside.index(False)
+            return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
         if limits.workspace is not None and limits.tip_of is not None:
             left = outside_workspace(limits.tip_of(target), limits.workspace)
             if left is not None:
                 return GuardedTarget(None, left)
-        return self._within_speed(q_target, target, measurement, limits.joint_speed)
+        return self._within_speed(q_target, wanted, measurement)
 
-    def _within_speed(self, q_target: Vector, target: Vector, measurement: Measurement, speed: Vector) -> GuardedTarget:
-        last = self._target if self._target is not None else measurement.q
+    def _within_speed(self, q_target: Vector, wanted: list[float], measurement: Measurement) -> GuardedTarget:
+        last = self._target
+        if last is None and measurement.q is not None:
+            last = measurement.q.tolist()
         if last is not None:
-            step = target - last
-            share = float((np.abs(step) / speed).max()) / (self._limits.period_ns * 1e-9)
+            steps = [q - was for q, was in zip(wanted, last, strict=True)]
+            share = max([abs(step) / speed for step, speed in zip(steps, self._speed, strict=True)])
+            share /= self._limits.period_ns * 1e-9
             if share > 1.0 + _ROUNDING:
                 self.slowed += 1
-                self._target = last + step / share
-                return GuardedTarget(self._target)
-        self._target = target
+                self._target = [was + step / share for was, step in zip(last, steps, strict=True)]
+                return GuardedTarget(np.array(self._target))
+        self._target = wanted
         return GuardedTarget(q_target)
+
+
+def _numbers(values: Vector | None) -> list[float]:
+    """As plain floats: six of them are done with before numpy has begun."""
+    return [] if values is None else [float(v) for v in values]

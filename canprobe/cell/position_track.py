@@ -36,7 +36,8 @@ class PositionTrack:
 
     def aim(self, step_counts: float) -> None:
         """The target moves on by this much in this cycle."""
-        self._asked = max(step_counts, _FORGET * self._asked)
+        faded = _FORGET * self._asked
+        self._asked = step_counts if step_counts > faded else faded
 
     def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
         """Take a report.
@@ -52,17 +53,17 @@ class PositionTrack:
         """
         self.steady = self.steady + 1 if abs(counts - self._last) <= BASE_COUNTS else 0
         self._last = counts
-        if guarded and self.cycle >= 0 and not self._reachable(counts, cycle, t_ns):
-            return False
-        if self.cycle >= 0 and t_ns > self._t_ns:
-            self._rate = (counts - self.counts) / (t_ns - self._t_ns)
+        if self.cycle >= 0:
+            step, passed_ns = counts - self.counts, t_ns - self._t_ns
+            if guarded:
+                carried = self._rate * passed_ns
+                reach = BASE_COUNTS + abs(carried) + (cycle - self.cycle) * self._asked
+                if abs(step - carried) > reach:
+                    return False
+            if passed_ns > 0:
+                self._rate = step / passed_ns
         self.counts, self.cycle, self._t_ns = counts, cycle, t_ns
         return True
-
-    def _reachable(self, counts: int, cycle: int, t_ns: int) -> bool:
-        passed_ns, cycles = t_ns - self._t_ns, cycle - self.cycle
-        moved = self._rate * passed_ns
-        return abs(counts - self.counts - moved) <= BASE_COUNTS + abs(moved) + cycles * self._asked
 
     def position(self, cycle: int, t_ns: int) -> float:
         """Where the motor is at a SYNC: as reported, or carried on by its rate."""

@@ -86,7 +86,6 @@ class Seen:
         controller_state: of the CAN controller.
         measurement: of this cycle.
         sync_ns: when its SYNC went out, on the port's clock.
-        first_alarm: number of the first alarm that was raised while the cell cycles.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
         passive_ns: how long the controller has been error-passive.
@@ -104,7 +103,6 @@ class Seen:
     controller_state: ControllerState = ControllerState.ACTIVE
     measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))
     sync_ns: int = 0
-    first_alarm: int = 0
     overruns: int = 0
     late_share: float = 0.0
     passive_ns: int = 0

@@ -49,6 +49,8 @@ class Supervisor:
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
+        self._counters = [condition.count for condition in COUNTED if condition.count is not None]
+        self._counted = [0] * len(COUNTED)
 
     def step(
         self,
@@ -73,11 +75,16 @@ class Supervisor:
         seen.passive_ns = measurement.t_ns - self._active_ns
         seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._joints.measure(measurement)
-        for condition in COUNTED:
-            count = condition.count(seen)  # type: ignore[misc]  # COUNTED have one
+        counts = [count(seen) for count in self._counters]
+        if counts != self._counted:
+            self._note(counts, measurement.cycle)
+
+    def _note(self, counts: list[int], cycle: int) -> None:
+        self._counted = counts
+        for condition, count in zip(COUNTED, counts, strict=True):
             if count != self.counts[condition.key]:
                 self.counts[condition.key] = count
-                self.first.setdefault(condition.key, measurement.cycle)
+                self.first.setdefault(condition.key, cycle)
 
     def finding(self, *, enabling: bool = False) -> Finding | None:
         """The first condition of the table that holds now; a hold only where nothing worse is found."""

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
+
+UNTOLD = 64
+"""Alarms that are kept until somebody asks for the news."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,6 +20,11 @@ class EmcyEvent:
     node_id: int
     emcy: Emcy
     t_ns: int
+
+    @property
+    def is_communication(self) -> bool:
+        """Whether it is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
+        return self.emcy.code >> 8 in (0x81, 0x82)
 
     def __str__(self) -> str:
         return f"node {self.node_id}: EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
@@ -32,18 +41,23 @@ class NodeWatch:
     Attributes:
         states: NMT state that each node told last.
         boot_ups: boot-up messages of each node.
-        emergencies: every EMCY, in order.
-        alarms: those that report an error, not its end.
-        foreign: what another master sent.
+        last_emcy: the last EMCY of each node, the end of an error too.
+        last_alarm: the last EMCY of each node that reports an error, not its end.
+        device_alarm: the first one since the start that is about a device rather than frames; None where there is none.
+        communication: how many were about frames.
+        foreign: what another master sent first.
     """
 
     def __init__(self, node_ids: tuple[int, ...], master_id: int, heartbeat_timeout_ns: int) -> None:
         self.node_ids = node_ids
         self.states: dict[int, NmtState] = {}
         self.boot_ups: dict[int, int] = dict.fromkeys(node_ids, 0)
-        self.emergencies: list[EmcyEvent] = []
-        self.alarms: list[EmcyEvent] = []
-        self.foreign: list[str] = []
+        self.last_emcy: dict[int, EmcyEvent] = {}
+        self.last_alarm: dict[int, EmcyEvent] = {}
+        self.device_alarm: EmcyEvent | None = None
+        self.communication = 0
+        self.foreign: str | None = None
+        self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
         self._master_id = master_id
         self._timeout_ns = heartbeat_timeout_ns
         self._heard: dict[int, int] = {}
@@ -52,9 +66,10 @@ class NodeWatch:
         """Take a frame that is no PDO; True where it was one of those watched."""
         node_id = can_id & 0x7F
         if can_id == HEARTBEAT_BASE + self._master_id:
-            self.foreign.append(f"a heartbeat of node {self._master_id}, our own id")
+            self.foreign = self.foreign or f"a heartbeat of node {self._master_id}, our own id"
         elif can_id in (SYNC_ID, NMT_ID):
-            self.foreign.append(f"{'SYNC' if can_id == SYNC_ID else 'an NMT command'} from another master")
+            what = "SYNC" if can_id == SYNC_ID else "an NMT command"
+            self.foreign = self.foreign or f"{what} from another master"
         elif can_id == HEARTBEAT_BASE + node_id and node_id in self.boot_ups:
             self._push_heartbeat(node_id, data, t_ns)
         elif can_id == EMCY_BASE + node_id and node_id in self.boot_ups:
@@ -78,9 +93,28 @@ class NodeWatch:
             event = EmcyEvent(node_id, Emcy.unpack(data), t_ns)
         except ProtocolError:
             return
-        self.emergencies.append(event)
-        if event.emcy.code != NO_ERROR:
-            self.alarms.append(event)
+        self.last_emcy[node_id] = event
+        if event.emcy.code == NO_ERROR:
+            return
+        self.last_alarm[node_id] = event
+        self._untold.append(event)
+        if event.is_communication:
+            self.communication += 1
+        elif self.device_alarm is None:
+            self.device_alarm = event
+
+    def news(self) -> list[EmcyEvent]:
+        """Alarms since the last call, the last `UNTOLD` of them."""
+        if not self._untold:
+            return []
+        news = list(self._untold)
+        self._untold.clear()
+        return news
+
+    def last_words(self, node_id: int) -> str:
+        """The node's last alarm, to be put behind an error; empty where there is none."""
+        event = self.last_alarm.get(node_id)
+        return "" if event is None else f"; {event}"
 
     def forget(self) -> None:
         """Start the heartbeat supervision afresh: nobody has been heard yet."""
@@ -88,7 +122,8 @@ class NodeWatch:
         self.states.clear()
 
     def start(self, t_ns: int) -> None:
-        """Expect every node's heartbeat from now on."""
+        """Expect every node's heartbeat from now on; what a device reported until now is over."""
+        self.device_alarm = None
         self._heard = dict.fromkeys(self.node_ids, t_ns)
 
     def silent(self, t_ns: int) -> int | None:

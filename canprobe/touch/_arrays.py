@@ -7,28 +7,69 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev
 
 from canprobe.errors import UsageError
 
 Array = NDArray[np.float64]
-_UPPER = np.triu(np.ones((10, 10), dtype=bool))
+_UPPER = np.triu(np.ones((16, 16)))
+
+# LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
 
 
 def upper_root(A: Array) -> Array:
     """The upper triangular R of a QR decomposition, Rᵀ R = Aᵀ A."""
-    h, _ = np.linalg.qr(A, mode="raw")  # half the time of mode="r", which spends it on copies
-    R = h.T[: min(A.shape)]
-    return np.asarray(np.where(_UPPER, R, 0.0) if R.shape == _UPPER.shape else np.triu(R), dtype=np.float64)
+    qr, _, _, _ = dgeqrf(A)
+    R = qr[: min(A.shape)]
+    n, m = R.shape
+    return R * _UPPER[:n, :m] if m <= len(_UPPER) else np.triu(R)
 
 
 def solved(A: Array, B: Array) -> Array:
-    """A⁻¹ B."""
-    return np.asarray(np.linalg.solve(A, B), dtype=np.float64)
+    """A⁻¹ B.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is singular.
+    """
+    _, _, X, info = dgesv(A, B)
+    if info > 0:
+        raise np.linalg.LinAlgError("singular matrix")
+    result: Array = X
+    return result
 
 
 def inverted(A: Array) -> Array:
-    """A⁻¹."""
-    return np.asarray(np.linalg.inv(A), dtype=np.float64)
+    """A⁻¹.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is singular.
+    """
+    return solved(A, np.eye(len(A)))
+
+
+def eigen(A: Array) -> tuple[Array, Array]:
+    """Eigenvalues of a symmetric matrix, the least first, and its eigenvectors as columns.
+
+    Raises:
+        numpy.linalg.LinAlgError: where it is not finite.
+    """
+    values, vectors, info = dsyev(A, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("eigenvalues did not converge")
+    return values, vectors
+
+
+def lower_root(A: Array) -> Array:
+    """The lower triangular L of a Cholesky decomposition, L Lᵀ = A.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is not positive definite.
+    """
+    L, info = dpotrf(A, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("matrix is not positive definite")
+    result: Array = L
+    return result
 
 
 def read_only(values: ArrayLike) -> Array:

@@ -14,6 +14,7 @@ Source: Chen, Rink and Zhang (13)–(23). The paper writes 2S for K, right only 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -80,7 +81,7 @@ def pad_to_direction(u: float, v: float, radius: float) -> Array:
     return np.array([u * scale, v * scale, math.cos(angle)])
 
 
-def direction_to_pad(direction: Array, radius: float) -> tuple[float, float]:
+def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple[float, float]:
     """Pad coordinates (u, v) in m of a direction (3,) in the probe frame: the logarithmic map at the pole."""
     x, y, z = float(direction[0]), float(direction[1]), float(direction[2])
     sine = math.hypot(x, y)
@@ -113,7 +114,7 @@ def contact_sample(
     *,
     t_s: float,
     T_base_probe: Array,
-    uv: ArrayLike,
+    uv: Sequence[float] | Array,
     depth: float,
     radius: float,
     force_n: float,
@@ -132,7 +133,7 @@ def contact_sample(
         moments: of the patch, m².
         doubts: about the image.
     """
-    u, v = np.asarray(uv, dtype=np.float64).tolist()
+    u, v = uv
     direction = pad_to_direction(u, v, radius)
     point, normal = contact_on_object(T_base_probe, direction, radius, depth)
     arm = (radius - depth) * direction

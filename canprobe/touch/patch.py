@@ -182,7 +182,8 @@ def compute_patch(
         saturated=peak >= calibration.counts_max,
         cut_by_window=cut_by_window,
         cut_by_pad=cut_by_pad,
-    )._replace(dead=dead)
+        dead=dead,
+    )
 
 
 def _patch(
@@ -194,11 +195,12 @@ def _patch(
     saturated: bool,
     cut_by_window: bool,
     cut_by_pad: bool,
+    dead: int = 0,
 ) -> Patch:
     total = moments[0]
     if n_active == 0 or total <= 0.0:
         nan = math.nan
-        return Patch(0.0, nan, nan, nan, nan, nan, n_active, peak_pa, False, False, False, True)
+        return Patch(0.0, nan, nan, nan, nan, nan, n_active, peak_pa, False, False, False, True, dead)
     pitch = calibration.pitch_m
     u, v = moments[1] / total, moments[2] / total
     square, off = pitch * pitch, pitch * pitch / 12.0 + calibration.blur_var_m2
@@ -215,19 +217,22 @@ def _patch(
         cut_by_window=cut_by_window,
         cut_by_pad=cut_by_pad,
         too_few=n_active < _TOO_FEW,
+        dead=dead,
     )
 
 
 def _cuts(active: NDArray[np.bool_], window: Sequence[int] | None) -> tuple[bool, bool]:
     """Whether active taxels touch the pad's edge, and an edge of the window inside the pad."""
-    rows, cols = np.any(active, axis=1), np.any(active, axis=0)
-    cut_by_pad = bool(rows[0] or rows[-1] or cols[0] or cols[-1])
+    rows = np.logical_or.reduce(active, axis=1).tolist()
+    cols = np.logical_or.reduce(active, axis=0).tolist()
+    cut_by_pad = rows[0] or rows[-1] or cols[0] or cols[-1]
     if window is None:
         return cut_by_pad, False
     r0, c0, n_rows, n_cols = window
     r1, c1 = r0 + n_rows - 1, c0 + n_cols - 1
-    inside = ((r0 > 0, rows, r0), (r1 < SIDE - 1, rows, r1), (c0 > 0, cols, c0), (c1 < SIDE - 1, cols, c1))
-    return cut_by_pad, any(bool(line[k]) for is_inside, line, k in inside if is_inside)
+    return cut_by_pad, (
+        (r0 > 0 and rows[r0]) or (r1 < SIDE - 1 and rows[r1]) or (c0 > 0 and cols[c0]) or (c1 < SIDE - 1 and cols[c1])
+    )
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:

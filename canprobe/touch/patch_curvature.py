@@ -83,16 +83,19 @@ class PatchCurvature:
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
-        r = sample.r_probe
-        was = self._memory.add(sample.t_s, *direction_to_pad(r / math.sqrt(float(r @ r)), self.model.radius))
+        x, y, z = sample.r_probe.tolist()
+        k = 1.0 / math.sqrt(x * x + y * y + z * z)
+        direction = k * x, k * y, k * z
+        was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
         if sample.moments is None:
             self.refused += 1
             return
         self._carry(*(-sample.n_base).tolist())
         self.frames = min(self.frames + 1, MOST_FRAMES)
         share = 1.0 / self.frames
-        uu, uv, vv = (m - self.model.fit.memory * w for m, w in zip(sample.moments, was, strict=True))
-        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(sample))
+        (uu, uv, vv), memory = sample.moments, self.model.fit.memory
+        uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
+        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
         dxx, dxy, dyy = xx - self._xx, xy - self._xy, yy - self._yy
         if self.frames > LEAST_FRAMES:
             share *= min(1.0, GROSS * (self._xx + self._yy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
@@ -113,19 +116,20 @@ class PatchCurvature:
         x, y, z = size * x, size * y, size * z
         self._x, self._y = [x, y, z], [zy * z - zz * y, zz * x - zx * z, zx * y - zy * x]
 
-    def _pad_axis(self, sample: ContactSample) -> tuple[float, float]:
+    def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
-        x, y, z = sample.r_probe.tolist()
-        k = 1.0 / math.sqrt(x * x + y * y + z * z)
-        x, y, z = k * x, k * y, k * z
+        x, y, z = direction
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
         ux, uy, uz = 1.0 - bend * x, -bend * y, -x
-        u = [a * ux + b * uy + c * uz for a, b, c, _ in sample.T_base_probe[:3].tolist()]
-        return self._in_axes(u)
+        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
+        return self._in_axes(
+            [a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz],
+        )
 
     def _in_axes(self, u: list[float]) -> tuple[float, float]:
         """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
-        cx, cy = (a[0] * u[0] + a[1] * u[1] + a[2] * u[2] for a in (self._x, self._y))
+        (x0, x1, x2), (y0, y1, y2), (u0, u1, u2) = self._x, self._y, u
+        cx, cy = x0 * u0 + x1 * u1 + x2 * u2, y0 * u0 + y1 * u1 + y2 * u2
         size = 1.0 / math.hypot(cx, cy)
         return cx * size, cy * size
 

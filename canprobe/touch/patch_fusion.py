@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, solved, upper_root
+from canprobe.touch._arrays import Array, eigen, solved, upper_root
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.evidence import TO_Q
@@ -92,14 +92,14 @@ def _notes(found: Fused, share: float) -> tuple[str, ...]:
 def _joined(model_root: Array, patch: Array) -> Array:
     """(9, 9) root of the information about the entries of S with the patch's part about K."""
     rows = np.zeros((3, 9))
-    values, vectors = np.linalg.eigh(patch)
+    values, vectors = eigen(patch)
     rows[:, 6:] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / UNIT
     return upper_root(np.concatenate([model_root, rows]))
 
 
 def _decide(information: Array, q: Array, length: float) -> Decision:
     """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
-    values, vectors = np.linalg.eigh(information)
+    values, vectors = eigen(information)
     size = max(math.sqrt(float(q @ q)), 1.0 / length)
     return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
 

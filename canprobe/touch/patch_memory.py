@@ -31,7 +31,7 @@ class PadMemory:
     def reset(self) -> None:
         """Contact was lost."""
         self._t_s: float | None = None
-        self._sums = [[0.0] * 6 for _ in TIMES_S]  # of 1, u, v, uu, uv, vv
+        self._sums = [(0.0, 0.0, 0.0, 0.0, 0.0, 0.0) for _ in TIMES_S]  # of 1, u, v, uu, uv, vv
 
     def add(self, t_s: float, u: float, v: float) -> Moments:
         """Take the centroid (m) of an image at a time (s).
@@ -41,14 +41,15 @@ class PadMemory:
         """
         dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
         self._t_s = t_s
-        here = (1.0, u, v, u * u, u * v, v * v)
-        total = [0.0] * 6
+        mass = su = sv = uu = uv = vv = 0.0
         for k, tau in enumerate(TIMES_S):
             kept = math.exp(-dt / tau)
-            held = [kept * old + (1.0 - kept) * new for old, new in zip(self._sums[k], here, strict=True)]
-            self._sums[k] = held
-            total = [a + b for a, b in zip(total, held, strict=True)]
-        mass, su, sv, uu, uv, vv = total
+            new = 1.0 - kept
+            m, a, b, aa, ab, bb = self._sums[k]
+            m, a, b = kept * m + new, kept * a + new * u, kept * b + new * v
+            aa, ab, bb = kept * aa + new * u * u, kept * ab + new * u * v, kept * bb + new * v * v
+            self._sums[k] = m, a, b, aa, ab, bb
+            mass, su, sv, uu, uv, vv = mass + m, su + a, sv + b, uu + aa, uv + ab, vv + bb
         return (
             uu - 2.0 * u * su + u * u * mass,
             uv - u * sv - v * su + u * v * mass,

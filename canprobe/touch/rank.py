@@ -22,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, eigen
 
 SPREAD = 10.0
 SIGMA_LIMIT = 0.3
@@ -65,12 +65,12 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
     """
     small, large, axes = _axes(spread)
     if small >= SPREAD:  # spread for everything, the usual case
-        values, vectors = np.linalg.eigh(root_q.T @ root_q)
+        values, vectors = eigen(root_q.T @ root_q)
         return Decision(np.maximum(values, 0.0), vectors, values >= _least(curvature, float(values[-1])))
     wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
     seen = axes[:, wide]
     root = root_q @ seen
-    values, turn = np.linalg.eigh(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
+    values, turn = eigen(root.T @ root) if seen.size else (np.zeros(0), np.zeros((0, 0)))
     least = _least(curvature, float(values.max(initial=0.0)))
     unseen = int(np.count_nonzero(~wide))
     return Decision(

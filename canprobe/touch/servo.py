@@ -178,20 +178,23 @@ class TactileServo:
             foot, normal = self._march(self._follower, foot, normal, speed * dt)
         self._reference = foot
         reach, share = self._radius - depth, self._share
-        pole = _unit([share * p - (1 - share) * n for p, n in zip(self._first_pole, normal, strict=True)])
-        return ProbePose(np.array([f + reach * n for f, n in zip(foot, normal, strict=True)]), np.array(pole))
+        (f0, f1, f2), (n0, n1, n2), (p0, p1, p2), flat = foot, normal, self._first_pole, 1 - share
+        pole = _unit((share * p0 - flat * n0, share * p1 - flat * n1, share * p2 - flat * n2))
+        return ProbePose(np.array((f0 + reach * n0, f1 + reach * n1, f2 + reach * n2)), np.array(pole))
 
     def _march(self, follower: PathFollower, foot: Floats, normal: Floats, distance: float) -> tuple[Floats, Floats]:
         """One step along the heading, lifted out of the scan plane into the tangent plane."""
-        offset = [f - o for f, o in zip(foot, self._origin, strict=True)]
+        (h0, h1, h2), (c0, c1, c2), (u0, u1, u2) = self._heading, self._across, self._up
+        (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
+        offset = f0 - o0, f1 - o1, f2 - o2
         steep = max(_dot(normal, self._up), STEEPEST)
         along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), distance * steep)
-        flat = [along * h + across * c for h, c in zip(self._heading, self._across, strict=True)]
-        rise = _dot(normal, flat) / steep
-        lifted = [f - rise * u for f, u in zip(flat, self._up, strict=True)]
-        out = _dot(normal, lifted)
-        tangent = _unit([v - out * n for v, n in zip(lifted, normal, strict=True)])
-        return self.surface.foot_of([f + distance * t for f, t in zip(foot, tangent, strict=True)])
+        x, y, z = along * h0 + across * c0, along * h1 + across * c1, along * h2 + across * c2
+        rise = (n0 * x + n1 * y + n2 * z) / steep
+        x, y, z = x - rise * u0, y - rise * u1, z - rise * u2
+        out = n0 * x + n1 * y + n2 * z
+        x, y, z = _unit((x - out * n0, y - out * n1, z - out * n2))
+        return self.surface.foot_of((f0 + distance * x, f1 + distance * y, f2 + distance * z))
 
 
 def _dot(a: Floats, b: Floats) -> float:

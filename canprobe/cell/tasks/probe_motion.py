@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dgesv
 
 from canprobe.cell.joint_guard import outside_workspace
 from canprobe.robot.damped import damped_step
@@ -57,8 +58,9 @@ class ProbeMotion:
         self._model = model
         self._flange_probe = flange_probe
         self._bounds = bounds
-        self._step_max = model.qd_max * bounds.speed_share * period_s
+        self._step_max: list[float] = (model.qd_max * bounds.speed_share * period_s).tolist()
         self._low, self._high = model.q_min + bounds.margin, model.q_max - bounds.margin
+        self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
         self.pose_matrix, _ = forward_jacobian(model, self.q, flange_probe)
         self._x_reference: tuple[float, float, float] = tuple(self.pose_matrix[:3, 0].tolist())
         self.limit: str | None = None
@@ -79,24 +81,24 @@ class ProbeMotion:
         self.pose_matrix = T
         if self._bounds.workspace is not None:
             self.limit = outside_workspace(T[:3, 3] + self._bounds.radius * T[:3, 2], self._bounds.workspace)
-        twist = np.array(_pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference))
+        twist = _pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
         dq = self._increment(J, twist)
-        share = float((np.abs(dq) / self._step_max).max())
+        share = max([abs(step) / most for step, most in zip(dq.tolist(), self._step_max, strict=True)])
         if share > 1.0:
             dq /= share
             self.slowed += 1
         self.q = self.q + dq
-        if (self.q < self._low).any() or (self.q > self._high).any():
+        if not all([low <= q <= high for q, (low, high) in zip(self.q.tolist(), self._range, strict=True)]):
             self._stop_at_limit()
         return self.q
 
-    def _increment(self, J: Vector, twist: Vector) -> Vector:
+    def _increment(self, J: Vector, twist: tuple[float, ...]) -> Vector:
         """The exact step; the damped one where the exact step would be no small one, as near a singular pose."""
-        try:
-            dq = np.asarray(np.linalg.solve(J, twist), dtype=np.float64)
-        except np.linalg.LinAlgError:
-            return damped_step(J, twist)
-        return dq if float(np.abs(dq).max()) < SMALL_STEP else damped_step(J, twist)
+        _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
+        if info == 0 and max(map(abs, dq.tolist())) < SMALL_STEP:
+            exact: Vector = dq
+            return exact
+        return damped_step(J, np.array(twist))
 
     def _stop_at_limit(self) -> None:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])

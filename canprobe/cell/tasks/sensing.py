@@ -158,7 +158,7 @@ class ContactSensing:
         return contact_sample(
             t_s=sample.t_sample_ns * 1e-9,
             T_base_probe=T_base_probe,
-            uv=np.array([patch.u, patch.v]),
+            uv=(patch.u, patch.v),
             depth=self.depth(patch.force),
             radius=self.radius,
             force_n=patch.force,

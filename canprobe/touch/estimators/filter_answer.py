@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, inverted, solved, upper_root
+from canprobe.touch._arrays import Array, inverted, lower_root, solved, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
@@ -42,7 +42,7 @@ def filter_estimate(
     flat = tangent.T @ spread @ tangent
     decision = decide(inverted(upper_root(q.T)).T, flat, size)
     noise = state.inverse.T @ state.score.matrix @ state.inverse
-    noise_root = np.asarray(np.linalg.cholesky(noise), dtype=np.float64)
+    noise_root = lower_root(noise)
     evidence = evidence_of(a.c, a.M @ state.inverse @ noise_root, flat, L)
     known = decision.vectors[:, decision.passed]
     a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))

@@ -1,0 +1,62 @@
+"""What the nodes say of themselves, over a night: remembered in bounded memory, and found in bounded time."""
+
+from __future__ import annotations
+
+import sys
+
+from canprobe.cell.watch import UNTOLD, NodeWatch
+from canprobe.protocol.emcy import Emcy
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+
+SYNC_LOST, OVERHEATED, OVERCURRENT = 0x8100, 0x4210, 0x2310
+
+
+def told(watch: NodeWatch, node_id: int, code: int) -> None:
+    assert watch.push(EMCY_BASE + node_id, Emcy(code, 0, b"\0" * 5).pack(), 0)
+
+
+def a_watch() -> NodeWatch:
+    return NodeWatch((1, 2), 127, 250_000_000)
+
+
+def size_of(watch: NodeWatch) -> int:
+    return sum(sys.getsizeof(value) for value in vars(watch).values())
+
+
+def test_a_device_error_is_found_among_many_about_frames():
+    watch = a_watch()
+    for _ in range(1000):
+        told(watch, 1, SYNC_LOST)
+        told(watch, 1, 0)
+    assert watch.device_alarm is None
+    told(watch, 2, OVERHEATED)
+    told(watch, 1, OVERCURRENT)
+    assert watch.device_alarm is not None
+    assert (watch.device_alarm.node_id, watch.device_alarm.emcy.code) == (2, OVERHEATED)
+    assert watch.communication == 1000
+    assert watch.last_words(1).startswith("; node 1: EMCY 2310h")
+    assert watch.last_words(3) == ""
+
+
+def test_what_a_device_said_before_the_start_is_over():
+    watch = a_watch()
+    told(watch, 1, OVERHEATED)
+    watch.start(0)
+    assert watch.device_alarm is None
+    assert [event.emcy.code for event in watch.news()] == [OVERHEATED]  # but it is told
+    assert watch.news() == []
+
+
+def test_memory_does_not_grow_with_what_is_said():
+    watch = a_watch()
+    for _ in range(UNTOLD):
+        told(watch, 1, SYNC_LOST)
+        watch.push(0x80, b"", 0)
+    before = size_of(watch)
+    for _ in range(10_000):
+        told(watch, 1, SYNC_LOST)
+        watch.push(0x80, b"", 0)
+        watch.push(HEARTBEAT_BASE + 1, b"\x05", 0)
+    assert size_of(watch) <= before + 1000  # numbers have grown by a digit, a table by its first entry
+    assert len(watch.news()) == UNTOLD
+    assert watch.foreign == "SYNC from another master"
