@@ -16,6 +16,7 @@ from canprobe.cell.build import make_task
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.tasks.touch import Phase
+from canprobe.emulator.faults import FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.emulator.node import SlaveNode
 from canprobe.errors import CanprobeError, SafetyStop
@@ -94,7 +95,8 @@ def run_seed(seed: int) -> dict[str, Any]:
 def carry_out(case: FaultCase) -> dict[str, Any]:
     """Run a case to its end and a while beyond it; what came of it, with every failure in words."""
     reach = peak(case.scenario)
-    bound = reach.force(len(case.faults)) if reach is not None else None
+    wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
+    bound = reach.force(len(case.faults), wrong) if reach is not None else None
     if not case.files:
         return _Run(case).result(bound)
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:

@@ -69,10 +69,10 @@ class Peak:
     torn: tuple[float, ...]
     wrong: float = 0.0
 
-    def force(self, faults: int) -> float:
-        """The highest force of a run with so many faults, N."""
+    def force(self, faults: int, wrong_targets: bool = False) -> float:
+        """The highest force of a run with so many faults, N; with frames to drives corrupted, or not."""
         torn = self.torn[min(faults, len(self.torn) - 1)]
-        ways = (self.blind, torn, self.wrong)
+        ways = (self.blind, torn, self.wrong if wrong_targets else 0.0)
         sinks = max(ways) if faults < 2 else sum(ways)
         return (math.sqrt(self.force_limit) + sinks / self.depth_at_1n) ** 2
 

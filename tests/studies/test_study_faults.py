@@ -15,7 +15,7 @@ from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.studies import fault_witness
 from canprobe.studies.fault_cases import PHASES, FaultCase
 from canprobe.studies.fault_runs import carry_out, draw_case, peak, phase_windows, run_seed
-from canprobe.studies.fault_scenes import SCENARIOS, seeded_plan
+from canprobe.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
 from canprobe.studies.fault_scores import Peak, score_force
 
 FEATURES = "press, features"
@@ -142,3 +142,17 @@ def test_a_node_that_has_every_fault_in_contact_is_answered(kind):
     faults = tuple(Fault(kind, node, start, S // 4, incoming=kind is FaultKind.DEAF, seed=7) for node in (3, 16))
     run = carry_out(FaultCase(1, FEATURES, "scan", faults))
     assert run["failures"] == [] and run["hits"] > 0
+
+
+def test_a_drive_that_tells_wrong_positions_does_not_let_the_probe_be_driven_in():
+    """Reports wrong by powers of two, some of them believed: carried on as a motion they led to 16.7 N."""
+    wrong = Fault(FaultKind.WRONG_DATA, 3, 1_080_816_012, 146_755_255, seed=1530753339)
+    run = carry_out(FaultCase(100_006, FEATURES, "scan", (wrong,), files=False))
+    assert run["hits"] > 10 and run["failures"] == [] and run["force_max_n"] < 10.0
+
+
+def test_a_corrupted_target_is_not_followed():
+    """Bit errors behind the CRC of a drive's controller: it refuses the target, and the cell stops."""
+    corrupt = Fault(FaultKind.CORRUPT, 2, phase_windows(FEATURES, False)["scan"][0], S // 2, incoming=True, seed=3)
+    run = carry_out(FaultCase(2, FEATURES, "scan", (corrupt,), files=False))
+    assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < FORCE_MAX_N
