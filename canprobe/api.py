@@ -16,12 +16,15 @@ from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.joint_report import check_joints
+from canprobe.link_report import check_links
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
 if TYPE_CHECKING:
+    from canprobe.cell.commission import Commissioned
     from canprobe.cell.monitor import CellView
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
@@ -33,6 +36,8 @@ __all__ = [
     "Measurement",
     "Observation",
     "RunResult",
+    "check_joints",
+    "commission",
     "emulate",
     "emulate_eds",
     "monitor",
@@ -283,6 +288,7 @@ def up(
         scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
     )
     plan = make_plan(resolved)
+    check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
         Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
@@ -305,6 +311,44 @@ def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> 
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
         return scan_nodes(port, timeout_s)
+    finally:
+        port.close()
+
+
+def commission(
+    interface: str,
+    channel: str,
+    bitrate: int,
+    *,
+    scene: Scene | None = None,
+    assign: Sequence[tuple[tuple[int | None, int | None, int | None, int | None], int]] = (),
+    store: bool = True,
+) -> Commissioned:
+    """Find the nodes that have no id and give them theirs by LSS (CiA 305).
+
+    Args:
+        interface, channel, bitrate: of the bus.
+        scene: whose nodes get their ids; as far as its EDS files and serial numbers tell which is which.
+        assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
+        store: let the devices keep their ids when their power goes.
+
+    Raises:
+        UsageError: the scene does not fit.
+        BusError: see :func:`canprobe.cell.commission.commission`.
+        InterfaceError: no such interface.
+    """
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.cell.commission import commission, wanted_by
+    from canprobe.cell.lss_choice import Wanted
+
+    hush_canopen()
+    wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
+    if scene is not None:
+        wanted = wanted_by(make_plan(resolve_scene(scene, interface=interface)))
+    port = open_port(interface, channel, bitrate, MonotonicClock())
+    try:
+        return commission(port, wanted, must=scene is None, store=store)
     finally:
         port.close()
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.errors import NodeError, UsageError
+from canprobe.protocol.lss import UNCONFIGURED
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
 from canprobe.session import Say, quiet, resolve_scene
@@ -29,6 +31,7 @@ def emulate(
     seed: int | None = None,
     truth_path: Path | None = None,
     store_folder: Path | None = None,
+    without_id: tuple[int, ...] = (),
     say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
@@ -39,7 +42,8 @@ def emulate(
         node_ids: which nodes.
         seed: in the place of the scene's.
         truth_path: file for the plant's true values, written at the end.
-        store_folder: folder with a file for each node, where its 1010h stores; None forgets at the end.
+        store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
+        without_id: which of the nodes start without a node id, for LSS to give them one.
         say: called when the nodes are about to be served.
 
     Raises:
@@ -56,12 +60,13 @@ def emulate(
     plan = make_plan(resolved)
     fast = data_bitrate(plan.scene.bus)
     way_out = "end that node, or name others with --nodes"
-    with _free_port(interface, channel, bitrate, node_ids, way_out, data_bitrate=fast) as port:
+    busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
+    with _free_port(interface, channel, bitrate, busy, way_out, data_bitrate=fast) as port:
         rehearse(resolved)
-        world = make_world(plan, node_ids, truth=truth_path is not None)
+        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
         _keep(world.nodes, store_folder)
         try:
-            _serve(world.participants, node_ids, port, say=say, in_realtime=resolved.cycle.realtime)
+            _serve(world.participants, world.nodes, port, say=say, in_realtime=resolved.cycle.realtime)
         finally:
             if truth_path is not None and world.recorder is not None:
                 world.recorder.save(truth_path)
@@ -74,39 +79,48 @@ def emulate_eds(
     channel: str,
     bitrate: int,
     store_folder: Path | None = None,
+    serial_numbers: Sequence[int | None] = (),
     in_realtime: bool = False,
     say: Say = quiet,
 ) -> None:
     """Serve a node from each EDS file on a real interface until interrupted, for any master.
 
     Args:
-        files: (name or path of an EDS or DCF file, node id) of each node.
+        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS to give it one.
         interface, channel, bitrate: of the bus.
         store_folder: as for :func:`emulate`.
+        serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
         say: called with what is odd about the files, and when the nodes are there.
 
     Raises:
         EdsError: a file cannot be served; one line a fault.
-        UsageError: a node id is given twice, or a file of `store_folder` is not of its node.
+        UsageError: a node id is given twice, two nodes without one are the same device, or a file of `store_folder` is
+            not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
     """
     from canprobe.eds import check_eds
     from canprobe.emulator.any_eds import make_eds_node
 
-    node_ids = tuple(node_id for _, node_id in files)
+    node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)
     if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
         raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
-    nodes = []
-    for name, node_id in files:
-        reading = check_eds(name, node_id)
-        nodes.append(make_eds_node(reading.usable(), node_id))
+    nodes: list[SlaveNode] = []
+    for (name, node_id), serial in zip_longest(files, serial_numbers):
+        reading = check_eds(name, 1 if node_id == UNCONFIGURED else node_id)
+        od = reading.usable()
+        speaks_lss = node_id == UNCONFIGURED or od.device_information.LSS_supported
+        nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
         if warnings := len(reading.warnings):
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
+    _check_addresses(nodes)
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
+        for node in nodes:
+            if node.lss is not None:
+                node.lss.bitrate = bitrate
         _keep(nodes, store_folder)
-        _serve(nodes, node_ids, port, say=say, in_realtime=in_realtime)
+        _serve(nodes, nodes, port, say=say, in_realtime=in_realtime)
 
 
 @contextlib.contextmanager
@@ -133,7 +147,17 @@ def _free_port(
         port.close()
 
 
-def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, *, say: Say, in_realtime: bool) -> None:
+def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
+    """Nodes without an id can only be told apart by their LSS addresses."""
+    addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
+    for address in addresses:
+        if addresses.count(address) > 1:
+            raise UsageError(f"two nodes without an id are the device {address}: give each its --serial")
+
+
+def _serve(
+    participants: Sequence[Participant], nodes: Sequence[SlaveNode], port: Port, *, say: Say, in_realtime: bool
+) -> None:
     from canprobe.bus.memory import reserve_memory
     from canprobe.bus.priority import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.emulator.serve import serve
@@ -142,9 +166,17 @@ def _serve(nodes: Sequence[Participant], node_ids: tuple[int, ...], port: Port, 
     port.drain()  # what passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
-    say(f"serving nodes {', '.join(map(str, node_ids))} on {port.channel}; Ctrl-C stops them")
+    say(f"serving {_named(nodes)} on {port.channel}; Ctrl-C stops them")
     with favour:
-        serve(nodes, port, lambda: False)
+        serve(participants, port, lambda: False)
+
+
+def _named(nodes: Sequence[SlaveNode]) -> str:
+    """Nodes by their ids, those without one by their LSS addresses."""
+    ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED)
+    blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
+    with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
+    return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []))
 
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
@@ -153,4 +185,11 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
     if folder is not None:
         for node in nodes:
-            keep_in_file(node, folder / f"node{node.node_id:03}.json")
+            keep_in_file(node, folder / _file_name(node))
+
+
+def _file_name(node: SlaveNode) -> str:
+    """By node id; one that has none yet is told by its serial number."""
+    if node.node_id != UNCONFIGURED:
+        return f"node{node.node_id:03}.json"
+    return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.log_cycles import LogCycles
 from canprobe.cell.recording import read_recording
-from canprobe.cell.replay import GAP_S, replay_contacts, replay_task
+from canprobe.cell.replay import replay_contacts, replay_task
 from canprobe.cell.tasks.build import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import ProtocolError, UsageError
@@ -83,15 +82,15 @@ def replay(
     try:
         cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
         task = replay_task(plan, cycles)
-        tracker, unplaced, gap_s = task.task.shape, task.task.unplaced, math.inf
+        tracker, unplaced = task.task.shape, task.task.unplaced
         if not task.drove or tracker is None:
             cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
-            (tracker, unplaced), gap_s = replay_contacts(plan, cycles), GAP_S
+            tracker, unplaced = replay_contacts(plan, cycles)
     except ProtocolError as error:
         raise UsageError(f"{path}: on {recording.channel}: {error}") from error
     if not tracker.samples:
         raise UsageError(f"{path}: nothing was touched in this log: no contact to estimate from")
-    estimates = estimates_of(plan.scene, tracker, methods, gap_s)
+    estimates = estimates_of(plan.scene, tracker, methods)
     summary = summarise_replay(
         plan, recording, cycles, task, tracker=tracker, unplaced=unplaced, estimates=estimates, folder=folder
     )

@@ -17,6 +17,7 @@ from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
+from canprobe.scene_tool import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
 from canprobe.surface_file import save_surface_map
@@ -128,6 +129,8 @@ def summarise(
         "shape": summarise_shape(
             scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
         ),
+        "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
+        "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
         "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
         "bus_load": {
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
@@ -156,7 +159,7 @@ def _scan(controller: object) -> tuple[int, int] | None:
     return cycles if cycles is not None and cycles[1] > cycles[0] else None
 
 
-def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, float | None]:
+def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
     task, scan = session.scene.task, _scan(controller)
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
@@ -171,7 +174,14 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
                 figures["speed_mean_m_s"] = None
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
-    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured}
+    losses = [
+        {
+            "searched_mm": 1e3 * loss.searched,
+            "regained_after_ms": None if loss.regained_s is None else 1e3 * loss.regained_s,
+        }
+        for loss in getattr(controller, "losses", ())
+    ]
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured, "losses": losses}
 
 
 def summarise_shape(
@@ -305,7 +315,10 @@ def write_files(result: RunResult, out: Path) -> None:
     )
     (out / "scene.toml").write_text(dump_scene(result.plan.scene), encoding="utf-8")
     np.savez_compressed(out / "log.npz", allow_pickle=False, **result.log)
-    (out / "surface.npz").unlink(missing_ok=True)  # of an earlier run
+    for name in ("surface.npz", FILE):
+        (out / name).unlink(missing_ok=True)  # of an earlier run
+    if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
+        (out / FILE).write_text(text, encoding="utf-8")
     if result.surface_map is not None:
         save_surface_map(result.surface_map, out / "surface.npz")
 
@@ -326,6 +339,7 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
         f"  cycle      {rate}, {cycle['overruns']} overruns,"
         f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
     ]
+    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
     if contact["force_rms_error_n"] is not None:
         target = contact["force_target_n"]
         lines.append(
@@ -337,12 +351,27 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
             f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
             f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
         )
+    if contact["losses"]:
+        lines.append(f"  {_losses(contact['losses'])}")
     if shape["method"] is not None:
         lines += shape_lines(shape)
+    if summary.get("calibration") is not None:
+        lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)
+
+
+def _losses(losses: Sequence[Mapping[str, float | None]]) -> str:
+    """How often contact was lost in the scan, and what was done about it."""
+    told = ", ".join(
+        f"not regained within {loss['searched_mm']:.1f} mm"
+        if loss["regained_after_ms"] is None
+        else f"regained after {loss['regained_after_ms']:.0f} ms and {loss['searched_mm']:.1f} mm"
+        for loss in losses
+    )
+    return f"contact lost {len(losses)} time{'s' * (len(losses) > 1)}: {told}"
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Annotated, Literal
 
 from canprobe.scene_checks import Direction, Distinct, Only, Pattern, Range, ScenePath, Symmetric
 
-TaskKind = Literal["scan", "press", "listen", "free"]
+TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
 Auto = Literal["auto"]  # the plan chooses
 TactileModeName = Literal["window", "image", "features", "auto"]
@@ -24,14 +24,18 @@ Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponent
 TransmitQueue = Literal["priority", "fifo"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
+Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Row4 = tuple[float, float, float, float]
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
+SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
+SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
 NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 
-TOUCHING = Only("kind", ("scan", "press"))
+TOUCHING = Only("kind", ("scan", "press", "calibrate"))
 SCANNING = Only("kind", ("scan",))
+CALIBRATING = Only("kind", ("calibrate",))
 FREE = Only("kind", ("free",))
 DYNAMIC = Only("fidelity", ("dynamic",))
 TWO_RADII = Only("kind", ("saddle", "ellipsoid"), required=True)
@@ -83,6 +87,7 @@ class ArmSettings:
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
     grouped_rpdo: bool | Auto = False  # two targets in one RPDO through dummy mapping
+    serial_numbers: Annotated[SerialNumbers | None, Distinct()] = None  # 1018h:04 of each drive; None: any
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +101,7 @@ class SensorSettings:
     mode: TactileModeName = "window"
     rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
+    serial_number: SerialNumber | None = None  # 1018h:04; None: any
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +110,7 @@ class ProbeSettings:
 
     radius_mm: Annotated[float, Range(5, 200)] = 40.0
     centre_offset_mm: Annotated[float, Range(0, 300)] = 80.0  # of the sphere's centre beyond the flange, along tool z
+    centre_lateral_mm: Vec2 = (0.0, 0.0)  # and along tool x and y; `canprobe run calibrate` finds all three
     mass_kg: Annotated[float, Range(0, 5)] = 0.3
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] = 1.27e8  # K/h of the elastic layer
 
@@ -143,8 +150,9 @@ class ObjectSettings:
 class TaskSettings:
     """`[task]`: what is done.
 
-    `scan` approaches, touches and follows the strategy; `press` approaches and holds the force; `listen` reads the
-    sensor only; `free` swings the joints about `arm.start_deg` without a sensor.
+    `scan` approaches, touches and follows the strategy; `press` approaches and holds the force; `calibrate` touches a
+    ball of known radius, its top expected at `start_mm`, from several sides to find the probe's centre on the flange;
+    `listen` reads the sensor only; `free` swings the joints about `arm.start_deg` without a sensor.
     """
 
     kind: TaskKind
@@ -158,10 +166,19 @@ class TaskSettings:
     strategy: Annotated[Strategy, SCANNING] = "weave"
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
     heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane
+    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0  # towards the object where contact is lost; 0: give up
+    turn_max_deg: Annotated[float, Range(0, 180), SCANNING] = (
+        90.0  # that the plan may turn it where joints are too slow
+    )
     length_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING] = 36.0  # full size; a circle's diameter
     width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
     wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave
     rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05  # 0: pad follows the normal, 1: fixed orientation
+    ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATING] = 25.0
+    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATING] = 3.0  # of its expected centre per axis
+    touches: Annotated[int, Range(2, 200), CALIBRATING] = 13
+    tilt_deg: Annotated[float, Range(0, 60), CALIBRATING] = 22.0  # of the touches round the top from the top
+    beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0  # of each touch from the pole of the probe
     swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)  # amplitude of each joint
     swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
 
@@ -227,6 +244,7 @@ class PlantSettings:
     velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
     torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
+    tool_error_mm: Vec3 = (0.0, 0.0, 0.0)  # of the probe's centre that is really there, in the flange frame
     # K/h of the layer that is really there, N/m³; the probe's by default
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
     contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)

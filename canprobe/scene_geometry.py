@@ -62,7 +62,9 @@ def _parameter(settings: ObjectSettings, name: str) -> object:
 
 def T_flange_probe(probe: ProbeSettings) -> Array:
     """Frame of the probe's centre on the flange, (4, 4), m; z is the pole."""
-    return tool_z_offset(probe.centre_offset_mm)
+    T = tool_z_offset(probe.centre_offset_mm)
+    T[:2, 3] = np.array(probe.centre_lateral_mm) * 1e-3
+    return T
 
 
 def approach_normal(task: TaskSettings) -> Array:

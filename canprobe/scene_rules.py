@@ -27,6 +27,15 @@ SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
         "servo": ("default", ""),
         "plant": ("default", ""),
     },
+    "calibrate": {
+        "arm": ("must", "a calibration moves the probe"),
+        "sensor": ("must", "a calibration feels the ball"),
+        "probe": ("default", ""),
+        "object": ("may", ""),
+        "shape": ("never", "the ball's shape is known"),
+        "servo": ("never", "no surface is followed"),
+        "plant": ("default", ""),
+    },
     "listen": {
         "arm": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
@@ -70,13 +79,13 @@ def _duplicate_node(arm_ids: tuple[int, ...] | None, sensor_id: int | None) -> s
 
 
 def _object_missing(kind: str, sensor: bool | None, obj: object) -> str | None:
-    if kind not in ("scan", "press") or not sensor or obj is not None:
+    if kind not in ("scan", "press", "calibrate") or not sensor or obj is not None:
         return None
     return "missing: an emulated sensor touches nothing without an [object]; describe the true object"
 
 
 def _half_emulated(kind: str, arm: bool | None, sensor: bool | None) -> str | None:
-    if kind not in ("scan", "press") or arm is None or sensor is None or arm is False or sensor is True:
+    if kind not in ("scan", "press", "calibrate") or arm is None or sensor is None or arm is False or sensor is True:
         return None
     return "expected true: a real sensor cannot feel what an emulated arm touches; emulate both, or only the sensor"
 
@@ -98,6 +107,12 @@ def _heading_along_normal(kind: str, normal: tuple[float, ...] | None, heading: 
     return f"expected a heading across task.approach_normal, got {heading:g}, which runs along it"
 
 
+def _not_a_ball(kind: str, obj: str | None, radius: float | None, ball: float | None) -> str | None:
+    if kind != "calibrate" or obj is None or ball is None or (obj == "sphere" and radius == ball):
+        return None
+    return f'expected the ball that is touched: kind = "sphere", radius_mm = {ball:g} (task.ball_radius_mm)'
+
+
 def _saddle_radii(kind: str | None, x: float | None, y: float | None) -> str | None:
     if kind != "saddle" or x is None or y is None or (x * y < 0 and min(abs(x), abs(y)) >= 1):
         return None
@@ -117,7 +132,7 @@ def _torus_radii(kind: str | None, ring: float | None, tube: float | None) -> st
 
 
 def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
-    if kind not in ("scan", "press") or force is None or limit is None or force < limit:
+    if kind not in ("scan", "press", "calibrate") or force is None or limit is None or force < limit:
         return None
     return f"expected less than limits.force_max_n = {limit:g}, got {force:g}"
 
@@ -134,6 +149,7 @@ RULES: tuple[Rule, ...] = (
     Rule("sensor.emulated", ("task.kind", "arm.emulated", "sensor.emulated"), _half_emulated),
     Rule("shape.also", ("shape.method", "shape.also"), _main_method_repeated),
     Rule("task.heading_deg", ("task.kind", "task.approach_normal", "task.heading_deg"), _heading_along_normal),
+    Rule("object", ("task.kind", "object.kind", "object.radius_mm", "task.ball_radius_mm"), _not_a_ball),
     Rule("object.radius_y_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _saddle_radii),
     Rule("object.radius_x_mm", ("object.kind", "object.radius_x_mm", "object.radius_y_mm"), _ellipsoid_radii),
     Rule("object.ring_radius_mm", ("object.kind", "object.ring_radius_mm", "object.radius_mm"), _torus_radii),

@@ -56,6 +56,8 @@ COMPOSITION = {
     "tables",
     "traffic_log",
     "emulation",
+    "link_report",
+    "joint_report",
 }
 
 # module → packages of its extra; it is imported only where the extra is asked for

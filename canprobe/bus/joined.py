@@ -1,15 +1,17 @@
 """Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
 
-SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus.
+SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus. A bus that is lost
+is told once; then the others go on without it, so that their nodes can be stopped in an orderly way.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import fields
 
 from canprobe.bus.clock import Clock
 from canprobe.bus.port import ControllerState, Frame, Port, PortCounters, TimedFrame
+from canprobe.errors import InterfaceError
 
 _SLICE_NS = 200_000
 """How long one bus is waited for before the others are looked at again."""
@@ -27,6 +29,7 @@ class JoinedPort:
         self._ports = dict(ports)
         self._routes = {can_id: self._ports[channel] for can_id, channel in routes.items()}
         self._arrived: list[TimedFrame] = []
+        self._lost: set[str] = set()
 
     @property
     def clock(self) -> Clock:
@@ -58,15 +61,23 @@ class JoinedPort:
         """Send each frame on the bus of its identifier, or on all.
 
         Raises:
-            InterfaceError: a bus is down, closed, lost or stays full.
+            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each bus is told
+                once, as long as there is another.
         """
-        for port in self._ports.values():
+
+        def send(port: Port) -> None:
             mine = [frame for frame in frames if self._routes.get(frame[0], port) is port]
             if mine:
                 port.send_batch(mine, t_ns)
 
+        self._on_each(send)
+
     def drain(self) -> list[TimedFrame]:
-        """Return every frame that has arrived on any bus, by time."""
+        """Return every frame that has arrived on any bus, by time.
+
+        Raises:
+            InterfaceError: as `send_batch`; what came on the others is kept for the next call.
+        """
         self._take()
         frames, self._arrived = self._arrived, []
         return frames
@@ -76,8 +87,9 @@ class JoinedPort:
         clock = self.clock
         self._take()
         while not self._arrived and clock.now_ns() < until_ns:
-            for port in self._ports.values():
-                port.wait(min(until_ns, clock.now_ns() + _SLICE_NS))
+            for name, port in self._ports.items():
+                if name not in self._lost:
+                    port.wait(min(until_ns, clock.now_ns() + _SLICE_NS))
                 self._take()
                 if self._arrived:
                     return
@@ -88,9 +100,30 @@ class JoinedPort:
             port.close()
 
     def _take(self) -> None:
-        new = [frame for port in self._ports.values() for frame in port.drain()]
-        if new:
-            self._arrived = sorted([*self._arrived, *new], key=_time)
+        new: list[TimedFrame] = []
+        try:
+            self._on_each(lambda port: new.extend(port.drain()))
+        finally:
+            if new:
+                self._arrived = sorted([*self._arrived, *new], key=_time)
+
+    def _on_each(self, act: Callable[[Port], None]) -> None:
+        """Do it on every bus, then raise the first failure that is news; on lost ones too, as they may come back."""
+        news: InterfaceError | None = None
+        failed: set[str] = set()
+        for name, port in self._ports.items():
+            try:
+                act(port)
+            except InterfaceError as error:
+                failed.add(name)
+                if name not in self._lost:
+                    news = news or error
+                last = error
+        self._lost |= failed
+        if news is not None:
+            raise news
+        if failed and len(self._lost) == len(self._ports):
+            raise last
 
 
 def _time(frame: TimedFrame) -> int:

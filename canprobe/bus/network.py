@@ -1,4 +1,4 @@
-"""canopen's `Network` without its threads: SDO, NMT, EMCY and heartbeats over any `Port`, in the port's own time.
+"""canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own time.
 
 Whoever waits for an answer pumps the port: it receives frames itself, gives canopen its own and everything else to a
 callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost no real time.
@@ -19,6 +19,7 @@ from canopen.node.remote import RemoteNode
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
+from canprobe.bus.lss import PumpedLss
 from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Port, TimedFrame
 from canprobe.errors import UsageError
 
@@ -42,6 +43,9 @@ class PumpedNetwork(canopen.Network):
         self.port = port
         self.other = other
         self.malformed = 0
+        self.unsubscribe(self.lss.LSS_RX_COBID)  # of canopen's own, which waits for a thread
+        self.lss = PumpedLss(self)
+        self.subscribe(self.lss.LSS_RX_COBID, self.lss.on_message_received)
 
     def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
         """Send one frame through the port."""

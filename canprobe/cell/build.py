@@ -12,7 +12,7 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
-from canprobe.cell.limits import force_of, limits_of
+from canprobe.cell.limits import limits_of, patch_from
 from canprobe.cell.measurement import Controller
 from canprobe.cell.observe import Observers
 from canprobe.cell.tactile import TactileReceiver
@@ -64,7 +64,7 @@ def make_cell(
         drives=make_drives(plan),
         tactile=make_tactile(plan),
         limits=limits_of(plan),
-        force_of=force_of(plan.scene) if plan.scene.arm is not None else None,
+        patch_from=patch_from(plan.scene) if plan.scene.arm is not None else None,
         say=say,
         times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
@@ -124,6 +124,8 @@ def make_task(plan: Plan) -> Controller:
         assert plan.scene.sensor is not None
         calibration = array_calibration(plan.scene.sensor.full_scale_kpa * 1e3)
         return ListenTask(calibration, task.duration_s, period_s, limits_of(plan))
-    from canprobe.cell.tasks.build import make_touch_task
+    from canprobe.cell.tasks.build import make_calibrate_task, make_touch_task
 
+    if task.kind == "calibrate":
+        return make_calibrate_task(plan, period_s)
     return make_touch_task(plan, period_s)

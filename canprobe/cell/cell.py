@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
@@ -20,6 +21,9 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+
+if TYPE_CHECKING:
+    from canprobe.touch.patch import Patch
 
 WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
@@ -39,7 +43,7 @@ class Cell:
         drives: the arm, or None.
         tactile: the sensor, or None.
         limits: what the supervision must not let pass.
-        force_of: force (N) of a tactile sample; None where nothing can press.
+        patch_from: the patch of a tactile sample; None where nothing can press.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
@@ -61,7 +65,7 @@ class Cell:
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         limits: Limits,
-        force_of: Callable[[TactileSample], float] | None = None,
+        patch_from: Callable[[TactileSample], Patch] | None = None,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
@@ -79,7 +83,7 @@ class Cell:
         self._settings = settings
         self._say = say
         self._log_failure = log_failure
-        self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), force_of)
+        self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), patch_from)
         self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)

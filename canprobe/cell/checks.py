@@ -175,6 +175,16 @@ def force(contact: Contact) -> SafetyStop | None:
     return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
 
 
+def force_hidden(contact: Contact) -> SafetyStop | None:
+    """The array has been saturated for so long that the force may be above the limit, and nobody knows."""
+    if contact.hidden_s * 1e9 <= contact.limits.hidden_ns:
+        return None
+    return SafetyStop(
+        f"the array is saturated and no stiffness was felt: the true force is above the {contact.force:.1f} N "
+        "measured; raise sensor.full_scale_kpa or lower task.force_n"
+    )
+
+
 def sensor_stale(contact: Contact) -> SafetyStop | None:
     """No tactile sample for too long."""
     age = contact.tactile_age
@@ -184,8 +194,24 @@ def sensor_stale(contact: Contact) -> SafetyStop | None:
 
 
 def contact_lost(contact: Contact) -> SafetyStop | None:
-    """No force where there must be one."""
+    """No force where there must be one, and nothing to be done about it."""
+    if contact.path and contact.limits.regain > 0.0:
+        return None
     return SafetyStop("contact lost") if contact.lost_s * 1e9 > contact.limits.lost_ns else None
+
+
+def contact_to_regain(contact: Contact) -> SafetyStop | None:
+    """No force where a scan must have one, which looks for it."""
+    if not contact.path or contact.lost_s * 1e9 <= contact.limits.lost_ns:
+        return None
+    return SafetyStop("contact lost")
+
+
+def contact_not_regained(contact: Contact) -> SafetyStop | None:
+    """The object is not where a lost contact was looked for."""
+    if contact.searched <= contact.limits.regain:
+        return None
+    return SafetyStop(f"contact lost, and not found again within {contact.limits.regain * 1e3:.1f} mm")
 
 
 def limit_reached(contact: Contact) -> SafetyStop | None:

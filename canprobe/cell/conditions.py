@@ -27,6 +27,10 @@ def _sample(limits: Limits) -> int:
     return (2 * limits.tactile_cycles + 2) * limits.period_ns
 
 
+def _lost(limits: Limits) -> int:
+    return limits.lost_ns + _sample(limits) + ARRAY_RECOVERY_NS
+
+
 CONDITIONS: tuple[Condition, ...] = (
     # nodes
     Condition(
@@ -228,13 +232,44 @@ CONDITIONS: tuple[Condition, ...] = (
         touch=True,
     ),
     Condition(
-        "contact_lost",
-        "contact lost in a hold or scan",
-        "below half of the touch force for 30 ms",
+        "force_hidden",
+        "force that a saturated array does not tell",
+        "saturated for 20 ms in a touch whose stiffness was not felt",
         Reaction.RETREAT,
-        lambda limits: limits.lost_ns + _sample(limits) + ARRAY_RECOVERY_NS,
+        lambda limits: limits.hidden_ns + _sample(limits),
+        "a larger `sensor.full_scale_kpa`, or a smaller `task.force_n`",
+        check=checks.force_hidden,
+        touch=True,
+    ),
+    Condition(
+        "contact_lost",
+        "contact lost in a hold",
+        "below a tenth of `task.force_n`, at least 0.075 N, for 30 ms",
+        Reaction.RETREAT,
+        _lost,
         AGAIN,
         check=checks.contact_lost,
+        touch=True,
+    ),
+    Condition(
+        "contact_to_regain",
+        "contact lost in a scan",
+        "below a tenth of `task.force_n`, at least 0.075 N, for 30 ms",
+        Reaction.SEARCH,
+        _lost,
+        "goes on from where the object is found",
+        "no further along the path; towards the object at 2 mm/s, for `task.regain_mm` (2); counted",
+        check=checks.contact_to_regain,
+        touch=True,
+    ),
+    Condition(
+        "contact_not_regained",
+        "lost contact not found again",
+        "`task.regain_mm` searched",
+        Reaction.RETREAT,
+        _cycles(1),
+        AGAIN,
+        check=checks.contact_not_regained,
         touch=True,
     ),
     Condition(

@@ -45,7 +45,6 @@ def make_setups(plan: Plan) -> tuple[NodeSetup, ...]:
 
 def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     dictionary = load_eds(node.eds, node.node_id)
-    numbers = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
     specific = _drive_writes(plan, node) if node.kind == "drive" else _sensor_writes(plan)
     wanted = [*_common_writes(plan), *specific]
     return NodeSetup(
@@ -53,7 +52,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         name=node.role,
         eds=node.eds,
         dictionary=dictionary,
-        identity={sub: value for sub, value in enumerate(numbers, start=1) if value is not None},
+        identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},
         writes=(*_pdo_writes(plan, node, dictionary), *(w for w in wanted if w.index in dictionary)),
         lacks=tuple(sorted({w.index for w in wanted if w.index not in dictionary})),
     )
@@ -144,9 +143,7 @@ def software_limits(model: PumaModel) -> tuple[Array, Array]:
 def _sensor_writes(plan: Plan) -> list[Write]:
     assert plan.scene.sensor is not None
     writes = [Write(0x2000, 0, TactileMode[plan.scene.sensor.mode.upper()])]
-    if plan.scene.task.kind in (
-        "scan",
-        "press",
-    ):  # nothing touches the array yet; a listening cell knows no such moment
+    # nothing touches the array yet; a listening cell knows no such moment
+    if plan.scene.task.kind in ("scan", "press", "calibrate"):
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes

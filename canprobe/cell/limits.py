@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS, PumaModel
 from canprobe.scene import LimitSettings, ProbeSettings, Scene
 from canprobe.scene_geometry import T_flange_probe
+
+if TYPE_CHECKING:
+    from canprobe.touch.patch import Patch
 
 TACTILE_TIMEOUT_PERIODS = 6
 _ROUNDING = 1e-9
@@ -32,6 +36,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_cycles=round(ratio),
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         force_max=scene.limits.force_max_n,
+        regain=scene.task.regain_mm * 1e-3,
         late_share=scene.limits.late_cycles_max_percent / 100,
     )
     return limits if scene.arm is None else _of_arm(limits, scene, MODELS[scene.arm.model])
@@ -66,8 +71,8 @@ def workspace_of(limits: LimitSettings) -> Vector | None:
     return np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * 1e-3
 
 
-def force_of(scene: Scene) -> Callable[[TactileSample], float] | None:
-    """Force (N) of a tactile sample of the scene's sensor; None without one."""
+def patch_from(scene: Scene) -> Callable[[TactileSample], Patch] | None:
+    """The patch of a tactile sample of the scene's sensor; None without one."""
     if scene.sensor is None:
         return None
     from canprobe.cell.tasks.calibration import array_calibration
@@ -75,4 +80,4 @@ def force_of(scene: Scene) -> Callable[[TactileSample], float] | None:
 
     radius = {} if scene.probe is None else {"radius_m": scene.probe.radius_mm * 1e-3}
     calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, **radius)
-    return lambda sample: patch_of(sample, calibration).force
+    return lambda sample: patch_of(sample, calibration)

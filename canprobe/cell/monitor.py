@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
 from canprobe.cell.build import make_tactile
-from canprobe.cell.limits import force_of
+from canprobe.cell.limits import patch_from
 from canprobe.cell.measurement import TactileSample
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
@@ -100,7 +100,7 @@ class Monitor:
         self._feedback = {plan.pdos_of(n, "tpdo")[0].cob_id: (i, n, plan.pdos_of(n, "tpdo")[0].layout) for i, n in axes}
         self._counts: list[int | None] = [None] * 6
         self._tactile = make_tactile(plan)
-        self._force_of = force_of(plan.scene)
+        self._patch_from = patch_from(plan.scene)
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: deque[tuple[int, int]] = deque()
@@ -142,7 +142,8 @@ class Monitor:
         frame = self._tactile.assembler.push(can_id, data, t_ns)
         if frame is not None:
             self._view.taxels = frame.taxels
-            self._view.force_n = self._force_of(TactileSample(frame, t_ns, 0)) if self._force_of is not None else None
+            patch = self._patch_from(TactileSample(frame, t_ns, 0)) if self._patch_from is not None else None
+            self._view.force_n = patch.force if patch is not None else None
 
     def _take_heartbeat(self, node: NodeView, data: bytes, t_ns: int) -> None:
         try:

@@ -24,8 +24,6 @@ PARTED_COUNTS = 100
 """Difference at which the recorded targets are not the task's: 2 mm or 1 deg."""
 PARTED_S = 0.1
 """Time at that difference after which they never will be again: what a lost line sets off, the servo has mended."""
-GAP_S = 0.1
-"""Time without contact after which an estimator starts afresh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +101,7 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
         The tracker; and how many contacts could not be placed for want of the joints of their instant.
     """
     sensing = make_sensing(plan.scene)
-    tracker = make_shape_tracker(plan.scene, GAP_S)
+    tracker = make_shape_tracker(plan.scene)
     assert tracker is not None
     for cycle in cycles:
         measurement = cycle.measurement
@@ -111,7 +109,10 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
         if patch is None or measurement.tactile is None or patch.force <= TOUCH_FORCE:
             continue
         contact = sensing.contact(measurement.tactile, patch)
-        estimate = tracker.add(contact) if contact is not None else None
+        if contact is None:
+            continue
+        tracker.add(contact)
+        estimate = tracker.answer()
         if estimate is not None and bool(np.all(estimate.observed)):
             sensing.set_kappa(np.asarray(estimate.kappa))
     return tracker, sensing.dropped

@@ -29,6 +29,7 @@ class Reaction(Enum):
 
     DEGRADE = "degrade"
     HOLD = "hold"
+    SEARCH = "search"
     RETREAT = "retreat"
     STOP = "quick stop"
 
@@ -45,6 +46,8 @@ class Limits:
         tactile_cycles: between two tactile frames.
         tactile_timeout: cycles without a tactile sample.
         lost_ns: without contact force in a touch after which the contact is lost.
+        hidden_ns: with a saturated array, and no other knowledge of the force, after which it may be above the limit.
+        regain: way towards the object on which a scan looks for a lost contact, m; 0: it does not.
         force_max: N.
         late_share: of the last second's cycles that may be overruns.
         hold_ns: longest hold.
@@ -63,6 +66,8 @@ class Limits:
     tactile_cycles: int = 2
     tactile_timeout: int = 12
     lost_ns: int = 30_000_000
+    hidden_ns: int = 20_000_000
+    regain: float = 0.0
     force_max: float = 5.0
     late_share: float = 0.8
     hold_ns: int = 1_000_000_000
@@ -122,6 +127,9 @@ class Contact:
         tactile_age: cycles since the trigger of the newest sample, or since the first SYNC where none has come; None
             without a sensor.
         lost_s: how long the force has been below that of a contact, where there must be one.
+        hidden_s: how long the array has been saturated while nothing else tells the force.
+        path: the touch is a scan, which may look for a contact that it has lost.
+        searched: how far it has gone towards the object since, m.
         limit: what a joint or the workspace forbids; None where all is well.
     """
 
@@ -129,6 +137,9 @@ class Contact:
     force: float
     tactile_age: int | None
     lost_s: float = 0.0
+    hidden_s: float = 0.0
+    path: bool = False
+    searched: float = 0.0
     limit: str | None = None
 
 

@@ -5,13 +5,18 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from canprobe.bus.port import ControllerState, PortCounters
 from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
+from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.joint_guard import JointGuard
 from canprobe.cell.measurement import Command, Measurement, TactileSample
 from canprobe.cell.supervision import Condition, Contact, Reaction, Seen
 from canprobe.errors import CanprobeError
+
+if TYPE_CHECKING:
+    from canprobe.touch.patch import Patch
 
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
@@ -30,19 +35,20 @@ class Supervisor:
 
     Args:
         seen: the cell; brought up to date by :meth:`step`.
-        force_of: force (N) of a tactile sample, for controllers that do not guard their contact; None without touch.
+        patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
 
     Attributes:
         counts: how often each condition that the cell lives with has happened.
         first: cycle in which each condition was seen first.
     """
 
-    def __init__(self, seen: Seen, force_of: Callable[[TactileSample], float] | None = None) -> None:
+    def __init__(self, seen: Seen, patch_from: Callable[[TactileSample], Patch] | None = None) -> None:
         self.seen = seen
         self.counts: dict[str, int] = {condition.key: 0 for condition in COUNTED}
         self.first: dict[str, int] = {}
-        self._force_of = force_of
+        self._patch_from = patch_from
         self._force = 0.0
+        self._hidden = HiddenForce()
         self._joints = JointGuard(seen.limits)
         window = max(1, round(1e9 / seen.limits.period_ns))
         self._late: deque[int] = deque([0] * window, maxlen=window)
@@ -101,9 +107,12 @@ class Supervisor:
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """What must not go on in a touch, whatever the controller thinks of it."""
-        if self._force_of is not None and measurement.tactile is not None:
-            self._force = self._force_of(measurement.tactile)
-        return touch_finding(Contact(self.seen.limits, self._force, measurement.tactile_age))
+        if self._patch_from is not None and measurement.tactile is not None:
+            patch = self._patch_from(measurement.tactile)
+            self._force = patch.force
+            self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
+        hidden_s = self._hidden.hidden_s
+        return touch_finding(Contact(self.seen.limits, self._force, measurement.tactile_age, hidden_s=hidden_s))
 
     def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
         """The command that may be sent: a target too far away is approached, one out of bounds is left out."""

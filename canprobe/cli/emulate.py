@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_ids, whole
+from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_id, node_ids, number_of_32_bits, whole
 from canprobe.cli.target import add_realtime, real_target, target_of, with_realtime
 from canprobe.errors import UsageError
 
@@ -28,6 +28,8 @@ examples:
   canprobe emulate cylinder --channel vcan0 --store nodes/
   canprobe emulate --eds drive.eds --node-id 5 --channel vcan0
   canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
+  canprobe emulate free --channel vcan0 --without-id 3,5     (canprobe scan --lss gives them their ids)
+  canprobe emulate --eds drive.eds --node-id 255 --serial 0x4711 --channel vcan0
   canprobe emulate --bus-yml config/bus.yml --channel vcan0
 """
 _BITRATE = 1_000_000
@@ -48,8 +50,19 @@ def add_parser(commands: Commands[Parser]) -> None:
         metavar="N",
         action="append",
         default=[],
-        type=whole(1, 127),
-        help="node id of the --eds of the same rank",
+        type=node_id,
+        help="node id of the --eds of the same rank; 255: none, it waits for LSS",
+    )
+    parser.add_argument(
+        "--serial",
+        metavar="N",
+        action="append",
+        default=[],
+        type=number_of_32_bits,
+        help="serial number (1018h:04) of the --eds of the same rank",
+    )
+    parser.add_argument(
+        "--without-id", metavar="IDS", type=node_ids, default=(), help="nodes that start without an id and wait for LSS"
     )
     parser.add_argument("--bus-yml", metavar="FILE", type=Path, help="serve the slaves of a ros2_canopen bus.yml")
     parser.add_argument("--nodes", metavar="IDS", type=node_ids, help="such as 1-6,16 [those the scene marks emulated]")
@@ -58,7 +71,10 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--truth", metavar="FILE", type=Path, help="write the plant's true values there at the end (.npz)"
     )
     parser.add_argument(
-        "--store", metavar="DIR", type=Path, help="keep there what a master stores by 1010h [forgotten at the end]"
+        "--store",
+        metavar="DIR",
+        type=Path,
+        help="keep there what a master stores by 1010h or LSS [forgotten at the end]",
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.set_defaults(run=run)
@@ -82,12 +98,16 @@ def run(args: argparse.Namespace) -> int:
 def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
     from canprobe.scene_loader import load_scene
 
-    if args.node_id:
-        raise UsageError("emulate: --node-id belongs to --eds; of a scene's nodes, choose with --nodes")
+    for option in ("node_id", "serial"):
+        if getattr(args, option):
+            name = option.replace("_", "-")
+            raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
     scene = with_realtime(load_scene(args.scene), args.realtime)
     _name_bus(args, scene.bus.channel)
     target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
+    if absent := sorted(set(args.without_id) - set(wanted)):
+        raise UsageError(f"--without-id: {absent} is not among the nodes to serve, {list(wanted)}")
 
     from canprobe import api
 
@@ -100,15 +120,16 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         seed=args.seed,
         truth_path=args.truth,
         store_folder=args.store,
+        without_id=args.without_id,
         say=say,
     )
 
 
 def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     source = "--bus-yml" if args.bus_yml is not None else "--eds"
-    for option in ("nodes", "seed", "truth"):
-        if getattr(args, option) is not None:
-            raise UsageError(f"emulate: --{option} belongs to a scene, not to {source}")
+    for option in ("nodes", "seed", "truth", "without_id"):
+        if getattr(args, option) not in (None, ()):
+            raise UsageError(f"emulate: --{option.replace('_', '-')} belongs to a scene, not to {source}")
     files = _eds_files(args)
     channels = [channel for _, channel in args.channel or [(None, None)]]
     if len(channels) > 1 or (args.channel and args.channel[0][0] is not None):
@@ -125,6 +146,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
         channel=channel,
         bitrate=bitrate or _BITRATE,
         store_folder=args.store,
+        serial_numbers=args.serial,
         in_realtime=args.realtime,
         say=say,
     )
@@ -135,11 +157,13 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     if args.bus_yml is not None:
         from canprobe.bridge.bus_yml import read_bus_yml
 
-        if args.node_id:
-            raise UsageError("emulate: --node-id belongs to --eds; a bus.yml has its own")
+        if args.node_id or args.serial:
+            raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
         return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml).nodes]
     if len(args.eds) != len(args.node_id):
         raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
+    if len(args.serial) > len(args.eds):
+        raise UsageError(f"emulate: {len(args.serial)} --serial, but {len(args.eds)} --eds")
     return list(zip(args.eds, args.node_id, strict=True))
 
 

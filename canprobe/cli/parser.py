@@ -96,6 +96,22 @@ def whole(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
+def node_id(text: str) -> int:
+    """An argument type: a node id, or 255 for none."""
+    return 255 if text == "255" else whole(1, 127)(text)
+
+
+def number_of_32_bits(text: str) -> int:
+    """An argument type: a number of 1018h, decimal or hexadecimal with 0x."""
+    try:
+        value = int(text, 0)
+    except ValueError:
+        value = -1
+    if not 0 <= value <= 0xFFFFFFFF:
+        raise argparse.ArgumentTypeError(f"expected a number of 32 bits such as 4711 or 0x1267, got {text!r}")
+    return value
+
+
 def seconds(text: str) -> float:
     """An argument type: a duration."""
     try:

@@ -29,6 +29,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_realtime(parser)
     add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the results [runs/<scene>-<time>]")
+    parser.add_argument("--tool", metavar="FILE", type=Path, help="tool.toml of a calibration, for the probe's centre")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="length of the scene's phase, seconds [the scene's]"
@@ -43,6 +44,10 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.scene_loader import load_scene
 
     scene = with_realtime(load_scene(args.scene), args.realtime)
+    if args.tool is not None:
+        from canprobe.scene_tool import with_tool
+
+        scene = with_tool(scene, args.tool)
     target = target_of(args, scene)
 
     from canprobe import api

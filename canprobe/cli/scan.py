@@ -1,51 +1,127 @@
-"""`canprobe scan`: list the nodes on a bus with their identity."""
+"""`canprobe scan`: list the nodes on a bus with their identity; with --lss also give ids to nodes that have none.
+
+LSS (CiA 305) finds nodes without an id by their vendor, product, revision and serial number (1018h). --assign names a
+device by its serial number and the id that it gets; with a SCENE its nodes get theirs, as the identities in their EDS
+files and the scene's serial_numbers tell. A device keeps its id (unless --no-store) and boots with it at once.
+"""
 
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Commands, Parser, add_json, channel, whole
+from canprobe.cli.parser import Commands, Parser, add_json, add_scene, channel, number_of_32_bits, whole
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 
+if TYPE_CHECKING:
+    from canprobe.cell.commission import Commissioned
+
 _EXAMPLE = """\
-example:
+examples:
   canprobe scan --bus socketcan --channel can0
+  canprobe scan --lss --channel can0                         who has no id yet?
+  canprobe scan --lss --assign 3 --channel can0              the only one that has none gets 3
+  canprobe scan --lss --assign 0x4711=3 --assign 0x4712=4 --channel can0
+  canprobe scan mine.toml --lss --channel can0               as the scene says
 """
 _COLUMNS = ("node_id", "state", "vendor_id", "product_code", "revision_number", "serial_number", "device_name")
+_NUMBERS = 4
+Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser("scan", help="list the nodes on a bus", description=__doc__, epilog=_EXAMPLE)
+    add_scene(parser, optional=True)
     parser.add_argument(
         "--bus", metavar="B", help="any python-can interface [as CAN_INTERFACE or python-can's files say, or socketcan]"
     )
     parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="the channel [can0]")
     parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="[1000000]")
+    parser.add_argument("--lss", action="store_true", help="look for nodes without an id too")
+    parser.add_argument(
+        "--assign",
+        metavar="[SERIAL=]ID",
+        action="append",
+        type=assignment,
+        default=[],
+        help="give the device of this serial number (or VENDOR:PRODUCT:REVISION:SERIAL) this id; may be repeated",
+    )
+    parser.add_argument("--no-store", action="store_true", help="a device has its new id only until its power goes")
     add_json(parser)
     parser.set_defaults(run=run)
+
+
+def assignment(text: str) -> Assignment:
+    """An argument type: `ID`, `SERIAL=ID` or `VENDOR:PRODUCT:REVISION:SERIAL=ID`."""
+    device, _, node_id = text.rpartition("=")
+    parts = [number_of_32_bits(part) for part in device.split(":")] if device or "=" in text else []
+    if len(parts) not in (0, 1, _NUMBERS):
+        raise argparse.ArgumentTypeError(f"expected SERIAL=ID or VENDOR:PRODUCT:REVISION:SERIAL=ID, got {text!r}")
+    vendor, product, revision, serial = [None] * (_NUMBERS - len(parts)) + parts
+    return (vendor, product, revision, serial), whole(1, 127)(node_id)
 
 
 def run(args: argparse.Namespace) -> int:
     """Print one row a node."""
     if args.bus == "lockstep":
         raise UsageError("scan: a lockstep bus lives inside one run and has nobody on it; name a real interface")
+    _check(args)
 
     from canprobe import api
 
     interface, name, bitrate = real_target(args.bus, args.channel[1], args.bitrate)
-    where = name or "can0"
-    nodes = api.scan(interface, where, bitrate or 1_000_000)
+    where, rate = name or "can0", bitrate or 1_000_000
+    if not args.lss:
+        nodes = api.scan(interface, where, rate)
+        if args.json:
+            print_json(nodes)
+        else:
+            _print_nodes(nodes, where)
+        return 0
+    scene = None
+    if args.scene is not None:
+        from canprobe.scene_loader import load_scene
+
+        scene = load_scene(args.scene)
+    done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store)
     if args.json:
-        print_json(nodes)
-    elif nodes:
-        keys = [key for key in _COLUMNS if any(key in node for node in nodes)]
-        print_table([keys, *([_cell(key, node.get(key)) for key in keys] for node in nodes)])
+        print_json(done.as_document())
     else:
-        print(f"no node answers on {where}")
+        _print_commissioned(done, where)
     return 0
+
+
+def _check(args: argparse.Namespace) -> None:
+    for given, name in ((args.assign, "--assign"), (args.scene, "SCENE"), (args.no_store, "--no-store")):
+        if given and not args.lss:
+            raise UsageError(f"scan: {name} goes with --lss")
+    if args.scene is not None and args.assign:
+        raise UsageError("scan: --assign or SCENE, not both")
+    ids = [node_id for _, node_id in args.assign]
+    if twice := [node_id for node_id in ids if ids.count(node_id) > 1]:
+        raise UsageError(f"scan: --assign gives id {twice[0]} to more than one device")
+
+
+def _print_nodes(nodes: list[dict[str, Any]], where: str) -> None:
+    if not nodes:
+        print(f"no node answers on {where}")
+        return
+    keys = [key for key in _COLUMNS if any(key in node for node in nodes)]
+    print_table([keys, *([_cell(key, node.get(key)) for key in keys] for node in nodes)])
+
+
+def _print_commissioned(done: Commissioned, where: str) -> None:
+    for one, stored in done.assigned:
+        before = "" if one.before is None else f", before {one.before}"
+        print(f"{one.address} is node {one.node_id} now{before}{'' if stored else '; until its power goes'}")
+    _print_nodes(done.nodes, where)
+    for address in done.unconfigured:
+        print(f"without an id: {address} (vendor:product:revision:serial)")
+    if not done.unconfigured and not done.assigned:
+        print(f"no node without an id answers on {where}")
 
 
 def _cell(key: str, value: object) -> str:

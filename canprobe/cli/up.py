@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
+from typing import TYPE_CHECKING
 
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
-from canprobe.cli.target import add_realtime, target_of, with_realtime
+from canprobe.cli.target import Target, add_realtime, target_of, with_realtime
+from canprobe.errors import UsageError
+
+if TYPE_CHECKING:
+    from canprobe.scene import Scene
 
 _EXAMPLE = """\
-example:
+examples:
   canprobe up free --bus socketcan --channel can0
+  canprobe up free --bus socketcan --channel can0 --check-joints     (the first motion: each joint by 1 deg, slowly)
 """
 
 
@@ -23,15 +30,27 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_bus(parser)
     add_realtime(parser)
     add_bridge(parser)
+    parser.add_argument(
+        "--check-joints",
+        action="store_true",
+        help="turn each joint by 1 deg and back, one at a time, compare the encoders and end; asks before each",
+    )
+    parser.add_argument("--yes", action="store_true", help="with --check-joints: ask nobody")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Hold the cell until an interrupt, which is the normal way to leave."""
+    if args.yes and not args.check_joints:
+        raise UsageError("up: --yes goes with --check-joints")
+    if args.bridge and args.check_joints:
+        raise UsageError("up: --check-joints feeds no --bridge")
     from canprobe.scene_loader import load_scene
 
     scene = with_realtime(load_scene(args.scene), args.realtime)
     target = target_of(args, scene)
+    if args.check_joints:
+        return _check_joints(scene, target, ask=not args.yes)
 
     from canprobe import api
 
@@ -44,5 +63,25 @@ def run(args: argparse.Namespace) -> int:
             bitrate=target.bitrate,
             say=say,
             bridge=args.bridge or (),
+        )
+    return 0
+
+
+def _check_joints(scene: Scene, target: Target, *, ask: bool) -> int:
+    if ask and not sys.stdin.isatty():
+        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes asks nobody")
+
+    from canprobe import api
+    from canprobe.cli.operator import TerminalOperator
+
+    with termination_interrupts():
+        api.check_joints(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            sensor_channel=target.sensor_channel,
+            bitrate=target.bitrate,
+            operator=TerminalOperator() if ask else None,
+            say=say,
         )
     return 0

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from canprobe.eds import load_eds
 from canprobe.emulator.drive import make_drive_node
+from canprobe.emulator.lss import set_serial_number
 from canprobe.emulator.node import SlaveNode
 from canprobe.emulator.plant.config import DynamicSettings, PlantConfig, PressMotion
 from canprobe.emulator.plant.taxels import TaxelConfig
@@ -16,6 +18,8 @@ from canprobe.emulator.plant.world import Plant
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.planning import Plan
+from canprobe.planning.model import PlannedNode
+from canprobe.protocol.lss import UNCONFIGURED
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS, Array, PumaModel
 from canprobe.robot.touching import start_posture
@@ -47,13 +51,16 @@ class World:
         return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
 
 
-def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True) -> World:
+def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
     """The emulated nodes of a plan, behind one plant.
+
+    Where the scene gives a node no serial number, its node id in the scene is one.
 
     Args:
         plan: of the scene.
         node_ids: which of its nodes to emulate.
         truth: whether what is true is recorded.
+        without_id: which of them start without a node id and wait for LSS to give them one.
     """
     scene = plan.scene
     plant = Plant(_plant_config(scene))
@@ -61,21 +68,30 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True) -> 
     for node in plan.nodes:
         if node.node_id not in node_ids:
             continue
-        dictionary = load_eds(node.eds, node.node_id)
-        if node.kind == "drive":
-            assert scene.arm is not None
-            axis = scene.arm.node_ids.index(node.node_id)
-            nodes.append(make_drive_node(dictionary, node.node_id, axis, plant))
-        else:
-            nodes.append(make_tactile_node(dictionary, node.node_id, plant))
+        nodes.append(_node(scene, node, UNCONFIGURED if node.node_id in without_id else node.node_id, plant))
     return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
+
+
+def _node(scene: Scene, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:
+    dictionary, od_of = load_eds(planned.eds, planned.node_id), partial(load_eds, planned.eds)
+    if planned.kind == "drive":
+        assert scene.arm is not None
+        axis = scene.arm.node_ids.index(planned.node_id)
+        node = make_drive_node(dictionary, node_id, axis, plant, od_of)
+    else:
+        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)
+    serial = planned.identity.serial_number
+    set_serial_number(node, planned.node_id if serial is None else serial)
+    if node.lss is not None:
+        node.lss.bitrate = scene.bus.bitrate
+    return node
 
 
 def _plant_config(scene: Scene) -> PlantConfig:
     settings, probe, arm = scene.plant or PlantSettings(), scene.probe or ProbeSettings(), scene.arm
     config = PlantConfig(
         model=MODELS[arm.model] if arm is not None else None,
-        T_flange_probe_centre=T_flange_probe(probe),
+        T_flange_probe_centre=_real_tool(probe, settings),
         radius_m=probe.radius_mm * 1e-3,
         stiffness_n_m3=settings.stiffness_n_m3 or probe.stiffness_n_m3,
         damping_s_m=settings.contact_damping_s_m,
@@ -96,6 +112,13 @@ def _plant_config(scene: Scene) -> PlantConfig:
         dynamics=_dynamics(settings, probe),
         base_offset_m=_base_offset(scene, real),
     )
+
+
+def _real_tool(probe: ProbeSettings, settings: PlantSettings) -> Array:
+    """Where the probe's centre is on the flange, (4, 4), m: where the controller believes it, and an error."""
+    T = T_flange_probe(probe)
+    T[:3, 3] += np.array(settings.tool_error_mm) * 1e-3
+    return T
 
 
 def _dynamics(settings: PlantSettings, probe: ProbeSettings) -> DynamicSettings:
@@ -126,7 +149,7 @@ def _first_posture(scene: Scene) -> Array:
     """Joint angles (6,), rad, at power on: above the start point of a touch, else as the scene says."""
     assert scene.arm is not None
     given = np.radians(scene.arm.start_deg)
-    if scene.probe is None or scene.task.kind not in ("scan", "press"):
+    if scene.probe is None or scene.task.kind not in ("scan", "press", "calibrate"):
         return given
     return start_posture(
         MODELS[scene.arm.model],

@@ -7,6 +7,7 @@ brings a live value up to date before it is read.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 
 from canopen.objectdictionary import ObjectDictionary
 
@@ -30,6 +31,7 @@ class Dictionary:
     def __init__(self, od: ObjectDictionary) -> None:
         self.entries: dict[int, Entry] = {entry.key: entry for entry in read_entries(od)}
         self.values: dict[int, Value] = {}
+        self._own: dict[int, Value] = {}
         self._indices = {key >> 8 for key in self.entries}
         self._checks: dict[int, list[Check]] = {}
         self._hooks: dict[int, list[Hook]] = {}
@@ -42,6 +44,18 @@ class Dictionary:
         """Put the EDS's defaults back, without checks or hooks."""
         for key in keys:
             self.values[key] = self.entries[key].default
+
+    def set_default(self, index: int, subindex: int, value: Value) -> None:
+        """Give an entry a default of this very device's, such as its serial number. KeyError: no such entry."""
+        key = key_of(index, subindex)
+        self._own[key] = value
+        self.entries[key] = replace(self.entries[key], default=value)
+        self.values[key] = value
+
+    def take_defaults(self, od: ObjectDictionary) -> None:
+        """Take the defaults of the same EDS for another node id; present values stay until they are restored."""
+        for entry in read_entries(od):
+            self.entries[entry.key] = replace(entry, default=self._own.get(entry.key, entry.default))
 
     def __contains__(self, key: int) -> bool:
         return key in self.entries
@@ -82,10 +96,11 @@ class Dictionary:
         checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
         if entry.low is None and entry.high is None and not checks and not hooks:
             return None
-        values = self.values
+        values, limited = self.values, entry.low is not None or entry.high is not None
 
         def store(value: Value) -> None:
-            entry.check_limits(value)
+            if limited:
+                entry.check_limits(value)
             for check in checks:
                 check(subindex, value)
             values[key] = value

@@ -23,7 +23,7 @@ from canprobe.emulator.drive_states import DriveStates
 from canprobe.emulator.drive_supervision import Supervision
 from canprobe.emulator.drive_units import FACTORS
 from canprobe.emulator.entries import Value, key_of
-from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.node import OdOf, SlaveNode
 from canprobe.protocol import cia402
 from canprobe.protocol.cia402 import POWERED_STATES, Command, DriveState, Event
 from canprobe.protocol.emcy import HEARTBEAT_LOST
@@ -219,13 +219,16 @@ class DriveApplication(Application):
             self._node.pdos.event(0x6041)
 
 
-def make_drive_node(od: ObjectDictionary, node_id: int, axis: int, plant: AxisPlant) -> SlaveNode:
+def make_drive_node(
+    od: ObjectDictionary, node_id: int, axis: int, plant: AxisPlant, od_of: OdOf | None = None
+) -> SlaveNode:
     """A drive node on one axis of the plant.
 
     Args:
         od: of `puma260_joint.eds` or another CiA 402 EDS, for this node id.
-        node_id: 1–127.
+        node_id: 1–127, or 255 for none.
         axis: of the plant, 0-based.
         plant: shared by all nodes.
+        od_of: the EDS for another node id, where LSS may give the node one.
     """
-    return SlaveNode(od, node_id, DriveApplication(axis, plant))
+    return SlaveNode(od, node_id, DriveApplication(axis, plant), od_of=od_of)

@@ -21,13 +21,17 @@ from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.error_control import HeartbeatConsumer, HeartbeatProducer
 from canprobe.emulator.guarding import NodeGuarding
+from canprobe.emulator.lss import LssSlave
 from canprobe.emulator.nmt import NMT_TRANSITIONS
 from canprobe.emulator.pdo_engine import PdoEngine
 from canprobe.emulator.sdo_server import SdoServer
 from canprobe.emulator.store import Store
 from canprobe.emulator.sync_consumer import SyncConsumer
 from canprobe.protocol.frames import NMT_ID, Frame, NmtCommand, NmtState
+from canprobe.protocol.lss import UNCONFIGURED
 
+OdOf = Callable[[int], ObjectDictionary]
+"""Parses a node's EDS for a node id."""
 _ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
 _COMMANDS = frozenset(NmtCommand)
 
@@ -39,19 +43,26 @@ class SlaveNode:
         core: state, dictionary and timers, shared with the services.
         emcy, pdos, store: the services an application works with.
         application: the device.
+        lss: the LSS service; None where the node's id cannot be changed over the bus.
         rerouted: called when `listens` has changed; a bus puts its own function there.
     """
 
     def __init__(
-        self, od: ObjectDictionary, node_id: int, application: Application | None = None, boot_ns: int = 0
+        self,
+        od: ObjectDictionary,
+        node_id: int,
+        application: Application | None = None,
+        boot_ns: int = 0,
+        od_of: OdOf | None = None,
     ) -> None:
         """Make the node; it is silent until `start`.
 
         Args:
             od: parsed EDS, with $NODEID already put in.
-            node_id: 1–127.
+            node_id: 1–127; or 255 (`UNCONFIGURED`): it waits for LSS to give it one.
             application: what the device does; none by default.
             boot_ns: time spent in initialisation, in which nothing is served.
+            od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
         """
         self.application = application if application is not None else Application()
         self.core = core = NodeCore(node_id, Dictionary(od))
@@ -65,7 +76,10 @@ class SlaveNode:
         self._heartbeat = HeartbeatProducer(core)
         servers = [SdoServer(core, index) for index in _sdo_servers(core)]
         sync = SyncConsumer(core, self.emcy, self.pdos.sync)
+        self._od_of = od_of
+        self.lss = LssSlave(core, self.store, self._renamed) if od_of is not None else None
         self._services: tuple[Service, ...] = (
+            *([self.lss] if self.lss is not None else []),
             self.emcy,
             self.pdos,
             self.store,
@@ -80,13 +94,13 @@ class SlaveNode:
 
     @property
     def node_id(self) -> int:
-        """1–127."""
+        """1–127, or 255 without one."""
         return self.core.node_id
 
     @property
     def name(self) -> str:
         """For messages."""
-        return f"node {self.core.node_id}"
+        return f"node {self.core.node_id}" if self.core.node_id != UNCONFIGURED else "node without an id"
 
     @property
     def state(self) -> NmtState:
@@ -106,6 +120,8 @@ class SlaveNode:
     def start(self, t_ns: int) -> list[Frame]:
         """Power on."""
         self.core.now_ns = t_ns
+        if self.lss is not None:
+            self.lss.power_on()
         self._initialise(t_ns, communication_only=False)
         return self._taken()
 
@@ -148,8 +164,21 @@ class SlaveNode:
         elif goal is not None:
             self._enter(goal, t_ns)
 
+    def _renamed(self, t_ns: int) -> None:
+        """The node had no id and has one now: reset communication by itself (CiA 305)."""
+        self._initialise(t_ns, communication_only=True)
+
+    def _adopt_node_id(self) -> None:
+        """Use the id that LSS has configured, with the defaults that the EDS gives for it."""
+        if self.lss is None or self._od_of is None or self.lss.pending == self.core.node_id:
+            return
+        self.core.node_id = self.lss.pending
+        if self.core.node_id != UNCONFIGURED:
+            self.core.dictionary.take_defaults(self._od_of(self.core.node_id))
+
     def _initialise(self, t_ns: int, communication_only: bool) -> None:
         self.core.state = NmtState.INITIALISING
+        self._adopt_node_id()
         self.application.entered(t_ns)
         self.store.recall(communication_only)
         for service in self._services:
@@ -158,6 +187,8 @@ class SlaveNode:
             self.application.recall(self.store.kept)
             self.application.reset(t_ns)
         self._reroute()
+        if self.core.node_id == UNCONFIGURED:
+            return
         if self._boot_ns:
             self._boot_timer.arm(t_ns + self._boot_ns)
         else:
@@ -203,6 +234,8 @@ class SlaveNode:
             for service in self._services:
                 routes.update(service.routes())
             routes[NMT_ID] = self._nmt
+        elif self.lss is not None and self.lss.unconfigured:
+            routes.update(self.lss.routes())
         self.rerouted()
 
 

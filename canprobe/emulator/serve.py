@@ -196,13 +196,13 @@ def _kind(seat: _Seat) -> type:
     return type(getattr(seat.node, "application", seat.node))
 
 
-def _receiver(port: Port, max_wait_ns: int) -> Callable[[int | None, int], list[TimedFrame]]:
+def _receiver(port: Port, exchange: Exchange, max_wait_ns: int) -> Callable[[int], list[TimedFrame]]:
     """How to wait for frames until a deadline: by the port's own single call where it has one, in steps of 2 ms."""
     if (at_once := getattr(port, "receive", None)) is not None:
-        return lambda due_ns, now_ns: at_once(SINGLE_WAIT_NS)
+        return lambda now_ns: at_once(SINGLE_WAIT_NS)
 
-    def receive(due_ns: int | None, now_ns: int) -> list[TimedFrame]:
-        until_ns = now_ns + max_wait_ns
+    def receive(now_ns: int) -> list[TimedFrame]:
+        due_ns, until_ns = exchange.next_deadline_ns, now_ns + max_wait_ns
         port.wait(until_ns if due_ns is None else min(due_ns, until_ns))
         return port.drain()
 
@@ -223,7 +223,7 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
         now_ns = clock.now_ns()
         if boot_ups := exchange.start(now_ns):
             port.send_batch(boot_ups)
-        receive, defer = _receiver(port, max_wait_ns), getattr(port, "defer", None)
+        receive, defer = _receiver(port, exchange, max_wait_ns), getattr(port, "defer", None)
         deferred: frozenset[int] = frozenset()
         while not stop():
             if exchange.rerouted and defer is not None:
@@ -231,7 +231,7 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
                 exchange.rerouted = False
                 if (patient := exchange.patient) != deferred:
                     defer(deferred := patient)
-            received = receive(exchange.next_deadline_ns, now_ns)
+            received = receive(now_ns)
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
             now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()
             for frames in exchange.batches(received, now_ns):

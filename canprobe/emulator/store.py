@@ -30,6 +30,7 @@ class Store:
         saved: stored values by dictionary key; hand it to another node's store to model a power cycle.
         kept: what the application stored beside the dictionary.
         volatile: indices that are process data, never stored.
+        node_id: stored by LSS for the next power on, 255 for none; None where LSS never stored any.
         changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
     """
 
@@ -37,6 +38,7 @@ class Store:
         self._core, self._application = core, application
         self.saved: dict[int, Value] = {}
         self.kept = b""
+        self.node_id: int | None = None
         self.changed: Callable[[], None] = _nothing
         self.volatile: set[int] = set()
         core.dictionary.configured = self._unverify
@@ -63,6 +65,15 @@ class Store:
         for key, value in self.saved.items():
             if key >> 8 in area:
                 dictionary.values[key] = value
+
+    def keep_node_id(self, node_id: int) -> None:
+        """Store a node id (LSS store configuration). Raises SdoAbort when it could not be written."""
+        before, self.node_id = self.node_id, node_id
+        try:
+            self.changed()
+        except SdoAbort:
+            self.node_id = before
+            raise
 
     def _save(self, subindex: int, value: Value) -> None:
         if value != SAVE or subindex not in _GROUPS:

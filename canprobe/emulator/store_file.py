@@ -1,4 +1,4 @@
-"""A node's stored parameters (1010h, 1011h) in a JSON file, so that they survive a restart of the process."""
+"""A node's stored parameters (1010h, 1011h, LSS) in a JSON file, so that they survive a restart of the process."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.entries import Value
 from canprobe.emulator.node import SlaveNode
 from canprobe.errors import UsageError
+from canprobe.protocol.lss import UNCONFIGURED
 
 _SCHEMA = 1
 
 
 def keep_in_file(node: SlaveNode, path: Path) -> None:
-    """Take over what the file holds, if there is one; from now on write it at every "save" and "load".
+    """Take over what the file holds, if there is one; from now on write it at every "save" and "load" and when
+    LSS stores a node id.
 
-    Call it before the node is started. A write that fails aborts the SDO with 06060000h.
+    Call it before the node is started. A write that fails aborts the SDO with 06060000h, or LSS with error 2.
 
     Args:
         node: the node, not yet started.
@@ -48,6 +50,7 @@ def _write(node: SlaveNode, path: Path) -> None:
         "schema": _SCHEMA,
         "identity": _identity(node),
         "device": node.store.kept.hex(),
+        **({} if node.store.node_id is None else {"node_id": node.store.node_id}),
         "values": {
             f"{key >> 8:04X}:{key & 0xFF:02X}": _plain(value) for key, value in sorted(node.store.saved.items())
         },
@@ -67,13 +70,20 @@ def _read(node: SlaveNode, path: Path) -> None:
         content = json.loads(path.read_text(encoding="utf-8"))
         identity, texts, device = content["identity"], content["values"], bytes.fromhex(content["device"])
         values = {_key(text): _value(plain) for text, plain in texts.items()}
+        node_id = _node_id(content.get("node_id"))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise UsageError(f"{path}: no stored parameters of a node can be read from it: {error!r}") from error
     if identity != _identity(node):
         raise UsageError(f"{path}: stored by the device {identity}, {node.name} is {_identity(node)} (1018h:01 to 03)")
     for key, value in values.items():
         _check(node, path, key, value)
-    node.store.saved, node.store.kept = values, device
+    node.store.saved, node.store.kept, node.store.node_id = values, device, node_id
+
+
+def _node_id(value: Any) -> int | None:
+    if value is None or value == UNCONFIGURED or (type(value) is int and 1 <= value <= 127):
+        return value  # type: ignore[no-any-return]
+    raise ValueError(f"expected a node id from 1 to 127, or 255, got {value!r}")
 
 
 def _key(text: str) -> int:

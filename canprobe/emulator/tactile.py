@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
 from canprobe.emulator.entries import Value
-from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.node import OdOf, SlaveNode
 from canprobe.emulator.tactile_image import Image, compute_features, correct, follow, is_overloaded
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
@@ -151,16 +151,19 @@ class TactileApplication(Application):
         self._tare, self._taring = None, []
 
 
-def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1) -> SlaveNode:
+def make_tactile_node(
+    od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1, od_of: OdOf | None = None
+) -> SlaveNode:
     """A tactile node on the plant.
 
     Args:
         od: of `tactile_array.eds`, for this node id.
-        node_id: 1–127.
+        node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
         latency_frames: triggers between sampling an image and sending it.
+        od_of: the EDS for another node id, where LSS may give the node one.
     """
-    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames))
+    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames), od_of=od_of)
 
 
 def _check_tare(subindex: int, value: Value) -> None:

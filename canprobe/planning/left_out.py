@@ -40,7 +40,12 @@ def _by_sensor(scene: Scene) -> str | None:
 def _no_shape(scene: Scene) -> str | None:
     if scene.shape is not None:
         return None
-    why = {"press": "one touch without motion shows no shape", "listen": "nothing moves", "free": "nothing is touched"}
+    why = {
+        "press": "one touch without motion shows no shape",
+        "calibrate": "the ball is known",
+        "listen": "nothing moves",
+        "free": "nothing is touched",
+    }
     return why.get(scene.task.kind, "no [shape]")
 
 
@@ -53,6 +58,7 @@ def _no_patch(scene: Scene) -> str | None:
 def _no_strategy(scene: Scene) -> str | None:
     why = {
         "press": "the probe holds still",
+        "calibrate": "no surface is followed",
         "listen": "nothing moves",
         "free": "the joints swing, no surface is followed",
     }
@@ -143,6 +149,8 @@ def outputs(scene: Scene) -> tuple[str, ...]:
     files = ["summary.json", "log.npz", "bus.log", "scene.toml"]
     if _no_truth(scene) is None:
         files.append("truth.npz")
+    if scene.task.kind == "calibrate":
+        files.append("tool.toml")
     mapped = _no_shape(scene) is None
     if mapped:
         files.append("surface.npz")

@@ -25,8 +25,8 @@ from canprobe.planning.model import (
 from canprobe.planning.needs import missing_objects
 from canprobe.planning.open_keys import candidates
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
-from canprobe.planning.reach import check_motion
 from canprobe.planning.traffic import plan_traffic
+from canprobe.planning.turning import plan_motion
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
 
@@ -50,7 +50,7 @@ def make_plan(scene: Scene) -> Plan:
     if found is not None:
         problems += found.reasons()
         scene = found.scene
-    joint_speeds, unreachable = check_motion(scene)
+    scene, joint_speeds, unreachable, turn = plan_motion(scene)
     problems += unreachable
     if problems or found is None:
         raise PlanError(problems)
@@ -61,7 +61,7 @@ def make_plan(scene: Scene) -> Plan:
         pdos=bus.pdos,
         sync=bus.sync,
         buses=bus.buses,
-        choices=found.choices,
+        choices=(*found.choices, *turn),
         joint_speeds=joint_speeds,
         estimator=scene.shape.method if scene.shape is not None else None,
         offline_estimators=scene.shape.also if scene.shape is not None else (),
@@ -214,13 +214,22 @@ def _nodes(scene: Scene, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
             kind=kind,
             role=role,
             eds=devices[node_id].eds,
-            identity=devices[node_id].identity,
+            identity=replace(devices[node_id].identity, serial_number=_serial_number(scene, node_id)),
             emulated=emulated,
             channel=channel_of[node_id],
             switched_off=_switched_off(node_id, devices[node_id], pdos),
         )
         for node_id, kind, role, emulated in sorted(roles)
     )
+
+
+def _serial_number(scene: Scene, node_id: int) -> int | None:
+    """What the scene wants 1018h:04 of a node to be."""
+    if scene.sensor is not None and node_id == scene.sensor.node_id:
+        return scene.sensor.serial_number
+    if scene.arm is None or scene.arm.serial_numbers is None:
+        return None
+    return scene.arm.serial_numbers[scene.arm.node_ids.index(node_id)]
 
 
 def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:

@@ -20,11 +20,17 @@ Direction = Literal["tpdo", "rpdo"]
 
 @dataclass(frozen=True, slots=True)
 class Identity:
-    """Object 1018h as the EDS gives it; None where the EDS leaves it open."""
+    """Object 1018h as the EDS gives it, and its serial number as the scene does; None where it may be any."""
 
     vendor_id: int | None
     product_code: int | None
     revision_number: int | None
+    serial_number: int | None = None
+
+    @property
+    def numbers(self) -> tuple[int | None, int | None, int | None, int | None]:
+        """1018h:01 to :04."""
+        return self.vendor_id, self.product_code, self.revision_number, self.serial_number
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,6 +235,11 @@ class JointSpeeds:
 
     needed_deg_s: tuple[float, ...]
     limit_deg_s: tuple[float, ...]
+
+    @property
+    def worst_share(self) -> float:
+        """Largest share of its limit that a joint is asked for; above 1 it cannot."""
+        return max(need / limit for need, limit in zip(self.needed_deg_s, self.limit_deg_s, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

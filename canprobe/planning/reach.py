@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
+from canprobe.planning.ball_reach import joints_on_ball
 from canprobe.planning.model import JointSpeeds
-from canprobe.planning.surface_path import SurfacePath, surface_path
+from canprobe.planning.surface_path import SAMPLES, SurfacePath, surface_path
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS, PumaModel
@@ -22,15 +23,22 @@ Array = NDArray[np.float64]
 _BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
 
 
-def check_motion(scene: Scene) -> tuple[JointSpeeds | None, list[str]]:
-    """What the task asks of the arm, and what the arm cannot do."""
+def check_motion(scene: Scene, samples: int = SAMPLES) -> tuple[JointSpeeds | None, list[str]]:
+    """What the task asks of the arm, and what the arm cannot do.
+
+    Args:
+        scene: any.
+        samples: points of a scan's path that are looked at.
+    """
     if scene.arm is None:
         return None, []
     model = MODELS[scene.arm.model]
     problems = _start_problems(model, scene, scene.arm)
     if scene.task.kind == "free":
         return _check_swing(model, scene, scene.arm, problems)
-    path, found = surface_path(scene)
+    if scene.task.kind == "calibrate":
+        return _check_ball(model, scene, scene.arm, problems)
+    path, found = surface_path(scene, samples)
     problems += found
     if path is None or scene.probe is None:
         return None, problems
@@ -41,7 +49,7 @@ def check_motion(scene: Scene) -> tuple[JointSpeeds | None, list[str]]:
         return None, problems
     problems += _stop_problems(model, scene, joints)
     speeds = _speeds_along(model, scene, joints, path)
-    return speeds, problems + _speed_problems(scene, speeds)
+    return speeds, problems + speed_problems(scene, speeds)
 
 
 def _start_problems(model: PumaModel, scene: Scene, arm: ArmSettings) -> list[str]:
@@ -129,8 +137,9 @@ def _joint_speeds(model: PumaModel, scene: Scene, needed: Array) -> JointSpeeds:
     )
 
 
-def _speed_problems(scene: Scene, speeds: JointSpeeds) -> list[str]:
-    worst = max(need / limit for need, limit in zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True))
+def speed_problems(scene: Scene, speeds: JointSpeeds) -> list[str]:
+    """One line for every joint that the task asks to be too fast."""
+    worst = speeds.worst_share
     if worst <= 1:
         return []
     ways_out = (
@@ -146,6 +155,17 @@ def _speed_problems(scene: Scene, speeds: JointSpeeds) -> list[str]:
     ]
 
 
+def _check_ball(
+    model: PumaModel, scene: Scene, arm: ArmSettings, problems: list[str]
+) -> tuple[JointSpeeds | None, list[str]]:
+    assert scene.probe is not None
+    joints, found = joints_on_ball(model, scene, arm, scene.probe)
+    problems += found
+    if joints is None:
+        return None, problems
+    return _joint_speeds(model, scene, np.zeros(6)), problems + _stop_problems(model, scene, joints)
+
+
 def _check_swing(
     model: PumaModel, scene: Scene, arm: ArmSettings, problems: list[str]
 ) -> tuple[JointSpeeds, list[str]]:
@@ -153,4 +173,4 @@ def _check_swing(
     speeds = _joint_speeds(model, scene, swing * 2 * math.pi / scene.task.swing_period_s)
     if not problems:
         problems = _stop_problems(model, scene, np.array((start - swing, start + swing)))
-    return speeds, problems + _speed_problems(scene, speeds)
+    return speeds, problems + speed_problems(scene, speeds)

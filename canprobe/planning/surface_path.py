@@ -15,7 +15,8 @@ from canprobe.touch.strategy import make_strategy
 
 Array = NDArray[np.float64]
 
-_SAMPLES = 240
+SAMPLES = 240
+"""Points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 
 
@@ -34,11 +35,12 @@ class SurfacePath:
     hollow_radius: float
 
 
-def surface_path(scene: Scene) -> tuple[SurfacePath | None, list[str]]:
+def surface_path(scene: Scene, samples: int = SAMPLES) -> tuple[SurfacePath | None, list[str]]:
     """Points of the object under the task's path; without a described object the plane that the approach expects.
 
     Args:
         scene: a scan or a press.
+        samples: points of a scan's path.
     """
     problems: list[str] = []
     shape = _shape(scene, problems)
@@ -47,13 +49,13 @@ def surface_path(scene: Scene) -> tuple[SurfacePath | None, list[str]]:
     start = np.array(scene.task.start_mm) * 1e-3
     down = approach_normal(scene.task)
     if shape is None:
-        points = _plane_points(scene)
+        points = _plane_points(scene, samples)
         return SurfacePath(points, np.tile(down, (len(points), 1)), math.inf), []
     miss = _along(shape, start, down)
     if miss is None or not -scene.task.search_mm <= 1e3 * miss <= scene.task.clearance_mm:
         return None, [_missed(scene, miss)]
     contacts = []
-    for point in _plane_points(scene):
+    for point in _plane_points(scene, samples):
         height = _along(shape, point, down)
         if height is None:
             return None, [_left_object(point)]
@@ -72,7 +74,7 @@ def _shape(scene: Scene, problems: list[str]) -> PlacedShape | None:
         return None
 
 
-def _plane_points(scene: Scene) -> Array:
+def _plane_points(scene: Scene, samples: int) -> Array:
     """Points of the path in the scan plane, (n, 3) m; one point for a press."""
     task = scene.task
     start = np.array(task.start_mm) * 1e-3
@@ -80,7 +82,7 @@ def _plane_points(scene: Scene) -> Array:
         return start[None, :]
     along, across, _ = scan_axes(task)
     strategy = make_strategy(task.strategy, task.length_mm * 1e-3, task.width_mm * 1e-3, task.wavelength_mm * 1e-3)
-    flat = [strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, _SAMPLES, endpoint=False)]
+    flat = [strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, samples, endpoint=False)]
     points: Array = start + np.array([x * along + y * across for x, y in flat])
     return points
 

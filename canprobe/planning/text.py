@@ -80,8 +80,9 @@ def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
     several = len({node.channel for node in nodes}) > 1
     rows = [["id", "role", "identity (vendor product revision)", "EDS", "", *(["bus"] if several else [])]]
     for node in nodes:
-        identity = (node.identity.vendor_id, node.identity.product_code, node.identity.revision_number)
-        numbers = " ".join("any" if number is None else f"{number:08X}h" for number in identity)
+        numbers = " ".join("any" if number is None else f"{number:08X}h" for number in node.identity.numbers[:3])
+        if node.identity.serial_number is not None:
+            numbers += f" serial {node.identity.serial_number:08X}h"
         kind = "emulated" if node.emulated else "real"
         rows.append([str(node.node_id), node.role, numbers, node.eds, kind, *([node.channel] if several else [])])
     return rows

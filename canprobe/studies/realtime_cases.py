@@ -67,13 +67,16 @@ def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measu
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
     """Six drives and the sensor at half their rate, none of them started by the session."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL, bitrate=WIRE_BITRATE)
+    real = with_real_nodes(replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz)))
+    assert real.sensor is not None
+    return replace(real, sensor=replace(real.sensor, mode=mode, rate_hz=rate_hz / 2))
+
+
+def with_real_nodes(scene: Scene) -> Scene:
+    """The scene with arm and sensor left to somebody else, and drives that are patient with their master."""
     assert scene.arm is not None and scene.sensor is not None
-    return replace(
-        scene,
-        cycle=replace(scene.cycle, rate_hz=rate_hz),
-        arm=replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS),
-        sensor=replace(scene.sensor, emulated=False, mode=mode, rate_hz=rate_hz / 2),
-    )
+    arm = replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS)
+    return replace(scene, arm=arm, sensor=replace(scene.sensor, emulated=False))
 
 
 class Hold:

@@ -53,9 +53,36 @@ def _panels(result: RunResult) -> list[tuple[str, Any]]:
         panels.append(("2d", _draw_curvature))
     if result.taxels is not None:
         panels.append(("2d", _draw_taxels))
-    if "q_rad" in result.log and not scanning:
+    if result.summary.get("calibration") is not None:
+        panels.append(("2d", _draw_tool))
+    elif "q_rad" in result.log and not scanning:
         panels.append(("2d", _draw_joints))
     return panels
+
+
+def _draw_tool(axes: Axes, result: RunResult) -> None:
+    """Each coordinate of the tool centre beside what was believed, with its 95 % band, and the truth."""
+    found = result.summary["calibration"]
+    rows = list(range(3))
+    for row in rows:
+        value, sigma = found["tool_centre_mm"][row], found["sigma_mm"][row]
+        if value is None:
+            axes.text(0.0, row, " not observed", va="center", color=ACCENT)
+            continue
+        moved = value - found["believed_mm"][row]
+        axes.errorbar(moved, row, xerr=TWO_SIGMA * sigma, fmt="o", color=ACCENT, capsize=4, label="found, 95 %")
+        axes.annotate(f"{value:.3f} mm", (moved, row), (0, 14), textcoords="offset points", ha="center", color=INK)
+    if found["true_mm"] is not None:
+        true = np.subtract(found["true_mm"], found["believed_mm"])
+        axes.plot(true, rows, "|", color=TRUE, markersize=26, markeredgewidth=2.0, label="truth")
+    axes.axvline(0.0, color=FAINT, linewidth=1.0)
+    axes.set_yticks(rows, ["x", "y", "z"])
+    axes.set_ylim(-0.6, 2.6)
+    title = f"Tool centre in the flange frame, {found['touches']} touches"
+    _style(axes, title, "found − believed (mm)", "")
+    handles, labels = axes.get_legend_handles_labels()
+    shown = dict(zip(labels, handles, strict=True))
+    axes.legend(shown.values(), shown.keys(), frameon=False, fontsize=8, loc="lower right")
 
 
 def _title(result: RunResult) -> str:

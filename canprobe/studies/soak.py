@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from canprobe.cell.measurement import Command, Measurement
 from canprobe.child import EmulatorChild
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
-from canprobe.studies.realtime_cases import CHANNEL, PATIENT_SYNCS, served
+from canprobe.studies.realtime_cases import CHANNEL, served, with_real_nodes
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -126,15 +126,9 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 def soak(seconds: float) -> list[Sample]:
     """Hold the cell; a look every sixtieth of the time."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
-    assert scene.arm is not None and scene.sensor is not None
-    real = replace(
-        scene,
-        arm=replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS),
-        sensor=replace(scene.sensor, emulated=False),
-    )
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
     with served(CHANNEL, child):
-        session = Session(real, rows_kept=ROWS_OF_UP)
+        session = Session(with_real_nodes(scene), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)
         with session:
             session.run(soaker)

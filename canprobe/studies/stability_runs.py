@@ -111,7 +111,7 @@ def scene_of(case: Case) -> Scene:
     stiffness = layer_stiffness(case)
     task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm)
     if case.speed_mm_s > 0.0:
-        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight")
+        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight", turn_max_deg=0.0)
     return replace(
         scene,
         bus=replace(scene.bus, timed=False),
@@ -274,8 +274,10 @@ def longest_above(times_ns: Any, forces: Any, limit: float) -> int:
 
 
 def allowed_above(limits: Limits, late_ms: float) -> int:
-    """How long a force may be above the limit: the stated reaction, what is late on the bus both ways, the retreat."""
-    within = BY_KEY["force"].within
-    assert within is not None
+    """How long a force may be above the limit: the stated reaction, by the force or by an array that hides it, what is
+    late on the bus both ways, the retreat.
+    """
+    seen, hidden = BY_KEY["force"].within, BY_KEY["force_hidden"].within
+    assert seen is not None and hidden is not None
     late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
-    return within(limits) + late + RELEASE_NS
+    return max(seen(limits), hidden(limits)) + late + RELEASE_NS

@@ -53,8 +53,9 @@ class LocalSurface:
     """
 
     def __init__(self, point: Vector, normal: Vector, gains: SurfaceGains) -> None:
-        self._point: Floats = tuple(point.tolist())
-        self._normal: Floats = _unit(normal.tolist())
+        self._point: Floats
+        self._normal: Floats
+        self.move_to(point, normal)
         self._curvature: list[list[float]] = [[0.0] * 3] * 3
         self._gains = gains
 
@@ -118,6 +119,11 @@ class LocalSurface:
         """Move the model outward along its normal by a height, m: what was measured so far lies that much higher."""
         self._point = tuple([a + height * m for a, m in zip(self._point, self._normal, strict=True)])
 
+    def move_to(self, point: Vector, normal: Vector) -> None:
+        """Stand on another point (3,), m, with an outward unit normal (3,)."""
+        self._point = tuple(point.tolist())
+        self._normal = _unit(normal.tolist())
+
     def set_curvature(self, tensor: Vector) -> None:
         """Take the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
         self._curvature = tensor.tolist()
@@ -161,6 +167,11 @@ class TactileServo:
         self._share = rolling_share
         self._reference: Floats = tuple(surface.point.tolist())
         self._first_pole = (-surface.normal).tolist()
+
+    def rest_on(self, point: Vector, normal: Vector) -> None:
+        """Go on from another contact: its point (3,), m, and outward unit normal (3,); the curvature is kept."""
+        self.surface.move_to(point, normal)
+        self._reference = tuple(point.tolist())
 
     def step(self, speed: float, depth: float, dt: float) -> ProbePose:
         """One servo cycle.

@@ -184,3 +184,17 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q"][:, 5]) > 0.01
     assert canprobe.run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+
+
+def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
+    """The scene names each drive's serial number; the nodes have others."""
+    session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
+    arm = replace(session.scene.arm, serial_numbers=(1001, 1002, 1004, 1003, 1005, 1006))
+    swapped = Session(replace(session.scene, arm=arm))
+    swapped.joins = session.joins
+    with (
+        pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
+        swapped,
+    ):
+        pass
+    assert failed.value.node_id == 3

@@ -423,6 +423,51 @@ def test_contact_lost_makes_the_probe_retreat():
     assert str(run.error) == "contact lost"
 
 
+def test_contact_lost_in_a_scan_makes_it_search_and_then_retreat():
+    """The answer to the loss is the phase; the object is gone, so it retreats when it has searched as far as it may."""
+
+    class Searching(Injected):
+        noticed_ns = gone_ns = None
+
+        def command(self, measurement, command):
+            if self.noticed_ns is None and self.task.phase is Phase.REGAIN:
+                self.noticed_ns = self.now()
+            if self.gone_ns is None and self.task.losses and self.task.losses[0].searched > self.limits.regain:
+                self.gone_ns = self.now()
+            return command
+
+    run = Searching("cylinder", HOLD_CYCLE, vanish, until=1000, task={"clearance_mm": 0.8, "regain_mm": 1.0})
+    limit = BY_KEY["contact_to_regain"].within(run.limits)
+    assert 0 < run.noticed_ns - run.injected_ns <= limit
+    limit = BY_KEY["contact_not_regained"].within(run.limits)
+    assert 0 <= run.answered_ns - run.gone_ns <= limit
+    assert str(run.error) == "contact lost, and not found again within 1.0 mm"
+    run.assert_drives_off()
+
+
+def test_contact_lost_in_a_scan_that_must_not_search():
+    run = Injected("cylinder", HOLD_CYCLE, vanish, task={"clearance_mm": 0.8, "regain_mm": 0.0})
+    run.assert_within("contact_lost")
+    assert str(run.error) == "contact lost"
+
+
+def test_a_saturated_array_makes_the_probe_retreat():
+    class Saturated(Injected):
+        saturated_ns = None  # since when without a break
+
+        def command(self, measurement, command):
+            if measurement.tactile is not None and self.answered_ns is None:
+                first = self.saturated_ns or self.now()
+                self.saturated_ns = first if self.task.sensing.patch.saturated else None
+            return command
+
+    stiff = {"stiffness_n_m3": 1.4e10}  # 0.1 MN/m: a few taxels carry all of it
+    run = Saturated("press", FREE_CYCLE, lambda _: None, until=1000, plant=stiff, servo={"surface_height_hz": 2.0})
+    assert "the array is saturated and no stiffness was felt" in str(run.error)
+    assert 0 < run.answered_ns - run.saturated_ns <= BY_KEY["force_hidden"].within(run.limits)
+    assert run.session.truth["force"][-1] == 0.0
+
+
 def own_target(change):
     class Own(Injected):
         def command(self, measurement, command):
@@ -620,6 +665,7 @@ def test_every_row_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
     special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
     special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
+    special |= {key: f'BY_KEY["{key}"]' for key in ("contact_to_regain", "contact_not_regained", "force_hidden")}
     special |= {"master_dead": 'BY_KEY["master_dead"]', "log": "test_a_full_disk", "drive_late": 'BY_KEY["drive_late"]'}
     for condition in CONDITIONS:
         assert special.get(condition.key, f'("{condition.key}")') in source, condition.key

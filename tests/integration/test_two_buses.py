@@ -10,9 +10,13 @@ from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.cell.measurement import Command
 from canprobe.cell.recording import read_recording
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.planning import make_plan
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.protocol.frames import NmtState
+from canprobe.session import Session
 
 
 def split_scene():
@@ -121,3 +125,99 @@ def test_each_bus_is_measured_against_its_own_part_of_the_plan(pressed):
     result, _ = pressed
     assert all(report["as_planned"] for report in result.summary["traffic"].values())
     assert set(result.summary["traffic"]) == {"can0", "can1"}
+
+
+class Cut:
+    """A port whose interface is gone from a moment on."""
+
+    def __init__(self, port, lost_ns):
+        self._port, self._lost_ns = port, lost_ns
+
+    def __getattr__(self, name):
+        return getattr(self._port, name)
+
+    def _check(self):
+        if self._port.clock.now_ns() >= self._lost_ns:
+            raise InterfaceError(f"{self._port.channel}: it is gone")
+
+    def send_batch(self, frames, t_ns=None):
+        self._check()
+        self._port.send_batch(frames, t_ns)
+
+    def drain(self):
+        self._check()
+        return self._port.drain()
+
+    def wait(self, until_ns):
+        self._check()
+        self._port.wait(until_ns)
+
+
+class CutSession(Session):
+    """A session that loses one of its buses."""
+
+    def __init__(self, scene, lost, lost_ns):
+        super().__init__(scene)
+        self._lost = lost, lost_ns
+
+    def _join(self, ports):
+        channel, lost_ns = self._lost
+        ports[channel] = Cut(ports[channel], lost_ns)
+        return super()._join(ports)
+
+
+def hold(measurement):
+    return Command(q_target=None if measurement.cycle else measurement.q)
+
+
+def test_the_arm_is_stopped_by_its_master_when_the_sensors_bus_is_lost():
+    """The bus that is left still carries SYNC and controlwords: no drive has to stop by itself, with an EMCY."""
+    session = CutSession(split_scene(), "can1", 1_500_000_000)
+    heard = []
+    with pytest.raises(InterfaceError, match="can1: it is gone"), session:
+        write = session.lockstep.recorder
+
+        def record(can_id, data, t_ns):
+            heard.append((can_id, data, t_ns))
+            write(can_id, data, t_ns)
+
+        session.lockstep.recorder = record
+        session.run(hold)
+    words = [node.dictionary.number(0x6041) for node in session.world.nodes if node.node_id <= 6]
+    assert not POWERED_STATES.intersection(map(state_of, words))
+    assert not [frame for frame in heard if 0x81 <= frame[0] <= 0x86]
+    stops = [t for can_id, data, t in heard if can_id == 0x201 and t > 1_500_000_000 and data[0] & 0x06 == 0x02]
+    assert stops and stops[0] < 1_510_000_000  # quick stop, within four cycles
+
+
+def test_the_sensor_is_let_go_when_the_arms_bus_is_lost():
+    session = CutSession(split_scene(), "can0", 1_500_000_000)
+    with pytest.raises(InterfaceError, match="can0: it is gone"), session:
+        session.run(hold)
+    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    assert sensor.state is NmtState.PRE_OPERATIONAL
+    words = [node.dictionary.number(0x6041) for node in session.world.nodes if node.node_id <= 6]
+    assert not POWERED_STATES.intersection(map(state_of, words))  # by themselves
+
+
+def test_a_bus_that_is_lost_is_told_once_and_the_others_go_on():
+    clock = VirtualClock()
+    buses = {name: LockstepBus(clock, name) for name in ("a", "b")}
+    for bus in buses.values():
+        bus.attach(Answering(1_000_000))
+    ports = {"a": Cut(buses["a"].port(), 10_000_000), "b": buses["b"].port()}
+    joined = JoinedPort(ports, {})
+    clock.sleep_until_ns(10_000_000)
+    with pytest.raises(InterfaceError, match="a: it is gone"):
+        joined.send_batch([(0x080, b"")])
+    joined.wait(20_000_000)
+    assert joined.drain() == [(0x081, b"", 11_000_000)]  # b had the frame all the same
+    joined.send_batch([(0x080, b"")])
+    joined.wait(20_000_000)
+    assert [frame[0] for frame in joined.drain()] == [0x081]
+    joined.wait(20_000_000)
+    assert clock.now_ns() == 20_000_000
+    ports["b"].close()
+    for _ in range(2):  # nothing is left: that is told again and again
+        with pytest.raises(InterfaceError):
+            joined.drain()

@@ -17,6 +17,7 @@ from canprobe.scene_loader import load_scene, packaged_scenes
     [
         ("cylinder", {"drive", "tactile"}, "recursive", "weave", {"full image (32 PDOs)"}),
         ("press", {"drive", "tactile"}, None, None, {"surface estimator", "exploration strategy"}),
+        ("calibrate", {"drive", "tactile"}, None, None, {"surface estimator", "exploration strategy", "tactile servo"}),
         (
             "listen",
             {"tactile"},

@@ -65,6 +65,11 @@ def test_minimal_scan_gets_every_default():
     ("kind", "sections", "absent"),
     [
         ("press", "[arm]\n[sensor]\n[object]\nkind = 'plane'\n", {"shape"}),
+        (
+            "calibrate",
+            "[arm]\n[sensor]\n[object]\nkind = 'sphere'\nradius_mm = 25\n",
+            {"shape", "servo"},
+        ),
         ("listen", "[sensor]\n", {"arm", "shape", "servo", "object"}),
         ("free", "[arm]\n", {"sensor", "probe", "object", "shape", "servo"}),
     ],
@@ -135,7 +140,7 @@ def test_one_wrong_line_is_one_problem(section, line, path, words):
         (SCAN.replace("[arm]\n", ""), "arm", "a scan moves the probe"),
         (SCAN.replace('[object]\nkind = "plane"\n', ""), "object", "touches nothing without an [object]"),
         (SCAN.replace('name = "test"\n', ""), "scene.name", "missing"),
-        (SCAN.replace('kind = "scan"\n', ""), "task.kind", "one of scan, press, listen, free"),
+        (SCAN.replace('kind = "scan"\n', ""), "task.kind", "one of scan, press, calibrate, listen, free"),
         (SCAN.replace('"plane"', '"sphere"'), "object.radius_mm", 'kind = "sphere" needs it'),
         (SCAN.replace('"plane"', '"saddle"\nradius_x_mm = 60'), "object.radius_y_mm", "needs it"),
         (SCAN.replace('"plane"', '"saddle"\nradius_x_mm = 60\nradius_y_mm = 80'), "object.radius_y_mm", "opposite"),

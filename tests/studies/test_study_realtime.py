@@ -9,7 +9,7 @@ from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
 from canprobe.studies.cycle_times import CycleTimes, answer_latencies
 from canprobe.studies.realtime import findings
-from canprobe.studies.realtime_cases import Measured
+from canprobe.studies.realtime_cases import PATIENT_SYNCS, Measured, holding_scene
 
 
 def log_of(tmp_path, *lines):
@@ -65,3 +65,9 @@ def test_findings_tell_rates_and_shares():
 def test_without_socketcan_the_way_is_told(capsys, tmp_path):
     assert main(["study", "realtime", "--quick", "--out", str(tmp_path)]) == 3
     assert "canprobe vcan -- COMMAND" in capsys.readouterr().err
+
+
+def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():
+    scene = holding_scene("features", 800.0)
+    assert scene.emulated_node_ids == () and scene.arm.missed_syncs == PATIENT_SYNCS
+    assert (scene.cycle.rate_hz, scene.sensor.rate_hz, scene.sensor.mode) == (800.0, 400.0, "features")

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.cell.limits import limits_of, workspace_of
 from canprobe.cell.supervision import Limits
@@ -24,6 +25,7 @@ from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import Strategy, make_strategy
 
 if TYPE_CHECKING:
+    from canprobe.cell.tasks.calibrate import CalibrateTask
     from canprobe.touch.estimators import Estimator
 
 SIGMA_POINT_M = 0.1e-3
@@ -32,6 +34,7 @@ CORRELATION = (0.25e-3, 0.3)
 """Length (m) and share of errors that last: with it 95 % regions of K hold the truth in 95 of 100 cases, without in 71.
 Set on seeds 0 and 1 of five scenes, verified on others by `canprobe study pipeline`."""
 CYCLES_TO_EFFECT = 2
+Vector = NDArray[np.float64]
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes; the others stay what they are in the literature."""
 
@@ -40,6 +43,17 @@ def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
     """The task of a ``scan`` or ``press`` scene."""
     scene = plan.scene
     sensing = make_sensing(scene)
+    return TouchTask(
+        _settings(scene, period_s, limits_of(plan)),
+        sensing,
+        _motion(scene, sensing, period_s),
+        _strategy(scene.task),
+        make_shape_tracker(scene),
+    )
+
+
+def _motion(scene: Scene, sensing: ContactSensing, period_s: float) -> Callable[[Vector], ProbeMotion]:
+    """What makes the probe's motion from the first joint angles."""
     model, flange_probe = sensing.model, sensing.flange_probe
     bounds = MotionBounds(
         margin=math.radians(scene.limits.joint_margin_deg),
@@ -47,13 +61,39 @@ def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
         workspace=workspace_of(scene.limits),
         radius=sensing.radius,
     )
-    return TouchTask(
-        _settings(scene, period_s, limits_of(plan)),
-        sensing,
-        lambda q: ProbeMotion(model, flange_probe, q, period_s, bounds),
-        _strategy(scene.task),
-        make_shape_tracker(scene),
+    return lambda q: ProbeMotion(model, flange_probe, q, period_s, bounds)
+
+
+def make_calibrate_task(plan: Plan, period_s: float) -> CalibrateTask:
+    """The task of a ``calibrate`` scene."""
+    from canprobe.cell.tasks.calibrate import CalibrateTask, CalibrationSettings
+    from canprobe.robot.tool_calibration import BallModel
+    from canprobe.scene_ball import expected_ball, planned_approaches
+
+    scene = plan.scene
+    sensing = make_sensing(scene)
+    centre, radius = expected_ball(scene.task)
+    sensing.set_kappa(np.full(2, 1.0 / radius))
+    ball = BallModel(
+        sensing.flange_probe[:3, 3], centre, sensing.radius + radius, sigma_c=scene.task.ball_sigma_mm * 1e-3
     )
+    settings = CalibrationSettings(
+        period_s=period_s,
+        limits=limits_of(plan),
+        force=scene.task.force_n,
+        approaches=planned_approaches(scene.task),
+        ball=ball,
+        clearance=scene.task.clearance_mm * 1e-3,
+        search=scene.task.search_mm * 1e-3,
+        approach_speed=scene.task.approach_mm_s * 1e-3,
+        lead_s=_lead_s(scene, period_s),
+    )
+    return CalibrateTask(settings, sensing, _motion(scene, sensing, period_s))
+
+
+def _lead_s(scene: Scene, period_s: float) -> float:
+    """From a SYNC to the moment its command has taken effect, s."""
+    return CYCLES_TO_EFFECT * period_s + (scene.servo or ServoSettings()).drive_lag_ms * 1e-3
 
 
 def make_sensing(scene: Scene) -> ContactSensing:
@@ -85,7 +125,7 @@ def _settings(scene: Scene, period_s: float, limits: Limits) -> TouchSettings:
         approach_speed=task.approach_mm_s * 1e-3,
         clearance=task.clearance_mm * 1e-3,
         search=task.search_mm * 1e-3,
-        lead_s=CYCLES_TO_EFFECT * period_s + servo.drive_lag_ms * 1e-3,
+        lead_s=_lead_s(scene, period_s),
         gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
     )
 
@@ -140,22 +180,20 @@ def samples_between_estimates(scene: Scene) -> int:
     return max(1, round(scene.shape.every_ms * 1e-3 * scene.sensor.rate_hz))
 
 
-def make_shape_tracker(scene: Scene, gap_s: float = math.inf) -> ShapeTracker | None:
+def make_shape_tracker(scene: Scene) -> ShapeTracker | None:
     """The estimator of a scene that asks for a shape, None of one that does not."""
     if scene.shape is None or scene.task.kind != "scan":
         return None
-    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene), gap_s)
+    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene))
 
 
-def estimates_of(
-    scene: Scene, tracker: ShapeTracker, methods: Iterable[str], gap_s: float = math.inf
-) -> dict[str, list[ShapeRecord]]:
+def estimates_of(scene: Scene, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
     """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
     assert scene.shape is not None and scene.sensor is not None
     every = max(1, round(0.1 * scene.sensor.rate_hz))
     return {
         method: tracker.records
         if method == scene.shape.method
-        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every, gap_s)
+        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every)
         for method in dict.fromkeys(methods)
     }

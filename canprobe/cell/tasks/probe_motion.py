@@ -145,17 +145,20 @@ class LineMotion:
         end: pose to reach.
         speed: mean speed, m/s.
         angular_speed: mean angular speed of the pole, rad/s.
+        at_once: leave with twice the mean speed, which then falls to zero: to let go of what is pressed.
     """
 
-    def __init__(self, start: ProbePose, end: ProbePose, speed: float, angular_speed: float = 0.5) -> None:
-        self._start, self._end = start, end
+    def __init__(
+        self, start: ProbePose, end: ProbePose, speed: float, angular_speed: float = 0.5, *, at_once: bool = False
+    ) -> None:
+        self._start, self._end, self._at_once = start, end, at_once
         distance = float(np.linalg.norm(end.centre - start.centre))
         angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
         self.duration = max(distance / speed, angle / angular_speed, 0.05)
 
     def at(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the start; the end pose afterwards."""
-        share = smooth_step(t / self.duration)
+        share = smooth_step(t / self.duration) if not self._at_once else 1.0 - max(1.0 - t / self.duration, 0.0) ** 2
         pole = self._start.pole + share * (self._end.pole - self._start.pole)
         return ProbePose(
             self._start.centre + share * (self._end.centre - self._start.centre), pole / math.sqrt(float(pole @ pole))

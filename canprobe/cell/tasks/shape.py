@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -15,6 +14,8 @@ if TYPE_CHECKING:
     from canprobe.touch.estimators import Estimator
 
 
+GAP_S = 0.1
+"""Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
 """1/m; no pad feels a ball of 1 mm, so an answer beyond it has diverged."""
 
@@ -37,11 +38,13 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
+    A contact is taken and an answer worked out by calls of their own: together they take longer than either, and the
+    loop has a cycle between two images for the answer.
+
     Args:
         estimator: the online estimator.
         every: samples between two answers.
-        gap_s: time without a contact after which the estimator starts afresh; by default it never does, as a loop
-            that loses contact is at its end.
+        gap_s: time without a contact after which the estimator starts afresh.
 
     Attributes:
         records: every answer.
@@ -50,7 +53,7 @@ class ShapeTracker:
         restarts: how often the estimator diverged and started afresh.
     """
 
-    def __init__(self, estimator: Estimator, every: int, gap_s: float = math.inf) -> None:
+    def __init__(self, estimator: Estimator, every: int, gap_s: float = GAP_S) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
@@ -59,9 +62,10 @@ class ShapeTracker:
         self._every = max(1, every)
         self._gap_s = gap_s
         self._last: ContactSample | None = None
+        self._due = False
 
-    def add(self, sample: ContactSample) -> SurfaceEstimate | None:
-        """Take one contact; the new estimate where one was due and can be given."""
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
         if self._last is not None:
             if sample.t_s - self._last.t_s > self._gap_s:
                 self._estimator.reset()
@@ -70,15 +74,20 @@ class ShapeTracker:
         self._last = sample
         self.samples.append(sample)
         self._estimator.add(sample)
-        if len(self.samples) % self._every:
+        self._due = len(self.samples) % self._every == 0
+
+    def answer(self) -> SurfaceEstimate | None:
+        """The estimate at the last contact, once, where one is due and can be given."""
+        if not self._due or self._last is None:
             return None
+        self._due = False
         estimate = self._estimator.estimate()
         if estimate is not None and has_diverged(estimate):
             self.restarts += 1
             self._estimator.reset()
             return None
         if estimate is not None:
-            self.records.append(ShapeRecord(sample.t_s, self.travelled_m, estimate))
+            self.records.append(ShapeRecord(self._last.t_s, self.travelled_m, estimate))
         return estimate
 
 
@@ -89,11 +98,10 @@ def has_diverged(estimate: SurfaceEstimate) -> bool:
     return not (finite and bool((np.abs(known) < SHARPEST).all()))
 
 
-def replay_samples(
-    estimator: Estimator, samples: Sequence[ContactSample], every: int, gap_s: float = math.inf
-) -> list[ShapeRecord]:
+def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every: int) -> list[ShapeRecord]:
     """Feed recorded contacts to another estimator, as the loop would have."""
-    tracker = ShapeTracker(estimator, every, gap_s)
+    tracker = ShapeTracker(estimator, every)
     for sample in samples:
         tracker.add(sample)
+        tracker.answer()
     return tracker.records

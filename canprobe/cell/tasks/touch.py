@@ -1,4 +1,4 @@
-"""The touch tasks: approach, settle, scan or hold, retreat."""
+"""The touch tasks: approach, settle, scan or hold, regain a lost contact, retreat."""
 
 from __future__ import annotations
 
@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.measurement import Command, Measurement
-from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervision import Contact, Limits, Reaction
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
+from canprobe.cell.tasks.regain import REST_S, SPEED, Loss, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.touch.at_rest import AtRest
@@ -36,12 +38,14 @@ LONGEST_STEP = 4
 
 AT_REST = 0.7
 """Share of the settling time after which nothing is asked to change any more."""
+LOST = 0.1
+"""Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
 TOUCH_FORCE = 0.15
 """N; contact is made above it."""
 
 
 class Phase(IntEnum):
-    """Phases of a touch task, in their order."""
+    """Phases of a touch task, in their order; a scan that loses its contact goes to and fro between it and REGAIN."""
 
     MOVE = 0
     APPROACH = 1
@@ -49,6 +53,10 @@ class Phase(IntEnum):
     SCAN = 3
     RETREAT = 4
     DONE = 5
+    REGAIN = 6
+
+
+_LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +67,7 @@ class TouchSettings:
         period_s: of the cycle.
         limits: of the cell; beyond them the probe retreats and the cell stops.
         target_force: N.
-        touch_force: N; contact is made above it, lost below half of it.
+        touch_force: N; contact is made above it, lost below half of it or a tenth of the target.
         approach_speed, retreat_speed: m/s.
         start: expected contact point (3,), m, base frame.
         axes: (3, 3) rows heading, across, approach normal (outward), base frame.
@@ -132,6 +140,12 @@ class TouchTask:
         self._sample_t: float | None = None
         self._force = 0.0
         self._lost = 0.0
+        self._hidden = HiddenForce()
+        self.losses: list[Loss] = []
+        self._search: Search | None = None
+        self._asked: ProbePose | None = None
+        self._velocity: Vector = np.zeros(3)
+        self._scan_t = self._searched_before = self._floor = 0.0
         self._contact: ContactSample | None = None
         self._depth0 = 0.0
         self._push = PushFit()
@@ -171,7 +185,7 @@ class TouchTask:
 
     def stop(self) -> None:
         """Let go and be done, from whatever phase."""
-        if self._motion is not None and self.phase < Phase.RETREAT:
+        if self._motion is not None and self.phase not in _LEAVING:
             self._leave(None)
 
     def step(self, measurement: Measurement) -> Command:
@@ -181,12 +195,14 @@ class TouchTask:
             self._motion = self._motion_from(measurement.q)
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
-        self._estimate = None
         self._pass_time(measurement.t_ns)
+        self._take_answer()
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
         self._t += self._dt
+        if self.phase in (Phase.SCAN, Phase.REGAIN):
+            self._scan_t += self._dt
         target = self._motion.step(pose)
         if self._motion.limit is not None:
             self.retreat(self._motion.limit)
@@ -212,6 +228,8 @@ class TouchTask:
         if patch is None or measurement.tactile is None:
             return
         self._force = patch.force
+        felt = not patch.saturated or self._push.certain(CERTAIN)
+        self._hidden.add(not felt, measurement.tactile.t_sample_ns)
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
@@ -229,7 +247,7 @@ class TouchTask:
                 if self._t > AT_REST * self._s.settle_s:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
-                self._take_shape(contact)
+                self.shape.add(contact)
         self._columns = self._columns_of(measurement, patch, contact) | {"depth_at_1n_mm": depth_at_1n_mm}
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
@@ -247,10 +265,11 @@ class TouchTask:
             self._servo.surface.raise_by(rise)
             self._depth0 += rise
 
-    def _take_shape(self, contact: ContactSample) -> None:
-        assert self.shape is not None and self._servo is not None
-        estimate = self._estimate = self.shape.add(contact)
-        if estimate is None:
+    def _take_answer(self) -> None:
+        """What the estimator says about the contact of the cycle before."""
+        estimate = self._estimate = self.shape.answer() if self.shape is not None else None
+        contact = self._contact
+        if estimate is None or contact is None or self._servo is None:
             return
         self._shape_columns = {
             "kappa_per_m": np.where(estimate.observed, estimate.kappa, np.nan),
@@ -258,6 +277,7 @@ class TouchTask:
             "K_per_m": estimate.K,
             "K_covariance_per_m2": estimate.covariance,
         }
+        self._columns = self._columns | self._shape_columns
         if bool(np.all(estimate.observed)):
             self._servo.surface.set_curvature(estimate.curvature_tensor_base())
             before = self.sensing.depth(contact.force_n)
@@ -265,7 +285,7 @@ class TouchTask:
             self.sensing.set_kappa(np.asarray(estimate.kappa), sigma)
             # the depth that is aimed at has changed as much: without this the force would jump with the first answer
             self._servo.surface.raise_by(self.sensing.depth(contact.force_n) - before)
-            if is_too_hollow(estimate, self.sensing.radius):
+            if self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
                 hollow = -1e3 / float(estimate.kappa[1])
                 self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
 
@@ -286,28 +306,48 @@ class TouchTask:
         }
 
     def _watch(self, measurement: Measurement) -> None:
-        if self.phase >= Phase.RETREAT:
+        if self.phase in _LEAVING:
             return
-        touching = self.phase in (Phase.SETTLE, Phase.SCAN) and self._force < self._s.touch_force / 2
-        self._lost = self._lost + self._dt if touching else 0.0
-        finding = touch_finding(Contact(self._s.limits, self._force, measurement.tactile_age, self._lost))
-        if finding is not None:
+        self._lost = self._lost + self._dt if self._force < self._least_force() else 0.0
+        finding = touch_finding(
+            Contact(
+                self._s.limits,
+                self._force,
+                measurement.tactile_age,
+                self._lost,
+                hidden_s=self._hidden.hidden_s,
+                path=self._s.speed > 0 and self._scan_start is not None,
+                searched=self.losses[-1].searched if self._search is not None else 0.0,
+            )
+        )
+        if finding is None:
+            return
+        if finding.condition.reaction is Reaction.SEARCH:
+            self._look_for_contact()
+        else:
             self._leave(str(finding.error))
+
+    def _least_force(self) -> float:
+        """The force below which the contact is lost, N; an array that has let go shows a tenth of it for a while."""
+        if self.phase is Phase.SCAN:
+            return max(self._s.touch_force / 2, LOST * self._s.target_force)
+        resting = self.phase is Phase.SETTLE or (self.phase is Phase.REGAIN and self._search is None)
+        return self._s.touch_force / 2 if resting else 0.0
 
     def retreat(self, reason: str) -> None:
         """Let go for a reason that the cell has; nothing changes where the task is letting go already."""
-        if self.phase < Phase.RETREAT and self._motion is not None:
+        if self.phase not in _LEAVING and self._motion is not None:
             self._leave(reason)
 
     def _leave(self, reason: str | None) -> None:
         """Go to the retreat, for ``reason`` or because the work is done."""
         assert self._motion is not None
-        if self.phase is Phase.SCAN:
+        if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
         self.reason = reason
         pose = self._motion.pose
         away = ProbePose(pose.centre - pose.pole * self._s.retreat, pose.pole)
-        self._line = LineMotion(pose, away, self._s.retreat_speed)
+        self._line = LineMotion(pose, away, self._s.retreat_speed, at_once=True)
         self._enter(Phase.RETREAT)
 
     def _enter(self, phase: Phase) -> None:
@@ -346,34 +386,75 @@ class TouchTask:
             probe_radius=self.sensing.radius,
             rolling_share=self._s.rolling_share,
         )
+        self._sink_from(contact, pose)
+        self._enter(Phase.SETTLE)
+
+    def _sink_from(self, contact: ContactSample, pose: ProbePose) -> None:
+        """Remember how deep and with which pole the probe touches, to go on from there without a bump."""
         self._depth0 = self.sensing.radius - float(contact.n_base @ (pose.centre - contact.p_base))
         self._pole0 = pose.pole
-        self._enter(Phase.SETTLE)
+
+    def _sink(self, share: float) -> ProbePose:
+        """At rest on the surface, with a share of the way from the first touch to the wanted force gone."""
+        assert self._servo is not None
+        depth = self._depth0 + share * (self._target_depth() - self._depth0)
+        pose = self._servo.step(0.0, depth, self._dt)
+        pole = self._pole0 + share * (pose.pole - self._pole0)
+        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 
     def _target_depth(self) -> float:
         return self.sensing.depth(self._s.target_force)
 
     def _settle(self) -> ProbePose:
-        assert self._servo is not None
-        share = smooth_step(self._t / (0.6 * self._s.settle_s))
-        depth = self._depth0 + share * (self._target_depth() - self._depth0)
-        pose = self._servo.step(0.0, depth, self._dt)
+        pose = self._sink(smooth_step(self._t / (0.6 * self._s.settle_s)))
         if self._t >= self._s.settle_s:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle
             doubt = self._at_rest.doubt(self._s.target_force, self._push.certain(CERTAIN))
             if doubt is not None:
                 self._leave(doubt)
-        pole = self._pole0 + share * (pose.pole - self._pole0)
-        return ProbePose(pose.centre, pole / np.linalg.norm(pole))
+        return pose
 
     def _scan(self) -> ProbePose:
         assert self._servo is not None
-        left = self._s.duration_s - self._t
+        left = self._s.duration_s - self._scan_t
         share = min(1.0, self._t / self._s.ramp_s, max(left, 0.0) / self._s.ramp_s)
         pose = self._servo.step(self._s.speed * share, self._target_depth(), self._dt)
+        if self._asked is not None:
+            self._velocity = (pose.centre - self._asked.centre) / self._dt
+        self._asked = pose
         if left <= 0:
             self._leave(None)
+        return pose
+
+    def _look_for_contact(self) -> None:
+        """Leave the path for where the object should be."""
+        assert self._motion is not None
+        if self.phase is Phase.SCAN:
+            self.losses.append(Loss(self._cycle))
+        self._search = Search(self._motion.pose, self._velocity)
+        self._floor = self._force
+        self._asked, self._velocity = None, np.zeros(3)
+        self._searched_before = self.losses[-1].searched
+        self._lost = 0.0
+        self._enter(Phase.REGAIN)
+
+    def _regain(self) -> ProbePose:
+        assert self._servo is not None
+        if self._scan_t >= self._s.duration_s:
+            self._leave(None)
+        if self._search is None:
+            if self._t >= REST_S:
+                self._enter(Phase.SCAN)
+            return self._sink(smooth_step(self._t / (0.6 * REST_S)))
+        pose, loss = self._search.pose(self._t), self.losses[-1]
+        loss.searched = self._searched_before + SPEED * self._t
+        if self._contact is not None and self._force > self._s.touch_force + self._floor:
+            loss.regained_s = (self._cycle - loss.cycle) * self._s.period_s
+            self._servo.rest_on(self._contact.p_base, self._contact.n_base)
+            self._sink_from(self._contact, pose)
+            self._search = None
+            self._enter(Phase.REGAIN)
         return pose
 
     def _retreat(self) -> ProbePose:
@@ -395,4 +476,5 @@ _STEPS: dict[Phase, Callable[[TouchTask], ProbePose]] = {
     Phase.SCAN: TouchTask._scan,
     Phase.RETREAT: TouchTask._retreat,
     Phase.DONE: TouchTask._done,
+    Phase.REGAIN: TouchTask._regain,
 }

@@ -199,7 +199,9 @@ def sensor(connect: Any, plant: Any) -> Bench:
 
 # ---------------------------------------------------------------------- the table at the end
 
-_NAME = re.compile(r"::test_(?:cia301|cia402|sensor)(?:_[a-z]+)*?((?:_\d\d)+)(?![^_\[])[^\[]*(?:\[(lockstep|vcan)\b)?")
+_NAME = re.compile(
+    r"::test_(?:cia301|cia305|cia402|sensor)(?:_[a-z]+)*?((?:_\d\d)+)(?![^_\[])[^\[]*(?:\[(lockstep|vcan)\b)?"
+)
 _HERE = "/conformance/"
 
 

@@ -1,0 +1,118 @@
+"""How a SocketCAN interface is set: what `ip -details -statistics -json link show` tells of it.
+
+Drivers and versions of iproute2 leave things out, and write numbers as texts: what is not there is None.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from dataclasses import dataclass
+from typing import Any
+
+VIRTUAL = ("vcan", "vxcan")
+_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class LinkState:
+    """One interface.
+
+    Attributes:
+        name: such as `can0`.
+        kind: `can` for hardware, `vcan` or `vxcan`; None where the driver does not tell.
+        is_up: it is there and switched on.
+        tx_queue: frames that the kernel queues (txqueuelen).
+        bitrate, data_bitrate: bit/s; the second of CAN FD.
+        sample_point: share of the bit, 0 to 1.
+        restart_ms: after which a bus-off is left by itself; 0 never.
+        state: of the controller, such as `ERROR-ACTIVE`.
+        tx_errors, rx_errors: the controller's error counters.
+        modes: such as `LISTEN-ONLY`, `FD`.
+        bus_errors, bus_offs: counted since the interface was made.
+    """
+
+    name: str
+    kind: str | None = None
+    is_up: bool = True
+    tx_queue: int | None = None
+    bitrate: int | None = None
+    data_bitrate: int | None = None
+    sample_point: float | None = None
+    restart_ms: int | None = None
+    state: str | None = None
+    tx_errors: int | None = None
+    rx_errors: int | None = None
+    modes: tuple[str, ...] = ()
+    bus_errors: int | None = None
+    bus_offs: int | None = None
+
+
+def parse_link(text: str) -> LinkState:
+    """Read the JSON of one link.
+
+    Raises:
+        ValueError: it is not that.
+    """
+    links = json.loads(text)
+    found = [link for link in links if isinstance(link, dict) and link.get("ifname")] if isinstance(links, list) else []
+    if len(found) != 1:
+        raise ValueError(f"expected the JSON of one link, got {len(found)}")
+    link = found[0]
+    info = _table(link, "linkinfo")
+    data, counted = _table(info, "info_data"), _table(info, "info_xstats")
+    nominal, fast, errors = (_table(data, key) for key in ("bittiming", "data_bittiming", "berr_counter"))
+    kind, state = info.get("info_kind"), data.get("state")
+    return LinkState(
+        name=str(link["ifname"]),
+        kind=kind if isinstance(kind, str) else None,
+        is_up="UP" in _list(link, "flags"),
+        tx_queue=_whole(link, "txqlen"),
+        bitrate=_whole(nominal, "bitrate") or _whole(data, "bittiming_bitrate") or None,
+        data_bitrate=_whole(fast, "bitrate") or None,
+        sample_point=_number(nominal, "sample_point") or None,
+        restart_ms=_whole(data, "restart_ms"),
+        state=state if isinstance(state, str) else None,
+        tx_errors=_whole(errors, "tx"),
+        rx_errors=_whole(errors, "rx"),
+        modes=tuple(str(mode) for mode in _list(data, "ctrlmode")),
+        bus_errors=_whole(counted, "bus_error"),
+        bus_offs=_whole(counted, "bus_off"),
+    )
+
+
+def read_link(name: str) -> LinkState | None:
+    """Ask `ip` about an interface; None where there is no `ip`, or it says nothing that can be read."""
+    command = ["ip", "-details", "-statistics", "-json", "link", "show", "dev", name]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    if "does not exist" in done.stderr:
+        return LinkState(name, is_up=False)
+    try:
+        return parse_link(done.stdout)
+    except ValueError:
+        return None
+
+
+def _table(parent: dict[str, Any], key: str) -> dict[str, Any]:
+    value = parent.get(key)
+    return value if isinstance(value, dict) else {}
+
+
+def _list(parent: dict[str, Any], key: str) -> list[Any]:
+    value = parent.get(key)
+    return value if isinstance(value, list) else []
+
+
+def _number(parent: dict[str, Any], key: str) -> float | None:
+    try:
+        return float(parent[key])
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _whole(parent: dict[str, Any], key: str) -> int | None:
+    number = _number(parent, key)
+    return None if number is None else round(number)

@@ -1,0 +1,102 @@
+"""What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.port import Port
+from canprobe.cell.lss import assign, find_unconfigured
+from canprobe.cell.lss_choice import Assignment, Wanted, choose_assignments
+from canprobe.cell.scan import NUMBERS, scan_nodes
+from canprobe.errors import BusError
+from canprobe.planning import Plan
+from canprobe.protocol.lss import LssAddress
+
+
+@dataclass(frozen=True, slots=True)
+class Commissioned:
+    """What was found and done.
+
+    Attributes:
+        nodes: those with an id, as `scan_nodes` tells them, at the end.
+        unconfigured: devices that still have none.
+        assigned: devices that got an id, and whether each keeps it when its power goes.
+    """
+
+    nodes: list[dict[str, Any]]
+    unconfigured: list[LssAddress]
+    assigned: list[tuple[Assignment, bool]]
+
+    def as_document(self) -> dict[str, Any]:
+        """For JSON."""
+        return {
+            "nodes": self.nodes,
+            "unconfigured": [_numbers(address) for address in self.unconfigured],
+            "assigned": [
+                {"node_id": one.node_id, "before": one.before, "stored": stored, **_numbers(one.address)}
+                for one, stored in self.assigned
+            ],
+        }
+
+
+def commission(
+    port: Port, wanted: Sequence[Wanted], *, must: bool, store: bool = True, timeout_s: float = 0.2
+) -> Commissioned:
+    """Find the nodes without an id and give those that are wanted theirs.
+
+    Args:
+        port: the bus.
+        wanted: which ids are to be given to whom; none only looks.
+        must: each of them needs its device; False: as far as there is one.
+        store: let the devices keep their ids when their power goes.
+        timeout_s: for an SDO answer.
+
+    Raises:
+        BusError: nobody without an id is there though ids are wanted, or it is not clear who is meant; nothing was
+            changed.
+        NodeError: one device did not take its id; those before it have theirs.
+        InterfaceError: the interface failed.
+    """
+    nodes = scan_nodes(port, timeout_s)
+    network = PumpedNetwork(port)
+    unconfigured = find_unconfigured(network)
+    present = {int(node["node_id"]): _address(node) for node in nodes}
+    chosen = choose_assignments(wanted, unconfigured, present, channel=port.channel, must=must)
+    if wanted and not must:
+        _check_all_placed(unconfigured, chosen, wanted, port.channel)
+    assigned = [(one, assign(network, one, store=store)) for one in chosen]
+    if assigned:
+        nodes = scan_nodes(port, timeout_s)
+    gone = {one.address for one in chosen}
+    return Commissioned(nodes, [address for address in unconfigured if address not in gone], assigned)
+
+
+def wanted_by(plan: Plan) -> list[Wanted]:
+    """The nodes of a scene: ids, and identities from their EDS files and the scene's serial numbers."""
+    return [Wanted(node.node_id, node.role, node.identity.numbers) for node in plan.nodes]
+
+
+def _check_all_placed(
+    unconfigured: Sequence[LssAddress], chosen: Sequence[Assignment], wanted: Sequence[Wanted], channel: str
+) -> None:
+    if not unconfigured and not chosen:
+        raise BusError(f"no node without an id answers on {channel}; check power, bit rate and termination")
+    if strangers := sorted(set(unconfigured) - {one.address for one in chosen}):
+        ids = ", ".join(f"{want.node_id} ({want.name})" for want in wanted)
+        raise BusError(
+            f"the device {strangers[0]} (vendor:product:revision:serial) on {channel} has no id, and is none of the"
+            f" scene's nodes that are missing, of {ids}; name it, as in --assign"
+            f" {strangers[0].serial_number:#x}=ID"
+        )
+
+
+def _address(node: dict[str, Any]) -> LssAddress | None:
+    numbers = [node[name] for name in NUMBERS]
+    return None if None in numbers else LssAddress(*numbers)
+
+
+def _numbers(address: LssAddress) -> dict[str, int]:
+    return dict(zip(NUMBERS, address.numbers, strict=True))

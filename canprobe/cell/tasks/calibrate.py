@@ -1,0 +1,265 @@
+"""Find the probe's centre on the flange: touch a ball of known radius from several sides, gently, and let go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.hidden_force import HiddenForce
+from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervisor import touch_finding
+from canprobe.cell.tasks.ball_motion import ArcMotion
+from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.touch import TOUCH_FORCE, Phase
+from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.servo import ProbePose
+
+Vector = NDArray[np.float64]
+PRESS_SPEED = 0.8e-3
+"""m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
+SETTLE_S = 0.15
+LISTEN_S = 0.25
+"""At rest before samples count, and while they do."""
+MOVE_SPEED = 40e-3
+RETREAT_SPEED = 20e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibrationSettings:
+    """What a calibration does, in SI units.
+
+    Attributes:
+        period_s: of the cycle.
+        limits: of the cell.
+        force: at which the probe rests, N.
+        approaches: the touches.
+        ball: what is known of ball and tool.
+        clearance: above the ball before each approach, m.
+        search: beyond the ball's expected surface where an approach gives up, m.
+        approach_speed: m/s.
+        lead_s: from a SYNC to the moment its command has taken effect.
+    """
+
+    period_s: float
+    limits: Limits
+    force: float
+    approaches: Sequence[BallApproach]
+    ball: BallModel
+    clearance: float
+    search: float
+    approach_speed: float
+    lead_s: float
+
+
+class CalibrateTask:
+    """Touch after touch; the estimate in the end.
+
+    Args:
+        settings: what to do.
+        sensing: contacts from measurements; knows the ball's curvature.
+        motion_from: makes the probe's motion from the first joint angles.
+
+    Attributes:
+        touches: what was felt so far.
+        estimate: of the tool; None before the end, or with too few touches.
+    """
+
+    def __init__(
+        self, settings: CalibrationSettings, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]
+    ) -> None:
+        self.phase = Phase.MOVE
+        self.touches: list[BallTouch] = []
+        self.estimate: ToolEstimate | None = None
+        self.reason: str | None = None
+        self.taxels: NDArray[np.uint8] | None = None
+        self.sensing = sensing
+        self._s = settings
+        self._motion_from = motion_from
+        self._motion: ProbeMotion | None = None
+        self._line: LineMotion | ArcMotion | None = None
+        self._t = 0.0
+        self._number = 0
+        self._force = 0.0
+        self._hidden = HiddenForce()
+        self._gone = 0.0
+        self._felt: list[ContactSample] = []
+        self._columns: dict[str, float | Vector] = {}
+
+    @property
+    def unplaced(self) -> int:
+        """Contacts that were not used because the joints of their instant are unknown."""
+        return self.sensing.dropped
+
+    @property
+    def slowed(self) -> int:
+        """Cycles in which a joint could not keep up with the probe's path."""
+        return self._motion.slowed if self._motion is not None else 0
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        if self._motion is None:
+            assert measurement.q is not None
+            self._motion = self._motion_from(measurement.q)
+            self._move_on()
+        self._sense(measurement)
+        self._watch(measurement)
+        pose = _STEPS[self.phase](self)
+        self._t += self._s.period_s
+        target = self._motion.step(pose)
+        if self._motion.limit is not None:
+            self.retreat(self._motion.limit)
+        self._columns["phase"] = float(self.phase)
+        done = self.phase is Phase.DONE
+        return Command(
+            q_target=target,
+            done=done and self.reason is None,
+            stop_reason=self.reason if done else None,
+            columns=self._columns,
+        )
+
+    def retreat(self, reason: str) -> None:
+        """Let go and end for a reason that the cell has."""
+        if self.reason is None and self.phase is not Phase.DONE and self._motion is not None:
+            self.reason = reason
+            self._let_go()
+
+    def stop(self) -> None:
+        """Let go, and estimate from what was felt so far."""
+        self._number = len(self._s.approaches)
+        if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
+            self._let_go()
+
+    # sensing and supervision
+
+    def _sense(self, measurement: Measurement) -> None:
+        patch = self.sensing.step(measurement)
+        if patch is None or measurement.tactile is None:
+            return
+        self._force = patch.force
+        self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
+        contact = self.sensing.contact(measurement.tactile, patch) if patch.force > TOUCH_FORCE / 2 else None
+        if self.phase is Phase.SCAN:
+            self.taxels = measurement.tactile.frame.taxels
+            if contact is not None and self._t > SETTLE_S:
+                self._felt.append(contact)
+        nothing = np.full(3, np.nan)
+        self._columns = {
+            "phase": float(self.phase),
+            "sample_cycle": float(measurement.tactile.cycle),
+            "force_n": patch.force,
+            "pad_u_mm": patch.u * 1e3,
+            "pad_v_mm": patch.v * 1e3,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
+            "normal": contact.n_base if contact is not None else nothing,
+            "touch": float(self._number + 1),
+        }
+
+    def _watch(self, measurement: Measurement) -> None:
+        if self.reason is not None or self.phase is Phase.DONE:
+            return
+        hidden = self._hidden.hidden_s
+        finding = touch_finding(Contact(self._s.limits, self._force, measurement.tactile_age, hidden_s=hidden))
+        if finding is not None:
+            self.retreat(str(finding.error))
+
+    # phases: each returns the pose for this cycle
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase, self._t = phase, 0.0
+
+    def _at(self, gap: float) -> ProbePose:
+        """Probe at a distance from the expected ball, with this touch's direction and pole."""
+        touch = self._s.approaches[self._number]
+        return ProbePose(self._s.ball.c_base + (self._s.ball.radii + gap) * touch.n_base, touch.pole_base)
+
+    def _move_on(self) -> None:
+        """To the next touch, round the ball; or to the end."""
+        assert self._motion is not None
+        if self.reason is not None or self._number >= len(self._s.approaches):
+            if self.reason is None and len(self.touches) >= 2:
+                self.estimate = calibrate_tool(self.touches, self._s.ball)
+            return self._enter(Phase.DONE)
+        self._line = ArcMotion(self._s.ball.c_base, self._motion.pose, self._at(self._s.clearance), MOVE_SPEED)
+        self._enter(Phase.MOVE)
+
+    def _move(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._s.lead_s + 0.1:
+            self._enter(Phase.APPROACH)
+        return pose
+
+    def _approach(self) -> ProbePose:
+        self._gone = self._s.approach_speed * self._t - self._s.clearance
+        if self._force > TOUCH_FORCE:
+            self._enter(Phase.SETTLE)
+        elif self._gone > self._s.search:
+            self.retreat(
+                f"touch {self._number + 1}: no ball found up to {self._s.search * 1e3:.0f} mm beyond the expected place"
+            )
+        return self._at(-self._gone)
+
+    def _settle(self) -> ProbePose:
+        """On, slowly, until the force is there."""
+        if self._force >= self._s.force:
+            self._felt = []
+            self._enter(Phase.SCAN)
+        elif self._gone > self._s.search:
+            self.retreat(f"touch {self._number + 1}: {self._s.force:g} N are not reached where the ball is expected")
+        else:
+            self._gone += PRESS_SPEED * self._s.period_s
+        return self._at(-self._gone)
+
+    def _listen(self) -> ProbePose:
+        if self._t >= SETTLE_S + LISTEN_S:
+            if self._felt:
+                self.touches.append(self._touch(self._felt))
+                self._number += 1
+                self._let_go()
+            else:
+                self.retreat(f"touch {self._number + 1}: no tactile sample while it rested")
+        return self._at(-self._gone) if self.phase is Phase.SCAN else self._retreat()
+
+    def _touch(self, felt: Sequence[ContactSample]) -> BallTouch:
+        """Mean of the samples of a touch at rest."""
+        n = np.mean([contact.n_base for contact in felt], axis=0)
+        depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
+        T_base_probe = felt[len(felt) // 2].T_base_probe.copy()
+        T_base_probe[:3, 3] = np.mean([contact.T_base_probe[:3, 3] for contact in felt], axis=0)
+        T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
+        return BallTouch(T_base_flange, -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n)), depth)
+
+    def _let_go(self) -> None:
+        assert self._motion is not None
+        pose = self._motion.pose
+        n = pose.centre - self._s.ball.c_base
+        away = ProbePose(pose.centre + n / np.linalg.norm(n) * (self._s.clearance + 2e-3), pose.pole)
+        self._line = LineMotion(pose, away, RETREAT_SPEED, at_once=True)
+        self._enter(Phase.RETREAT)
+
+    def _retreat(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._s.lead_s:
+            self._move_on()
+        return pose
+
+    def _done(self) -> ProbePose:
+        assert self._motion is not None
+        return self._motion.pose
+
+
+_STEPS: dict[Phase, Callable[[CalibrateTask], ProbePose]] = {
+    Phase.MOVE: CalibrateTask._move,
+    Phase.APPROACH: CalibrateTask._approach,
+    Phase.SETTLE: CalibrateTask._settle,
+    Phase.SCAN: CalibrateTask._listen,
+    Phase.RETREAT: CalibrateTask._retreat,
+    Phase.DONE: CalibrateTask._done,
+}

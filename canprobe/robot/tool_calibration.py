@@ -1,0 +1,247 @@
+"""Where the probe's centre really is in the flange frame: from touches of a ball, in several orientations.
+
+Each touch says where the ball's centre must be: ``p + R (t + (r + ρ − δ) E d) = c`` with the flange at ``p, R``, the
+tool centre ``t``, the direction ``d`` in which the probe feels the ball, the sum ``r`` of both radii, the indentation
+``δ``, the ball's centre ``c``, an error ``ρ`` of the radii and a tilt ``E`` of the array on the probe. Along ``d`` this
+is known to a few hundredths of a millimetre, across it as well as the array tells directions. Least squares over all of
+it by Gauss-Newton; ``t`` has no prior, so what the touches do not tell about it is said to be unobserved.
+
+A tilt of the array and a sideways offset of the tool look alike where the pole is always turned to the ball: touches
+beside the pole tell them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import UsageError
+
+Array = NDArray[np.float64]
+LENGTH = 1e-3
+ANGLE = 1e-2
+_SCALE = np.array([LENGTH] * 7 + [ANGLE] * 2)
+"""Of the unknowns: tool centre, ball centre, radii, tilt. The condition number is of the problem in these units."""
+GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+"""rad."""
+_ROUNDS = 20
+_T, _C, _RHO, _TILT = slice(0, 3), slice(3, 6), 6, slice(7, 9)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallTouch:
+    """One touch at rest.
+
+    Attributes:
+        T_base_flange: (4, 4) the flange, m.
+        d_flange: (3,) unit vector from the probe's centre to the ball, as the array tells it, flange frame.
+        depth: indentation of the layer, m.
+    """
+
+    T_base_flange: Array
+    d_flange: Array
+    depth: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallModel:
+    """What is known before the touches: values and standard deviations.
+
+    Attributes:
+        t_flange: (3,) tool centre that is believed, m: where the search begins, no prior.
+        c_base: (3,) centre of the ball, m.
+        radii: sum of the radii of probe and ball, m.
+        sigma_c: of the ball's centre per axis, m.
+        sigma_radii: of the sum of the radii with the indentation, m.
+        sigma_tilt: of the array's orientation on the flange, rad.
+        sigma_along: of one touch along the direction of the touch, m.
+        sigma_across: and across it, m.
+        observed_below: standard deviation of a coordinate of the tool centre below which it counts as observed, m.
+    """
+
+    t_flange: Array
+    c_base: Array
+    radii: float
+    sigma_c: float = 5e-3
+    sigma_radii: float = 50e-6
+    sigma_tilt: float = 5e-3
+    sigma_along: float = 20e-6
+    sigma_across: float = 0.1e-3
+    observed_below: float = 0.25e-3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ToolEstimate:
+    """What the touches tell.
+
+    Attributes:
+        t_flange: (3,) tool centre, m, flange frame; NaN where not observed.
+        covariance: (3, 3) of it, m²; infinite where nothing is known.
+        observed: (3,) whether, of each coordinate.
+        c_base: (3,) centre of the ball, m.
+        radii_error: of the sum of the radii, m.
+        tilt: (2,) of the array about the flange's x and y, rad.
+        condition_number: of the whole problem, priors included, in units of `LENGTH` and `ANGLE`.
+        along_rms, across_rms: residuals, m.
+        chi2_per_dof: sum of squared residuals over their expectation; None without more rows than unknowns.
+        touches: how many.
+    """
+
+    t_flange: Array
+    covariance: Array
+    observed: NDArray[np.bool_]
+    c_base: Array
+    radii_error: float
+    tilt: Array
+    condition_number: float
+    along_rms: float
+    across_rms: float
+    chi2_per_dof: float | None
+    touches: int
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation of each coordinate (3,), m."""
+        sigma: Array = np.sqrt(np.diag(self.covariance))
+        return sigma
+
+
+def calibrate_tool(touches: Sequence[BallTouch], model: BallModel) -> ToolEstimate:
+    """Estimate the tool centre.
+
+    Args:
+        touches: of one ball, at least two.
+        model: what is known of it.
+
+    Raises:
+        UsageError: fewer than two touches, or one that is not finite.
+    """
+    if len(touches) < 2:
+        raise UsageError(f"touches: expected 2 or more, got {len(touches)}: one tells where the ball is, no more")
+    for number, touch in enumerate(touches, start=1):
+        if not (np.isfinite(touch.T_base_flange).all() and np.isfinite(touch.d_flange).all()):
+            raise UsageError(f"touches: touch {number} is not finite")
+    x0 = np.concatenate([model.t_flange, model.c_base, np.zeros(3)])
+    x = x0.copy()
+    for _ in range(_ROUNDS):
+        r, J = _rows(touches, model, x, x0)
+        step = _SCALE * np.linalg.lstsq(J * _SCALE, -r, rcond=1e-12)[0]
+        x += step
+        if np.abs(step / _SCALE).max() < 1e-9:
+            break
+    r, J = _rows(touches, model, x, x0)
+    return _estimate(touches, model, x, r, J)
+
+
+def residual(touch: BallTouch, model: BallModel, x: Array) -> tuple[Array, Array]:
+    """Where a touch puts the ball's centre less where it is, and its derivative by the unknowns.
+
+    Args:
+        touch: one touch.
+        model: gives the radii.
+        x: (9,) tool centre, ball centre (m), error of the radii (m), tilt (rad).
+
+    Returns:
+        (3,) m, base frame; (3, 9).
+    """
+    R, p = touch.T_base_flange[:3, :3], touch.T_base_flange[:3, 3]
+    d = touch.d_flange
+    reach = model.radii + x[_RHO] - touch.depth
+    ex, ey = x[_TILT]
+    turned = d + np.array([ey * d[2], -ex * d[2], ex * d[1] - ey * d[0]])
+    J = np.zeros((3, 9))
+    J[:, _T], J[:, _C] = R, -np.eye(3)
+    J[:, _RHO] = R @ turned
+    J[:, 7] = reach * (R @ np.array([0.0, -d[2], d[1]]))
+    J[:, 8] = reach * (R @ np.array([d[2], 0.0, -d[0]]))
+    return p + R @ (x[_T] + reach * turned) - x[_C], J
+
+
+def _rows(touches: Sequence[BallTouch], model: BallModel, x: Array, x0: Array) -> tuple[Array, Array]:
+    """Whitened residuals (3n + 6,) and their derivative: the touches, then the priors on all but the tool centre."""
+    blocks, slopes = [], []
+    for touch in touches:
+        r, J = residual(touch, model, x)
+        m = touch.T_base_flange[:3, :3] @ touch.d_flange
+        along = np.outer(m, m)
+        white = along / model.sigma_along + (np.eye(3) - along) / model.sigma_across
+        blocks.append(white @ r)
+        slopes.append(white @ J)
+    sigma = np.array([model.sigma_c] * 3 + [model.sigma_radii] + [model.sigma_tilt] * 2)
+    prior = np.zeros((6, 9))
+    prior[:, 3:] = np.diag(1.0 / sigma)
+    return np.concatenate([*blocks, (x - x0)[3:] / sigma]), np.concatenate([*slopes, prior])
+
+
+def _estimate(touches: Sequence[BallTouch], model: BallModel, x: Array, r: Array, J: Array) -> ToolEstimate:
+    _, s, Vt = np.linalg.svd(J * _SCALE, full_matrices=False)
+    known = s > s[0] * 1e-12
+    condition = float(s[0] / s[-1]) if known.all() else float("inf")
+    weights = np.where(known, 1.0 / np.where(known, s, 1.0), np.inf)
+    V = Vt.T[:3] * LENGTH
+    covariance = np.where(np.abs(V) > 0, V, 0.0) * np.where(known, weights, 0.0) ** 2 @ V.T
+    blind = (np.abs(V[:, ~known]) > 1e-9 * LENGTH).any(axis=1)
+    covariance[blind, blind] = np.inf
+    observed = np.sqrt(np.diag(covariance)) < model.observed_below
+    n = len(touches)
+    rows = r[: 3 * n].reshape(n, 3)
+    m = np.array([touch.T_base_flange[:3, :3] @ touch.d_flange for touch in touches])
+    along = np.sum(rows * m, axis=1)
+    across2 = np.maximum(np.sum(rows**2, axis=1) - along**2, 0.0)
+    free = len(r) - len(x)
+    return ToolEstimate(
+        t_flange=np.where(observed, x[_T], np.nan),
+        covariance=covariance,
+        observed=observed,
+        c_base=x[_C].copy(),
+        radii_error=float(x[_RHO]),
+        tilt=x[_TILT].copy(),
+        condition_number=condition,
+        along_rms=float(np.sqrt(np.mean(along**2))) * model.sigma_along,
+        across_rms=float(np.sqrt(np.mean(across2) / 2)) * model.sigma_across,
+        chi2_per_dof=float(r @ r / free) if free > 0 else None,
+        touches=n,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BallApproach:
+    """How one touch is made.
+
+    Attributes:
+        n_base: (3,) outward unit normal of the ball where it is touched.
+        pole_base: (3,) unit vector of the probe's pole during the touch.
+    """
+
+    n_base: Array
+    pole_base: Array
+
+
+def ball_approaches(count: int, tilt: float, beside: float, up: Array) -> list[BallApproach]:
+    """Touches all round a ball: on a ring about its top, each beside the pole of the probe in another direction.
+
+    Neighbours on the ball are neighbours in the list. From one to the next the direction beside the pole turns by the
+    golden angle, so that no turn of the tool goes with a place on the ball.
+
+    Args:
+        count: of touches, the first on top.
+        tilt: of the ring from the top, rad.
+        beside: of the touch from the pole, rad; 0 turns the pole to the ball.
+        up: (3,) unit vector to the top.
+    """
+    e1 = np.cross(up, np.array([0.0, 1.0, 0.0]) if abs(up[1]) < 0.9 else np.array([1.0, 0.0, 0.0]))
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(up, e1)
+    found = []
+    for k in range(count):
+        around = 2.0 * np.pi * k / max(count - 1, 1)
+        lean = tilt if k else 0.0
+        n = np.cos(lean) * up + np.sin(lean) * (np.cos(around) * e1 + np.sin(around) * e2)
+        side = np.cos(k * GOLDEN) * e1 + np.sin(k * GOLDEN) * e2
+        side = side - n * float(n @ side)
+        side /= np.linalg.norm(side)
+        found.append(BallApproach(n, -np.cos(beside) * n + np.sin(beside) * side))
+    return found

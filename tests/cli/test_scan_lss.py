@@ -1,0 +1,171 @@
+"""`canprobe scan --lss` on nodes of `canprobe emulate --without-id`, over a lockstep bus in the place of a real one."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+import canprobe
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.cli import main
+from canprobe.emulator.build import make_world
+from canprobe.planning import make_plan
+
+CHANNEL = ("--bus", "socketcan", "--channel", "can0")
+DRIVE = "0xca5e:0x260:0x10000"
+
+
+@pytest.fixture
+def bus(monkeypatch):
+    """A bus that every command of the test opens."""
+    bus = LockstepBus(VirtualClock())
+    monkeypatch.setattr("canprobe.bus.open.open_port", lambda *_, **__: bus.port())
+    return bus
+
+
+@pytest.fixture
+def serve(bus, monkeypatch):
+    """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
+    monkeypatch.setattr("canprobe.emulation.rehearse", lambda scene: None)
+    monkeypatch.setattr("canprobe.bus.priority.ask_for_processor", lambda: False)
+    nodes = []
+
+    def attach(participants, port, stop):
+        nodes[:] = [one for one in participants if hasattr(one, "lss")]
+        for node in nodes:
+            bus.attach(node)
+
+    monkeypatch.setattr("canprobe.emulator.serve.serve", attach)
+
+    def emulate(*words):
+        assert main(["emulate", *words, "--channel", "can0"]) == 0
+        return nodes
+
+    return emulate
+
+
+def ids(nodes):
+    return [node.node_id for node in nodes]
+
+
+def scan(*words):
+    return main(["scan", *words, *CHANNEL])
+
+
+def test_a_user_finds_the_blank_nodes_names_them_and_scans_again(serve, capsys):
+    nodes = serve("free", "--without-id", "3,5")
+    assert ids(nodes) == [1, 2, 255, 4, 255, 6]
+    said = capsys.readouterr().err
+    assert f"serving nodes 1, 2, 4, 6, and without an id {DRIVE}:0x3, {DRIVE}:0x5 on can0" in said
+    assert scan("--lss") == 0
+    out = capsys.readouterr().out
+    assert f"without an id: {DRIVE}:0x3 " in out and f"without an id: {DRIVE}:0x5 " in out
+    assert scan("--lss", "--assign", "3=3", "--assign", f"{DRIVE}:0x5=15", "--no-store") == 0
+    out = capsys.readouterr().out.splitlines()
+    assert out[:2] == [
+        f"{DRIVE}:0x3 is node 3 now; until its power goes",
+        f"{DRIVE}:0x5 is node 15 now; until its power goes",
+    ]
+    assert [line.split()[0] for line in out[3:]] == ["1", "2", "3", "4", "6", "15"]
+    assert ids(nodes) == [1, 2, 3, 4, 15, 6]
+    assert scan("--lss") == 0
+    assert "no node without an id answers on can0" in capsys.readouterr().out
+
+
+def test_the_only_blank_node_needs_no_name(serve, capsys):
+    nodes = serve("--eds", "tactile_array.eds", "--node-id", "255", "--serial", "0x4711")
+    assert scan("--lss", "--assign", "16", "--json") == 0
+    document = json.loads(capsys.readouterr().out)
+    assert [(one["node_id"], one["serial_number"], one["stored"]) for one in document["assigned"]] == [
+        (16, 0x4711, True)
+    ]
+    assert document["unconfigured"] == [] and [node["node_id"] for node in document["nodes"]] == [16]
+    assert ids(nodes) == [16]
+
+
+def test_a_scene_gives_its_nodes_their_ids(serve, capsys, tmp_path):
+    """Serial numbers in the scene: ids as they stand there, whoever had which before; bring-up then checks them."""
+    text = (canprobe.scene_loader._packaged_files()["free"]).read_text()
+    scene = tmp_path / "mine.toml"
+    scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1001, 1002, 1003, 1004, 1005, 1006]", 1))
+    nodes = serve(str(scene), "--without-id", "1-6")
+    assert ids(nodes) == [255] * 6
+    nodes[0].lss.pending = 21  # one has an id of its own already
+    nodes[0].start(0)
+    assert scan(str(scene), "--lss") == 0
+    assert "0xca5e:0x260:0x10000:0x3e9 is node 1 now, before 21" in capsys.readouterr().out
+    assert ids(nodes) == [1, 2, 3, 4, 5, 6]
+
+
+def test_a_scene_without_serial_numbers_places_the_one_that_is_missing(serve, capsys):
+    nodes = serve("listen", "--without-id", "16")
+    assert scan("listen", "--lss") == 0
+    assert "is node 16 now" in capsys.readouterr().out
+    assert ids(nodes)[-1] == 16
+
+
+def test_drives_that_only_a_serial_number_could_tell_apart_are_refused(serve, capsys):
+    nodes = serve("free", "--without-id", "2,3")
+    assert scan("free", "--lss") == 3
+    line = capsys.readouterr().err.splitlines()[-1]
+    assert line.startswith("canprobe: node 2: (joint 2) 2 devices could be meant:") and "--assign 0x2=2" in line
+    assert ids(nodes) == [1, 255, 255, 4, 5, 6]
+
+
+def test_what_is_stored_is_there_when_the_nodes_are_started_again(serve, tmp_path):
+    words = ("free", "--nodes", "1-2", "--without-id", "2", "--store", str(tmp_path))
+    serve(*words)
+    assert scan("--lss", "--assign", "2=9") == 0
+    stored = json.loads((tmp_path / "serial00000002.json").read_text())
+    assert stored["node_id"] == 9
+    plan = make_plan(canprobe.load_scene("free"))
+    again = make_world(plan, (2,), without_id=(2,)).nodes[0]
+    from canprobe.emulator.store_file import keep_in_file
+
+    keep_in_file(again, tmp_path / "serial00000002.json")
+    assert again.start(0) == [(0x709, b"\0")]
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("--assign", "3"), "--assign goes with --lss"),
+        (("free",), "SCENE goes with --lss"),
+        (("--no-store",), "--no-store goes with --lss"),
+        (("free", "--lss", "--assign", "3"), "--assign or SCENE, not both"),
+        (("--lss", "--assign", "1=3", "--assign", "2=3"), "--assign gives id 3 to more than one device"),
+        (("--lss", "--assign", "1:2=3"), "expected SERIAL=ID or VENDOR:PRODUCT:REVISION:SERIAL=ID"),
+        (("--lss", "--assign", "=3"), "expected a number of 32 bits"),
+        (("--lss", "--assign", "0x100000000=3"), "expected a number of 32 bits"),
+        (("--lss", "--assign", "1=0"), "expected an integer from 1 to 127"),
+    ],
+)
+def test_a_wrong_command_line_is_one_clear_line(words, what, capsys):
+    assert scan(*words) == 2
+    assert what in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (("free", "--serial", "3"), "--serial belongs to --eds"),
+        (("free", "--without-id", "9"), "--without-id: [9] is not among the nodes to serve"),
+        (("--eds", "puma260_joint.eds", "--node-id", "5", "--without-id", "5"), "--without-id belongs to a scene"),
+        (("--eds", "puma260_joint.eds", "--node-id", "5", "--serial", "1", "--serial", "2"), "2 --serial, but 1 --eds"),
+        (("--eds", "puma260_joint.eds", "--node-id", "255") * 2, "two nodes without an id are the device"),
+        (("--eds", "puma260_joint.eds", "--node-id", "128"), "expected an integer from 1 to 127"),
+    ],
+)
+def test_a_wrong_emulate_line_is_one_clear_line(words, what, capsys):
+    assert main(["emulate", *words, "--channel", "vcan0"]) == 2
+    assert what in capsys.readouterr().err
+
+
+def test_a_scene_whose_serial_numbers_are_wrong_is_refused(tmp_path):
+    scene = tmp_path / "mine.toml"
+    text = canprobe.scene_loader._packaged_files()["free"].read_text()
+    scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1, 2, 3, 4, 5, 5]", 1))
+    with pytest.raises(canprobe.errors.SceneError, match="serial_numbers: expected a list of 6 items"):
+        canprobe.load_scene(str(scene))

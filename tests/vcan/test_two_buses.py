@@ -1,0 +1,76 @@
+"""Real and emulated nodes side by side, the arm on one interface and the sensor on another, as three processes."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.socketcan import SocketCanPort
+
+pytestmark = pytest.mark.vcan
+SECOND = "vcan7"
+SCENE = """\
+[scene]
+name = "split"
+[cycle]
+rate_hz = 100
+[arm]
+emulated = false
+missed_syncs = 40
+[sensor]
+channel = "can1"
+rate_hz = 50
+mode = "image"
+[object]
+kind = "plane"
+[task]
+kind = "press"
+"""
+
+
+def ip(*words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(["ip", "link", *words], capture_output=True, text=True, check=False)
+
+
+@pytest.fixture
+def second_bus() -> Iterator[SocketCanPort]:
+    """An ear on a second virtual interface."""
+    ip("del", SECOND)  # of a test that was killed
+    for words in (("add", "dev", SECOND, "type", "vcan"), ("set", SECOND, "up")):
+        done = ip(*words)
+        if done.returncode:
+            pytest.skip(f"ip link {' '.join(words)}: {done.stderr.strip()}")
+    port = SocketCanPort(SECOND, MonotonicClock())
+    yield port
+    port.close()
+    ip("del", SECOND)
+
+
+def test_an_arm_of_another_process_and_an_emulated_sensor_on_its_own_bus(bench: Any, second_bus: Any) -> None:
+    arm = bench.start("emulate", "free", "--channel", "vcan0")
+    while not arm.err.startswith("serving nodes"):
+        assert arm.running, arm.err
+    scene = bench.folder / "split.toml"
+    scene.write_text(SCENE)
+    buses = ("--bus", "socketcan", "--channel", "can0=vcan0", "--channel", f"can1={SECOND}")
+    command = bench.start("up", scene, *buses)
+    bench.bus.until_enabled(6, by=command)
+    second = second_bus.drain()
+    images = {can_id for can_id, _, _ in second if 0x511 <= can_id <= 0x531}
+    assert images == set(range(0x511, 0x532)), "the header and the 32 PDOs of an image"
+    assert {0x080, 0x77F, 0x710} <= {can_id for can_id, _, _ in second}
+    assert not {can_id for can_id, _, _ in second if 0x181 <= can_id <= 0x206}, "the arm's PDOs are on the other bus"
+    command.send(signal.SIGINT)
+    lines = command.end(0)
+    assert {"vcan0: virtual, without a bit rate", f"{SECOND}: virtual, without a bit rate"} <= set(lines)
+    bench.bus.hear()
+    last = {can_id: data for can_id, data, _ in second + second_bus.drain()}
+    bench.assert_left_safe(bench.bus.last, 1, 2, 3, 4, 5, 6)
+    assert last[0x710] == b"\x7f", "the sensor is pre-operational"
+    assert not {can_id for can_id in bench.bus.last if 0x511 <= can_id <= 0x531}, "and was never on the arm's bus"
+    assert arm.running
