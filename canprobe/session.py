@@ -97,7 +97,7 @@ class Session:
     """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
 
     Args:
-        scene: what to bring up, resolved.
+        scene: what to bring up, resolved; or the plan of it.
         out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
         say: called with each step.
         observers: called after each cycle with what it saw, said and had on the bus.
@@ -109,14 +109,14 @@ class Session:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: Scene | Plan,
         out: Path | None = None,
         say: Say = quiet,
         observers: Sequence[Observer | Callable[[Observation], None]] = (),
         rows_kept: int | None = None,
     ) -> None:
         self._rows_kept = rows_kept
-        self.plan: Plan = make_plan(scene)
+        self.plan = scene if isinstance(scene, Plan) else make_plan(scene)
         self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0

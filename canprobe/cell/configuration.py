@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -39,6 +40,8 @@ EMCY_INHIBIT_100US = 1000
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
+ROUNDING_COUNTS = 2
+"""By which two targets may be rounded apart."""
 QUICK_STOP_AND_DISABLE = 2  # 605Ah: slow down on the quick stop ramp, then switch on disabled
 ABORT_QUICK_STOP = 3  # 6007h: quick stop when the connection is lost
 
@@ -105,7 +108,7 @@ def _one_pdo(pdo: PlannedPdo, dictionary: Any) -> list[Write]:
 
 
 def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
-    arm = plan.scene.arm
+    scene, arm = plan.scene, plan.scene.arm
     assert arm is not None and plan.sync.interpolation_100us is not None
     model, axis = MODELS[arm.model], arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
@@ -118,11 +121,25 @@ def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
         Write(0x60C2, 2, -4),
         Write(0x6065, 0, window),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS),
+        Write(0x607F, 0, motor_speed_limit(model, axis, scene.limits.joint_speed_share, plan.sync.period_ns)),
         Write(0x607D, 1, int(low[axis])),
         Write(0x607D, 2, int(high[axis])),
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE),
         Write(0x6007, 0, ABORT_QUICK_STOP),
     ]
+
+
+def motor_speed_limit(model: PumaModel, axis: int, share: float, period_ns: int) -> int:
+    """Counts/s beyond which a drive must not follow a target: all joints that turn the motor, at their limits.
+
+    Args:
+        model: the arm.
+        axis: of the motor, 0-based.
+        share: of the joints' speed limits.
+        period_ns: of the cycle; a target is a whole number of counts.
+    """
+    fastest = float(np.abs(model.counts[axis]) @ model.qd_max) * share
+    return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
 
 
 def software_limits(model: PumaModel) -> tuple[Array, Array]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import copysign
+
 STEADY = 5
 """Equal reports after which a motor is at rest."""
 BASE_COUNTS = 8
@@ -15,7 +17,9 @@ _FORGET = 0.9
 class PositionTrack:
     """Positions of one motor, counts, and its rate.
 
-    A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together.
+    A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together, and
+    an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
+    tell of a motion that grows from nothing.
 
     Attributes:
         counts: the last position that was believed.
@@ -55,13 +59,15 @@ class PositionTrack:
         self._last = counts
         if self.cycle >= 0:
             step, passed_ns = counts - self.counts, t_ns - self._t_ns
+            moved: float = step
             if guarded:
                 carried = self._rate * passed_ns
-                reach = BASE_COUNTS + abs(carried) + (cycle - self.cycle) * self._asked
-                if abs(step - carried) > reach:
+                asked = (cycle - self.cycle) * self._asked
+                if abs(step - carried) > BASE_COUNTS + abs(carried) + asked:
                     return False
+                moved = step if abs(step) <= asked else copysign(asked, step)
             if passed_ns > 0:
-                self._rate = step / passed_ns
+                self._rate = moved / passed_ns
         self.counts, self.cycle, self._t_ns = counts, cycle, t_ns
         return True
 

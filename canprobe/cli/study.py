@@ -18,6 +18,7 @@ examples:
   canprobe study estimators --quick --out runs/estimators
   canprobe study bound --dask tcp://10.0.0.1:8786
   canprobe study faults --seed 4711
+  canprobe vcan -- canprobe study faults --vcan
 """
 
 
@@ -32,6 +33,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--quick", action="store_true", help="fewer repeats: a first look")
     parser.add_argument(
         "--seed", metavar="N", type=whole(0, 2**63 - 1), help="faults: only this run, told step by step"
+    )
+    parser.add_argument(
+        "--vcan", action="store_true", help="faults: on the real vcan0, with processes killed and the link taken down"
     )
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler instead")
@@ -54,6 +58,10 @@ def run(args: argparse.Namespace) -> int:
         known = ", ".join(STUDIES)
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
+    if args.vcan and args.name != "faults":
+        args.complain(f"--vcan: study {args.name} has no form of its own on vcan0; faults has")
+    if args.vcan and args.seed is not None:
+        args.complain("--seed: the runs on vcan0 hang on the machine's own time too and cannot be told again")
     if args.seed is not None:
         return _replay(args)
     from canprobe.studies.study_files import as_document, text_of, write_study
@@ -66,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
             termination_interrupts(),
             open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep,
         ):
-            result = run_study(args.name, quick=args.quick, sweep=sweep)
+            result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
         say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
         raise

@@ -1,7 +1,10 @@
 """Cyclic synchronous position: a target latched at a SYNC is reached by a straight ramp after 60C2h.
 
+A target that is further from the one before than 607Fh and 6080h let the motor go in the time between them is not
+followed: reference limit, a fault. A target that was corrupted on its way is one, unless it is off by less.
 Offsets of velocity and torque (60B1h, 60B2h) are feed-forwards of a dynamic plant; the ideal one needs none.
-Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 60B0h–60B2h, 60C2h.
+Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 607Fh, 6080h, 60B0h–60B2h,
+60C2h; error code 8612h.
 """
 
 from __future__ import annotations
@@ -9,8 +12,9 @@ from __future__ import annotations
 from canprobe.emulator.drive_mode import FOLLOWS, DriveMode, DriveParts
 from canprobe.emulator.drive_parameters import PEAK_PERMILLE
 from canprobe.emulator.entries import key_of
-from canprobe.protocol.emcy import FOLLOWING_ERROR
+from canprobe.protocol.emcy import FOLLOWING_ERROR, REFERENCE_LIMIT
 
+ROUNDING_COUNTS = 2
 _TARGET, _OFFSET = key_of(0x607A), key_of(0x60B0)
 
 
@@ -22,11 +26,13 @@ class CyclicPosition(DriveMode):
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._fresh = False
+        self._latched_ns = 0
         parts.node.dictionary.on_write(self.target, self._target_written)
 
     def start(self, word: int, t_ns: int) -> None:
         """A target that came before does not count."""
         self._fresh = False
+        self._latched_ns = t_ns
         super().start(word, t_ns)
 
     def status(self) -> int:
@@ -47,8 +53,14 @@ class CyclicPosition(DriveMode):
         values, parameters, units = self._values, self._parameters, self._units
         target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
         allowed = parameters.clamp(target)
+        counts = allowed * units.scale + units.origin
+        passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
+        if abs(counts - self._motion.demand(t_ns)) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
+            self.parts.fault(REFERENCE_LIMIT, t_ns)
+            return
+        self._latched_ns = t_ns
         self.parts.loop.feed_forward()
-        self._motion.reach(allowed * units.scale + units.origin, t_ns, parameters.interpolation_ns)
+        self._motion.reach(counts, t_ns, parameters.interpolation_ns)
         limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
         if limited is not self.limited:
             self._limit(limited)

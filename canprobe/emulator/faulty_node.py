@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from heapq import heappop, heappush
 from random import Random
 
 from canprobe.emulator.faults import Fault, FaultKind, flip_bit
 from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.wrapped_node import WrappedNode
 from canprobe.errors import ProtocolError
 from canprobe.protocol.emcy import Emcy
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Frame
@@ -19,7 +20,7 @@ _TPDO1 = 0x180
 _DARK = (FaultKind.REBOOT, FaultKind.FREEZE)
 
 
-class FaultyNode:
+class FaultyNode(WrappedNode):
     """One node and its faults; without any it is the node itself.
 
     Args:
@@ -32,7 +33,7 @@ class FaultyNode:
     """
 
     def __init__(self, node: SlaveNode, faults: Iterable[Fault] = (), tactile_ids: Sequence[int] = ()) -> None:
-        self.node = node
+        super().__init__(node)
         self.hits = 0
         self._faults: list[tuple[Fault, Random]] = []
         self._tactile_ids = tuple(tactile_ids)
@@ -55,25 +56,6 @@ class FaultyNode:
             self._boots = sorted((*self._boots, fault.start_ns, fault.end_ns))
         if fault.kind in _DARK:
             self._thaws = sorted((*self._thaws, fault.end_ns))
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return self.node.name
-
-    @property
-    def listens(self) -> Container[int]:
-        """As the node."""
-        return self.node.listens
-
-    @property
-    def rerouted(self) -> Callable[[], None]:
-        """As the node's."""
-        return self.node.rerouted
-
-    @rerouted.setter
-    def rerouted(self, function: Callable[[], None]) -> None:
-        self.node.rerouted = function
 
     @property
     def next_deadline_ns(self) -> int | None:

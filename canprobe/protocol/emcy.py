@@ -18,6 +18,7 @@ PDO_TOO_LONG = 0x8220
 SYNC_LENGTH = 0x8240
 RPDO_TIMEOUT = 0x8250
 FOLLOWING_ERROR = 0x8611
+REFERENCE_LIMIT = 0x8612
 
 # Longest match wins: the code itself, then with its last digit, last two and last three digits cleared.
 # Source: CiA 301 (emergency error codes) and CiA 402-2 (error codes of drives).

@@ -5,177 +5,68 @@ from __future__ import annotations
 import tempfile
 import traceback
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from random import Random
 from typing import Any
 
 import numpy as np
 
-from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import VirtualClock
 from canprobe.cell.build import make_task
-from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.limits import limits_of
+from canprobe.cell.measurement import Measurement
 from canprobe.cell.tasks.touch import Phase
-from canprobe.emulator.faults import Fault, FaultKind
+from canprobe.emulator.faults import FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.emulator.node import SlaveNode
-from canprobe.emulator.plant.world import Plant
 from canprobe.errors import CanprobeError, SafetyStop
-from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.protocol.frames import Frame
-from canprobe.scene import Scene
-from canprobe.scene_loader import load_scene
-from canprobe.session import Session, resolve_scene
+from canprobe.session import Session
+from canprobe.studies import fault_cases
+from canprobe.studies.fault_cases import PHASES, FaultCase, Windows
+from canprobe.studies.fault_scenes import seeded_plan
+from canprobe.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest
+from canprobe.studies.fault_witness import HangError, Silent, Witness
 
-SCENARIOS = {"press, features": 0.7, "press, window": 0.15, "scan": 0.15}
-"""Scenario → its share of the runs."""
-PHASES = ("bring-up", "approach", "scan", "retreat", "stop")
-SENSOR = 16
-NODES = (1, 2, 3, 4, 5, 6, SENSOR)
-FORCE_MAX_N = 3.0
-AFTER_S = 0.4
-"""Time after the end for which nothing may move."""
-LOOK_NS = 10_000_000
-LONGEST_S = 15.0
-"""Virtual time after which a run hangs: nominal runs take two seconds, every time-out in them less than ten."""
-RELEASE_NS = 100_000_000
-"""Time that the retreat has, from its command, to bring the force below the limit."""
-AT_REST_RAD = 2e-4
-_KINDS = tuple(FaultKind)
-_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE)
-"""What the wire corrupts on the way to a node, its CRC drops; what a node itself corrupts has the right CRC."""
-
-
-class HangError(Exception):
-    """The run did not come to its end."""
-
-
-class Witness:
-    """A silent participant that looks at the plant every so often, also where the master sends no SYNC any more.
-
-    Args:
-        plant: of the run.
-        period_ns: between two looks.
-
-    Attributes:
-        rows: (t_ns, force in N) of each look.
-    """
-
-    name = "witness"
-    listens: frozenset[int] = frozenset()
-
-    def __init__(self, plant: Plant, period_ns: int) -> None:
-        self.rows: list[tuple[int, float]] = []
-        self.next_deadline_ns = period_ns
-        self._plant, self._period_ns = plant, period_ns
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing to say."""
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Nothing to hear."""
-        return ()
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Look."""
-        self.next_deadline_ns = t_ns + self._period_ns
-        self._plant.advance(t_ns)
-        self.rows.append((t_ns, float(self._plant.truth()["force"])))
-        if t_ns > LONGEST_S * 1e9:
-            raise HangError(f"not at its end after {LONGEST_S:g} s")
-        return ()
-
-
-class _Silent:
-    """In the place of a participant that is not needed."""
-
-    next_deadline_ns = None
-    listens: frozenset[int] = frozenset()
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        return ()
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        return ()
-
-
-@dataclass(frozen=True, slots=True)
-class FaultCase:
-    """What a seed stands for.
-
-    Attributes:
-        seed: of everything random in the run.
-        scenario: one of `SCENARIOS`.
-        phase: in which the first fault begins.
-        faults: what happens.
-    """
-
-    seed: int
-    scenario: str
-    phase: str
-    faults: tuple[Fault, ...]
+AFTER_S = 0.3
+"""Time after the end of the run, and of its last fault, for which nothing may move."""
+SETTLED_S = 0.1
+"""Time after which everything must be at rest."""
+LOOK_NS = 5_000_000
+BRING_UP_NS = 100_000_000
+"""Before the first SYNC: reset, configuration and start; before that the master only listens."""
+STOP_NS = 20_000_000
+"""Faults may begin for so long after the end too: on an untimed bus the nodes are let go at once."""
 
 
 @cache
-def scenario_scene(name: str) -> Scene:
-    """A touch that is short enough to be run ten thousand times."""
-    scene = load_scene("plane" if name == "scan" else "press")
-    scene = resolve_scene(scene, duration_s=0.2)
-    scene = replace(
-        scene,
-        task=replace(scene.task, clearance_mm=0.5),
-        limits=replace(scene.limits, force_max_n=FORCE_MAX_N),
-        shape=replace(scene.shape, also=()) if scene.shape is not None else None,
-    )
-    if name != "press, features" or scene.sensor is None:
-        return scene
-    return replace(
-        scene,
-        cycle=replace(scene.cycle, rate_hz=100.0),
-        sensor=replace(scene.sensor, rate_hz=100.0, mode="features"),
-    )
+def phase_windows(scenario: str, timed: bool) -> Windows:
+    """When each phase that a scenario has begins and ends in a run without faults, ns."""
+    run = _Run(FaultCase(0, scenario, "", (), timed, files=False)).result(None)
+    first, begun, end = run["first_sync_ns"], run["begun"], run["end_ns"]
+    task = begun.get(Phase.SETTLE, begun[Phase.SCAN])
+    marks: dict[str, int | None] = {
+        "bring-up": first - BRING_UP_NS,
+        "approach": first if task - first > 2 * run["period_ns"] else None,
+        "scan": task,
+        "retreat": begun.get(Phase.RETREAT),
+        "stop": begun[Phase.DONE],
+    }
+    there = [(name, t_ns) for name in PHASES if (t_ns := marks[name]) is not None]
+    ends = [t_ns for _, t_ns in there[1:]] + [end + STOP_NS]
+    return {name: (t_ns, end_ns) for (name, t_ns), end_ns in zip(there, ends, strict=True)}
 
 
 @cache
-def phase_windows(scenario: str) -> dict[str, tuple[int, int]]:
-    """When each phase begins and ends in a run without faults, ns."""
-    run = carry_out(FaultCase(0, scenario, "", ()))
-    t_first_ns, period_ns = run["first_sync_ns"], run["period_ns"]
-    rows = {phase: t_first_ns + row * period_ns for phase, row in run["phase_rows"].items()}
-    settle, retreat, done = rows[Phase.SETTLE], rows[Phase.RETREAT], rows[Phase.DONE]
-    edges = (t_first_ns - 100_000_000, t_first_ns, settle, retreat, done, run["end_ns"])
-    return {name: (edges[i], edges[i + 1]) for i, name in enumerate(PHASES)}
+def peak(scenario: str) -> Peak | None:
+    """What the probe of a scenario can reach until the cell reacts; None where nothing presses."""
+    run = _Run(FaultCase(0, scenario, "", (), timed=False, files=False))
+    run.result(None)
+    return peak_of(run.session)
 
 
 def draw_case(seed: int) -> FaultCase:
-    """The case of a seed: scenario, phase, one to three faults."""
-    rng = Random(f"fault campaign {seed}")
-    (scenario,) = rng.choices(tuple(SCENARIOS), tuple(SCENARIOS.values()))
-    windows = phase_windows(scenario)
-    phases = [rng.choice(PHASES) for _ in range(rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3)))]
-    return FaultCase(seed, scenario, phases[0], tuple(_draw_fault(rng, windows[phase]) for phase in phases))
-
-
-def _draw_fault(rng: Random, window: tuple[int, int]) -> Fault:
-    kind = rng.choice(_KINDS)
-    amount = rng.uniform(2e5, 2e6) if kind is FaultKind.BABBLE else 10 ** rng.uniform(5.0, 7.5)
-    return Fault(
-        kind,
-        node_id=SENSOR if rng.random() < 0.3 else rng.choice(NODES),
-        start_ns=rng.randrange(*window),
-        duration_ns=int(10 ** rng.uniform(6.0, 8.7)),
-        share=rng.choice((1.0, 1.0, 0.5, 0.1)),
-        incoming=kind is FaultKind.DEAF or (kind in _BOTH_WAYS and rng.random() < 0.4),
-        amount_ns=int(amount),
-        seed=rng.randrange(2**32),
-    )
+    """The case of a seed."""
+    return fault_cases.draw_case(seed, phase_windows)
 
 
 def run_seed(seed: int) -> dict[str, Any]:
@@ -185,6 +76,7 @@ def run_seed(seed: int) -> dict[str, Any]:
     return {
         "seed": seed,
         "scenario": case.scenario,
+        "timed": case.timed,
         "phase": case.phase,
         "kinds": sorted({fault.kind.value for fault in case.faults}),
         "faults": [str(fault) for fault in case.faults],
@@ -192,6 +84,7 @@ def run_seed(seed: int) -> dict[str, Any]:
         "outcome": run["outcome"],
         "reason": run["reason"],
         "force_max_n": run["force_max_n"],
+        "force_bound_n": run["force_bound_n"],
         "above_ms": run["above_ns"] * 1e-6,
         "moved_rad": run["moved_rad"],
         "end_s": run["end_ns"] * 1e-9,
@@ -201,29 +94,35 @@ def run_seed(seed: int) -> dict[str, Any]:
 
 def carry_out(case: FaultCase) -> dict[str, Any]:
     """Run a case to its end and a while beyond it; what came of it, with every failure in words."""
+    reach = peak(case.scenario)
+    wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
+    bound = reach.force(len(case.faults), wrong) if reach is not None else None
+    if not case.files:
+        return _Run(case).result(bound)
     with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        return _Run(case, Path(folder)).result()
+        return _Run(case, Path(folder)).result(bound)
 
 
 class _Run:
     """One case being carried out."""
 
-    def __init__(self, case: FaultCase, folder: Path) -> None:
-        scene = scenario_scene(case.scenario)
+    def __init__(self, case: FaultCase, folder: Path | None = None) -> None:
         self.case = case
-        self.session = Session(replace(scene, scene=replace(scene.scene, seed=case.seed)), folder)
+        self.plan = seeded_plan(case.scenario, case.timed, case.seed)
+        self.session = Session(self.plan, folder)
         self.session.joins = self._join
-        self.task = make_task(self.session.plan)
-        self.limits = limits_of(self.session.plan)
+        self.task = make_task(self.plan)
+        self.limits = limits_of(self.plan)
         self.emulated: list[SlaveNode] = []
         self.nodes: list[FaultyNode] = []
         self.witness: Witness | None = None
         self.failures: list[str] = []
-        self.steps = 0
+        self.steps = self.stepped_ns = 0
+        self.begun: dict[Phase, int] = {}
 
     def _join(self, participant: Any) -> Any:
         if not hasattr(participant, "node_id"):
-            return _Silent()  # the witness sees what the recorder of the truth would, and more
+            return Silent()  # the witness sees what the recorder of the truth would, and more
         self.emulated.append(participant)
         if self.witness is None:
             self._watch()
@@ -232,37 +131,44 @@ class _Run:
         sensor = self.session.scene.sensor
         ids: Sequence[int] = ()
         if sensor is not None and participant.node_id == sensor.node_id:
-            ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(sensor.node_id, "tpdo")]
+            ids = [pdo.cob_id for pdo in self.plan.pdos_of(sensor.node_id, "tpdo")]
         node = FaultyNode(participant, self.case.faults, ids)
         self.nodes.append(node)
         return node
 
     def _watch(self) -> None:
-        assert self.session.world is not None and self.session.lockstep is not None
-        self.witness = Witness(self.session.world.plant, LOOK_NS)
-        self.session.lockstep.attach(self.witness)
+        session = self.session
+        assert session.world is not None and session.lockstep is not None
+        self.witness = Witness(session.world.plant, LOOK_NS)
+        session.lockstep.attach(self.witness)
+        if session.out is None:
+            session.lockstep.recorder = None  # nothing is counted that nobody looks at
 
-    def result(self) -> dict[str, Any]:
+    def result(self, bound_n: float | None) -> dict[str, Any]:
+        """Carry it out; without a bound (N) the force is not scored."""
         outcome, reason = self._drive()
         session = self.session
         assert session.world is not None and session.lockstep is not None and self.witness is not None
         clock = session.lockstep.clock
         end_ns = clock.now_ns()
         session.lockstep.recorder = None  # the log is closed
-        self._score_log()
+        self.failures += score_log(session, self.steps)
         moved = self._rest(clock, end_ns) if outcome != "hang" else 0.0
-        force_max, above_ns = self._score_force()
+        force_max, above_ns, failures = score_force(self.witness.rows, self.limits, bound_n)
+        self.failures += failures
         return {
             "outcome": outcome,
             "reason": reason,
             "hits": sum(node.hits for node in self.nodes),
             "force_max_n": force_max,
+            "force_bound_n": bound_n,
             "above_ns": above_ns,
             "moved_rad": moved,
             "end_ns": end_ns,
             "failures": self.failures,
             "period_ns": self.limits.period_ns,
-            **self._phase_rows(),
+            "begun": self.begun,
+            "first_sync_ns": session.cell.cycle.t_first_ns if session.opened and session.cell.cycle else None,
         }
 
     def _drive(self) -> tuple[str, str]:
@@ -280,71 +186,29 @@ class _Run:
             place = traceback.extract_tb(error.__traceback__)[-1]
             self.failures.append(f"crash: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})")
             return "crash", str(error)
+        self.begun.setdefault(Phase.DONE, self.stepped_ns)
         return "completed", ""
 
-    def _count(self, _: object) -> None:
+    def _count(self, _: Measurement) -> None:
+        assert self.session.lockstep is not None
         self.steps += 1
+        self.stepped_ns = self.session.lockstep.clock.now_ns()
+        self.begun.setdefault(getattr(self.task, "phase", Phase.SCAN), self.stepped_ns)
 
     def _rest(self, clock: VirtualClock, end_ns: int) -> float:
         """Let time go on without a master; how far a joint moves once everything must be at rest (rad)."""
         assert self.session.world is not None
+        if self.session.scene.arm is None:
+            return 0.0
         plant = self.session.world.plant
+        over_ns = max(end_ns, *(fault.end_ns for fault in self.case.faults), 0)
         try:
-            clock.sleep_until_ns(end_ns + int(AFTER_S * 0.25e9))
+            clock.sleep_until_ns(end_ns + int(SETTLED_S * 1e9))
             before = np.array(plant.truth()["q"])
-            clock.sleep_until_ns(
-                max(end_ns + int(AFTER_S * 1e9), *(f.end_ns + int(AFTER_S * 0.5e9) for f in self.case.faults), 0)
-            )
+            clock.sleep_until_ns(over_ns + int(AFTER_S * 1e9))
         except CanprobeError as error:
             self.failures.append(f"crash after the end: {error}")
             return 0.0
         moved = float(np.abs(plant.truth()["q"] - before).max())
-        if moved > AT_REST_RAD:
-            self.failures.append(f"motion after the stop: {moved:.5f} rad")
-        for node in self.emulated:
-            if node.node_id != SENSOR and (state := state_of(node.dictionary.number(0x6041))) in POWERED_STATES:
-                self.failures.append(f"{node.name} is {state.name} after the stop")
+        self.failures += score_rest(moved, self.emulated)
         return moved
-
-    def _score_force(self) -> tuple[float, int]:
-        """Highest force, N; longest time above the limit, ns."""
-        assert self.witness is not None
-        longest = 0
-        since: int | None = None
-        for t_ns, force in self.witness.rows:
-            if force <= FORCE_MAX_N:
-                since = None
-                continue
-            since = t_ns if since is None else since
-            longest = max(longest, t_ns - since)
-        within = BY_KEY["force"].within
-        assert within is not None
-        allowed = within(self.limits) + RELEASE_NS
-        highest = max((force for _, force in self.witness.rows), default=0.0)
-        if longest > allowed:
-            self.failures.append(f"force above the limit for {longest * 1e-6:.0f} ms, up to {highest:.2f} N")
-        return highest, longest
-
-    def _score_log(self) -> None:
-        """Every frame that was on the bus until the end is in the log, and every cycle has its row."""
-        session = self.session
-        assert session.out is not None
-        try:
-            lines = sum(1 for _ in read_candump(session.out / "bus.log"))
-        except CanprobeError as error:
-            self.failures.append(f"log: {error}")
-            return
-        frames = sum(counter.frames for counter in session.traffic.values())
-        if lines != frames:
-            self.failures.append(f"log: {lines} lines of {frames} frames")
-        if session.opened and (rows := len(session.cell.log)) < self.steps:
-            self.failures.append(f"log: {rows} rows of {self.steps} cycles")
-
-    def _phase_rows(self) -> dict[str, Any]:
-        session = self.session
-        if not session.opened or session.cell.cycle is None:
-            return {}
-        columns = session.cell.log.arrays()
-        phases = columns.get("phase", np.empty(0))
-        rows = {p: int(np.flatnonzero(phases == p)[0]) for p in Phase if (phases == p).any()}
-        return {"phase_rows": rows, "first_sync_ns": session.cell.cycle.t_first_ns}

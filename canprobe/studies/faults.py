@@ -16,7 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.emulator.faults import FaultKind
-from canprobe.studies.fault_runs import FORCE_MAX_N, PHASES, draw_case, run_seed
+from canprobe.studies.fault_cases import PHASES
+from canprobe.studies.fault_runs import draw_case, run_seed
+from canprobe.studies.fault_scenes import FORCE_MAX_N
 from canprobe.studies.study import Column, Say, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep

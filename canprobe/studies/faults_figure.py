@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from canprobe.emulator.faults import FaultKind
-from canprobe.studies.fault_runs import FORCE_MAX_N
+from canprobe.studies.fault_scenes import FORCE_MAX_N
 
 COLOURS = {
     "completed": "#4c9f70",
@@ -42,4 +42,30 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
     failed = sum(bool(one["failures"]) for one in runs)
     right.set_title(f"{len(runs)} runs, {failed} failed")
     right.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw how long the master took to end, by what happened to it, to ``path``."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 3), layout="constrained")
+    axes = figure.subplots()
+    kinds = list(dict.fromkeys(row["fault"] for row in rows))
+    for colour, label, some in (
+        ("#4a7ebb", "as it should be", [row for row in rows if not row["failures"]]),
+        ("#c03030", "failed", [row for row in rows if row["failures"]]),
+    ):
+        axes.plot(
+            [row["ended_s"] for row in some],
+            [kinds.index(row["fault"]) for row in some],
+            "o",
+            color=colour,
+            label=label,
+        )
+    axes.set(
+        yticks=range(len(kinds)), yticklabels=kinds, xlabel="from the fault to the end of the master, s", xlim=(0, None)
+    )
+    axes.set_ylim(len(kinds) - 0.5, -0.5)
+    axes.legend(frameon=False)
     figure.savefig(path, dpi=110)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Container, Sequence
 
 from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.wrapped_node import WrappedNode
 from canprobe.protocol.frames import Frame
 
 
-class LateNode:
+class LateNode(WrappedNode):
     """Holds back some frames to and from a node, in their order; all others pass at once.
 
     Args:
@@ -19,29 +20,10 @@ class LateNode:
     """
 
     def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
-        self.node = node
+        super().__init__(node)
         self._late_ids, self._late_ns = late_ids, late_ns
         self._in: deque[tuple[int, Frame]] = deque()
         self._out: deque[tuple[int, Frame]] = deque()
-
-    @property
-    def name(self) -> str:
-        """For messages."""
-        return self.node.name
-
-    @property
-    def listens(self) -> Container[int]:
-        """As the node."""
-        return self.node.listens
-
-    @property
-    def rerouted(self) -> Callable[[], None]:
-        """As the node's."""
-        return self.node.rerouted
-
-    @rerouted.setter
-    def rerouted(self, function: Callable[[], None]) -> None:
-        self.node.rerouted = function
 
     @property
     def next_deadline_ns(self) -> int | None:

@@ -27,7 +27,8 @@ from canprobe.scene import ObjectSettings, PlantSettings, Scene, ServoSettings
 from canprobe.scene_geometry import T_flange_probe, true_object
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
-from canprobe.studies.fault_runs import RELEASE_NS, HangError, Witness
+from canprobe.studies.fault_scores import RELEASE_NS
+from canprobe.studies.fault_witness import HangError, Witness
 from canprobe.studies.late_node import LateNode
 from canprobe.studies.stability_loop import ForceLoop
 from canprobe.touch.contact import indentation_from_force

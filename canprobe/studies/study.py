@@ -72,18 +72,20 @@ class StudyResult:
     more: Sequence[StudyResult] = ()
 
 
-def run_study(name: str, *, quick: bool, sweep: Sweep) -> StudyResult:
+def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:
     """Run a study.
 
     Args:
         name: one of `STUDIES`.
         quick: fewer repeats and cases.
         sweep: computes its cells.
+        vcan: its form with processes on a real vcan0, which `faults` has.
 
     Raises:
         UsageError: for an unknown name.
     """
     if name not in STUDIES:
         raise UsageError(f"study: expected one of {', '.join(STUDIES)}, got {name!r}")
-    result: StudyResult = importlib.import_module(f"canprobe.studies.{name}").run(quick=quick, sweep=sweep)
+    module = importlib.import_module(f"canprobe.studies.{name}_vcan" if vcan else f"canprobe.studies.{name}")
+    result: StudyResult = module.run(quick=quick, sweep=sweep)
     return result

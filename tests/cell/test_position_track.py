@@ -65,3 +65,13 @@ def test_noise_of_some_counts_is_believed():
     track = PositionTrack()
     for k in range(50):
         assert track.take((k % 2) * (BASE_COUNTS // 3), k, k * PERIOD, guarded=True)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_wrong_reports_at_rest_do_not_grow_into_a_motion(sign):
+    """Each of them is near to where the one before would lead, and the target asks for nothing of the kind."""
+    track = moving(0)
+    assert track.take(sign * BASE_COUNTS, 20, 20 * PERIOD, guarded=True)
+    assert track.position(23, 23 * PERIOD) == sign * BASE_COUNTS
+    assert not track.take(sign * 3 * BASE_COUNTS, 21, 21 * PERIOD, guarded=True)
+    assert track.take(0, 22, 22 * PERIOD, guarded=True)

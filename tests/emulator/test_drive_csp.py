@@ -7,6 +7,8 @@ import pytest
 from canprobe.protocol.cia402 import DriveState as S
 
 CYCLE = 2_500_000
+FASTEST = 800_000
+"""607Fh, counts/s: 2000 counts in a cycle."""
 
 
 class Master:
@@ -15,6 +17,7 @@ class Master:
     def __init__(self, drive):
         self.drive = drive
         self.k = 0
+        assert drive.write(0x607F, 0, FASTEST, 4) == 0
         drive.nmt(0x01, 0)
 
     def sync(self):
@@ -286,3 +289,24 @@ def test_grouped_controlword_by_event_and_target_by_sync_with_a_dummy(drive, pla
         drive.send(0x80, f"{k:02x}", k * CYCLE)
         drive.send(0x301, "e803000011223344", k * CYCLE + 1000)
     assert plant.counts[0] == 1000
+
+
+@pytest.mark.parametrize(
+    ("step", "followed"), [(2000, True), (-2000, True), (2010, False), (-2010, False), (1 << 20, False)]
+)
+def test_cia402_a_target_that_the_motor_cannot_reach_in_time_is_a_fault(drive, plant, step, followed):
+    master = Master(drive).enable()
+    frames = [frame for _ in range(3) for frame in master.cycle(step)]
+    assert (drive.node.application.state is S.OPERATION_ENABLED) is followed
+    assert [data for can_id, data in frames if can_id == 0x81] == ([] if followed else ["1286210000000000"])
+    assert plant.ramps[-1][2] == (step if followed else 0)
+
+
+def test_cia402_a_target_after_missed_ones_may_be_further_away(drive, plant):
+    master = Master(drive).enable()
+    master.cycle(1000)
+    master.sync()  # latched: 1000 by the next SYNC
+    master.sync()
+    master.cycle(1000 + 5900)  # 2000 for each of the cycles since
+    master.sync()
+    assert drive.node.application.state is S.OPERATION_ENABLED and plant.ramps[-1][2] == 6900

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
+from canprobe.cell.limits import limits_of
 from canprobe.cell.supervisor import Supervisor
 from canprobe.cell.tasks import touch
 from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind
-from canprobe.studies import fault_runs
-from canprobe.studies.fault_runs import PHASES, FaultCase, carry_out, draw_case, phase_windows, run_seed
+from canprobe.studies import fault_witness
+from canprobe.studies.fault_cases import PHASES, FaultCase
+from canprobe.studies.fault_runs import carry_out, draw_case, peak, phase_windows, run_seed
+from canprobe.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
+from canprobe.studies.fault_scores import Peak, score_force
 
 FEATURES = "press, features"
 S = 1_000_000_000
@@ -29,9 +34,50 @@ def test_every_kind_every_phase_and_every_node_is_drawn():
     assert {fault.node_id for fault in faults} == {1, 2, 3, 4, 5, 6, 16}
     assert {case.phase for case in cases} == set(PHASES)
     assert max(len(case.faults) for case in cases) == 3
+    assert {case.scenario for case in cases} == set(SCENARIOS)
+    assert {case.timed for case in cases} == {case.files for case in cases} == {True, False}
     for case in cases:
-        first, last = phase_windows(case.scenario)["bring-up"][0], phase_windows(case.scenario)["stop"][1]
-        assert all(first <= fault.start_ns <= last for fault in case.faults)
+        windows = phase_windows(case.scenario, case.timed)
+        assert all(windows["bring-up"][0] <= fault.start_ns < windows["stop"][1] for fault in case.faults)
+        assert case.timed or case.phase != "bring-up"
+
+
+@pytest.mark.parametrize("timed", [False, True])
+@pytest.mark.parametrize(
+    ("scenario", "without"), [("listen", {"approach", "retreat"}), ("free", {"retreat"}), (FEATURES, set())]
+)
+def test_the_phases_of_a_scenario_follow_each_other(scenario, without, timed):
+    windows = phase_windows(scenario, timed)
+    assert list(windows) == [phase for phase in PHASES if phase not in without]
+    edges = [edge for window in windows.values() for edge in window]
+    assert edges == sorted(edges) and edges[1:-1:2] == edges[2::2]
+    assert all(last > first for first, last in windows.values())
+
+
+def test_the_peak_force_follows_from_what_the_probe_can_reach():
+    reach = peak(FEATURES)
+    assert reach is not None and peak("free") is None and peak("listen") is None
+    # K/h = 1.27e8 N/m3, probe 40 mm on a cylinder of 36 mm: F = pi K/h d^2 / (2 sqrt(ab)), gap a x^2 + b y^2
+    a, b = 0.5 / 0.040, 0.5 / 0.040 + 0.5 / 0.036
+    assert reach.depth_at_1n == pytest.approx((2 * (a * b) ** 0.5 / (np.pi * 1.27e8)) ** 0.5, rel=0.02)
+    # blind at 4 mm/s: six frames of 10 ms until the frame is stale, two cycles more, one of ramp, 6.8 ms of lag
+    assert reach.blind == pytest.approx(4e-3 * (0.080 + 0.010 + 0.0068), abs=4e-3 * 0.0101)
+    # with all drives going on the probe sinks in at the speed of the approach
+    assert reach.torn[0] == pytest.approx(4e-3 * (0.070 + 0.0168), rel=0.05)
+    assert list(reach.torn) == sorted(reach.torn)
+    assert reach.force(3) > reach.force(2) - 1e-12 and reach.force(2) > reach.force(1) > 3.0
+
+
+def test_a_force_is_scored_by_its_height_and_by_its_time():
+    limits = limits_of(seeded_plan(FEATURES, False, 0))
+    bound = Peak(3.0, 1e-3, 1e-3, (0.0, 0.0)).force(1)
+    assert bound == pytest.approx((3.0**0.5 + 1.0) ** 2)
+    rows = [(t * 5_000_000, 3.5 if 10 <= t < 30 else 1.0) for t in range(60)]
+    assert score_force(rows, limits, bound) == (3.5, 95_000_000, [])
+    long = [(t * 5_000_000, 3.5 if 10 <= t < 50 else 1.0) for t in range(60)]
+    assert "for 195 ms" in score_force(long, limits, bound)[2][0]
+    high = [(t * 5_000_000, 8.0 if t == 10 else 1.0) for t in range(60)]
+    assert "8.00 N" in score_force(high, limits, bound)[2][0] and score_force(high, limits, None)[2] == []
 
 
 def test_the_quick_study_runs_from_the_command_line(tmp_path, capsys):
@@ -76,7 +122,7 @@ def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
 
 
 def test_the_score_sees_a_hang_a_crash_and_a_torn_log(monkeypatch):
-    monkeypatch.setattr(fault_runs, "LONGEST_S", 0.5)
+    monkeypatch.setattr(fault_witness, "LONGEST_S", 0.5)
     assert any(f.startswith("hang") for f in carry_out(FaultCase(0, FEATURES, "", ()))["failures"])
     monkeypatch.undo()
 
@@ -92,7 +138,21 @@ def test_the_score_sees_a_hang_a_crash_and_a_torn_log(monkeypatch):
 
 @pytest.mark.parametrize("kind", FaultKind)
 def test_a_node_that_has_every_fault_in_contact_is_answered(kind):
-    start = phase_windows(FEATURES)["scan"][0] + S // 5
+    start = phase_windows(FEATURES, True)["scan"][0] + S // 5
     faults = tuple(Fault(kind, node, start, S // 4, incoming=kind is FaultKind.DEAF, seed=7) for node in (3, 16))
     run = carry_out(FaultCase(1, FEATURES, "scan", faults))
     assert run["failures"] == [] and run["hits"] > 0
+
+
+def test_a_drive_that_tells_wrong_positions_does_not_let_the_probe_be_driven_in():
+    """Reports wrong by powers of two, some of them believed: carried on as a motion they led to 16.7 N."""
+    wrong = Fault(FaultKind.WRONG_DATA, 3, 1_080_816_012, 146_755_255, seed=1530753339)
+    run = carry_out(FaultCase(100_006, FEATURES, "scan", (wrong,), files=False))
+    assert run["hits"] > 10 and run["failures"] == [] and run["force_max_n"] < 10.0
+
+
+def test_a_corrupted_target_is_not_followed():
+    """Bit errors behind the CRC of a drive's controller: it refuses the target, and the cell stops."""
+    corrupt = Fault(FaultKind.CORRUPT, 2, phase_windows(FEATURES, False)["scan"][0], S // 2, incoming=True, seed=3)
+    run = carry_out(FaultCase(2, FEATURES, "scan", (corrupt,), files=False))
+    assert run["outcome"] != "completed" and run["failures"] == [] and run["force_max_n"] < FORCE_MAX_N

@@ -1,0 +1,180 @@
+"""What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
+
+The peak of the force. Two criteria hold at once: the force may not stay above the limit for longer than reaction and
+retreat take, and it may never exceed what a probe can reach that nobody controls for the time until the cell reacts.
+Between a fault and the reaction the probe is driven on in one of two ways:
+
+- blind: without tactile frames the approach goes on, at `approach_speed`, until `sensor_stale` lets the probe retreat;
+- torn: k drives stand still and the others follow their targets, until `drive_silent` stops them. Joint i alone moves
+  the probe into the object by cᵢ = n·Jᵢ q̇ᵢ, so that without the set S it sinks in at Σcᵢ − Σ_S cᵢ: at most Σcᵢ and
+  the k most negative cᵢ turned round. The greatest of any cycle counts, over the targets of a run without faults.
+- wrong: one drive is given a target that was corrupted. Further away than 607Fh allows it is not followed (reference
+  limit); nearer, the motor i goes that far, ωᵢ T for one cycle, and the probe by n·Jᵢ ωᵢ T.
+
+To the first two times belong one cycle until the last target is reached and the drives' lag behind a ramp, 2 ζ/ω. The
+force grows with the square of the indentation, F = (δ/δ₁)² with δ₁ at 1 N, and may be at its limit at the fault:
+
+    F ≤ (√F_limit + d / δ₁)²,  d the longest of the ways for one fault, their sum for more.
+
+The contact's damping adds α δ̇, a hundredth at these speeds, which is left out.
+Source: Hunt and Crossley 1975 for the damping; `canprobe.touch.contact.indentation_from_force` for δ₁.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.candump import read_candump
+from canprobe.cell.conditions import BY_KEY
+from canprobe.cell.configuration import motor_speed_limit
+from canprobe.cell.limits import limits_of
+from canprobe.cell.supervision import Limits
+from canprobe.cell.tasks.touch import Phase
+from canprobe.emulator.node import SlaveNode
+from canprobe.errors import CanprobeError
+from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.robot.kinematics import forward_jacobian
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene import ServoSettings
+from canprobe.scene_geometry import T_flange_probe
+from canprobe.session import Session
+from canprobe.touch.contact import indentation_from_force
+
+Vector = NDArray[np.float64]
+RELEASE_NS = 100_000_000
+"""Time that the retreat has, from its command, to bring the force below the limit."""
+AT_REST_RAD = 2e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Peak:
+    """What a probe can reach until the cell reacts.
+
+    Attributes:
+        force_limit: N.
+        depth_at_1n: m.
+        blind: how far the probe sinks in without the sensor, m.
+        torn: how far it does with 0, 1, 2, … drives standing still, m.
+        wrong: how far it does by one wrong target, m.
+    """
+
+    force_limit: float
+    depth_at_1n: float
+    blind: float
+    torn: tuple[float, ...]
+    wrong: float = 0.0
+
+    def force(self, faults: int, wrong_targets: bool = False) -> float:
+        """The highest force of a run with so many faults, N; with frames to drives corrupted, or not."""
+        torn = self.torn[min(faults, len(self.torn) - 1)]
+        ways = (self.blind, torn, self.wrong if wrong_targets else 0.0)
+        sinks = max(ways) if faults < 2 else sum(ways)
+        return (math.sqrt(self.force_limit) + sinks / self.depth_at_1n) ** 2
+
+
+def peak_of(session: Session) -> Peak | None:
+    """Of a run without faults that is over; None where nothing presses."""
+    scene, limits = session.scene, limits_of(session.plan)
+    if scene.arm is None or scene.object is None or scene.probe is None:
+        return None
+    lag_s = limits.period_ns * 1e-9 + (scene.servo or ServoSettings()).drive_lag_ms * 1e-3
+    blind_s, torn_s = (_within(key)(limits) * 1e-9 + lag_s for key in ("sensor_stale", "drive_silent"))
+    assert session.world is not None
+    kappa = session.world.plant.truth()["kappa"]
+    return Peak(
+        limits.force_max,
+        indentation_from_force(1.0, scene.probe.stiffness_n_m3, scene.probe.radius_mm * 1e-3, kappa),
+        scene.task.approach_mm_s * 1e-3 * blind_s,
+        tuple((_torn_speeds(session) * torn_s).tolist()),
+        _wrong_reach(session),
+    )
+
+
+def _wrong_reach(session: Session) -> float:
+    """How far (m) the probe sinks in where one motor goes as far in a cycle as its drive lets it."""
+    scene, period_ns = session.scene, session.plan.sync.period_ns
+    assert scene.arm is not None and scene.probe is not None
+    model, share = MODELS[scene.arm.model], scene.limits.joint_speed_share
+    counts = [motor_speed_limit(model, axis, share, period_ns) * period_ns * 1e-9 for axis in range(6)]
+    q = session.cell.log.arrays()["q_target_rad"]
+    angles = q[np.isfinite(q).all(axis=1)][-1]
+    T, J = forward_jacobian(model, angles, T_flange_probe(scene.probe))
+    return float(np.abs(T[:3, 2] @ J[:3] @ model.joints_per_count * counts).max())
+
+
+def _torn_speeds(session: Session) -> Vector:
+    """Greatest speeds (7,), m/s, at which the probe sinks in while 0…6 joints stand still and the others go on."""
+    scene = session.scene
+    assert scene.arm is not None and scene.probe is not None
+    model, flange_probe = MODELS[scene.arm.model], T_flange_probe(scene.probe)
+    columns = session.cell.log.arrays()
+    q, phase = columns["q_target_rad"], columns["phase"]
+    near = (phase >= Phase.APPROACH) & (phase <= Phase.RETREAT)
+    rates = np.diff(q, axis=0) / (session.plan.sync.period_ns * 1e-9)
+    greatest = np.zeros(7)
+    for angles, rate in zip(q[1:][near[1:]], rates[near[1:]], strict=True):
+        T, J = forward_jacobian(model, angles, flange_probe)
+        shares = T[:3, 2] @ J[:3] * rate
+        missing = np.sort(np.maximum(-shares, 0.0))[::-1]
+        greatest = np.maximum(greatest, shares.sum() + np.concatenate([[0.0], np.cumsum(missing)]))
+    return greatest
+
+
+def _within(key: str) -> Callable[[Limits], int]:
+    within = BY_KEY[key].within
+    assert within is not None
+    return within
+
+
+def score_force(
+    rows: Sequence[tuple[int, float]], limits: Limits, bound_n: float | None
+) -> tuple[float, int, list[str]]:
+    """Highest force, N; longest time above the limit, ns; failures. Without a bound nothing can fail."""
+    longest = 0
+    since: int | None = None
+    for t_ns, force in rows:
+        if force <= limits.force_max:
+            since = None
+            continue
+        since = t_ns if since is None else since
+        longest = max(longest, t_ns - since)
+    highest = max((force for _, force in rows), default=0.0)
+    if bound_n is None:
+        return highest, longest, []
+    failures = []
+    if longest > _within("force")(limits) + RELEASE_NS:
+        failures.append(f"force above the limit for {longest * 1e-6:.0f} ms, up to {highest:.2f} N")
+    if highest > bound_n:
+        failures.append(f"force of {highest:.2f} N, at most {bound_n:.2f} N are possible until the cell reacts")
+    return highest, longest, failures
+
+
+def score_rest(moved_rad: float, nodes: Sequence[SlaveNode]) -> list[str]:
+    """Motion after the stop, and drives that are not disabled."""
+    failures = [f"motion after the stop: {moved_rad:.5f} rad"] if moved_rad > AT_REST_RAD else []
+    for node in nodes:
+        if not node.dictionary.has_index(0x6041):
+            continue
+        if (state := state_of(node.dictionary.number(0x6041))) in POWERED_STATES:
+            failures.append(f"{node.name} is {state.name} after the stop")
+    return failures
+
+
+def score_log(session: Session, steps: int) -> list[str]:
+    """Every cycle has its row; where frames are written down, every one that was on the bus is in the file."""
+    failures = []
+    if session.opened and (rows := len(session.cell.log)) < steps:
+        failures.append(f"log: {rows} rows of {steps} cycles")
+    if session.out is None:
+        return failures
+    try:
+        lines = sum(1 for _ in read_candump(session.out / "bus.log"))
+    except CanprobeError as error:
+        return [*failures, f"log: {error}"]
+    frames = sum(counter.frames for counter in session.traffic.values())
+    return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]

@@ -1,0 +1,25 @@
+"""Study `faults` on a real vcan0: whatever is killed, stalled or unplugged, nothing is left with power."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from canprobe.cli import main
+from canprobe.studies.fault_processes import ProcessFault
+
+pytestmark = pytest.mark.vcan
+
+
+@pytest.mark.timeout(300)
+def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
+    assert main(["study", "faults", "--vcan", "--quick", "--json", "--out", str(tmp_path)]) == 0
+    rows = {row["fault"]: row for row in json.loads(capsys.readouterr().out)["rows"]}
+    assert set(rows) == {fault.value for fault in ProcessFault}
+    assert {row["failures"] for row in rows.values()} == {""}
+    assert rows["master killed"]["status"] == -9
+    assert all(row["status"] in (1, 3) for name, row in rows.items() if name != "master killed")
+    # nodes that outlive their master have stopped by themselves; they go with their interface
+    assert rows["master killed"]["drives"] == "SWITCH_ON_DISABLED"
+    assert rows["nodes killed"]["drives"] == "gone"
