@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 import canprobe.errors

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import CandumpWriter, RecordingPort

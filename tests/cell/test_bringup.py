@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.bringup import configuration_date

@@ -6,7 +6,7 @@ import json
 
 import numpy as np
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.candump import read_candump

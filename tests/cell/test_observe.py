@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.api import Command

@@ -6,7 +6,7 @@ import dataclasses
 import json
 
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.build import make_task

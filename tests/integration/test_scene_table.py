@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from runs import undrawn_run
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.errors import PlanError
