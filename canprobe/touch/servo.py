@@ -133,7 +133,7 @@ class LocalSurface:
         self._normal = _unit(normal.tolist())
 
     def set_curvature(self, tensor: Vector) -> None:
-        """Go over, with the next samples, to the estimator's curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
+        """Go over, with the next samples, to a curvature tensor (3, 3), symmetric, 1/m, in the same frame."""
         self._wanted = tensor.tolist()
 
 
