@@ -56,8 +56,8 @@ class SampleSource:
             return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
+        self._feel(received.estimate)  # before the next contact, as the task does
         taxels, wrench, contact = self._touch(measurement, t_ns - measurement.t_ns)
-        self._feel(received.estimate)  # after the contact that it rests on, as the task does
         return Sample(
             t_ns,
             cycle=measurement.cycle,

@@ -15,7 +15,7 @@ from canprobe.bridge.view.panel import Panel
 from canprobe.bridge.view.path_nodes import GrowingPath
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale
+from canprobe.bridge.view.trail import OFF_PATH, Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
 from canprobe.scene_geometry import true_object
 
@@ -23,6 +23,7 @@ FRAME_NS, PLOT_NS = 40_000_000, 250_000_000
 """Time on the wall between two pictures, and between two drawings of the plots."""
 ROW_S, WINDOW_S = 0.05, 30.0
 """Time between two points of a plot, and how much of the past it shows."""
+_OFF_PATH = tuple(phase.name.lower() for phase in OFF_PATH)
 
 
 class LiveView:
@@ -59,7 +60,7 @@ class LiveView:
     def write(self, sample: Sample) -> None:
         """Take one sample; now and then show where the cell is."""
         moment = self._follower.take(sample)
-        if sample.contact is not None and moment.phase != "approach":
+        if sample.contact is not None and moment.phase not in _OFF_PATH:
             value = moment.error if self._follower.shape is not None else moment.sigma
             self._trail.add(moment.t_s, sample.contact.point, sample.contact.normal, value)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):

@@ -14,9 +14,8 @@ from canprobe.bridge.view.path_nodes import LoadedPath
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.server import address, open_server
 from canprobe.bridge.view.stage import Stage
-from canprobe.bridge.view.trail import Trail, error_scale
+from canprobe.bridge.view.trail import OFF_PATH, Trail, error_scale
 from canprobe.bus.clock import MonotonicClock
-from canprobe.cell.tasks.touch import Phase
 from canprobe.scene_geometry import true_object
 from canprobe.touch.objects import PlacedShape
 
@@ -96,7 +95,7 @@ def trail_of(run: RecordedRun) -> Trail:
     trail, log = Trail(), run.log
     if "contact_mm" not in log:
         return trail
-    touched = np.isfinite(log["contact_mm"]).all(axis=1) & (log["phase"] != Phase.APPROACH)
+    touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
     rows = np.nonzero(touched)[0]
     answers = np.searchsorted(run.answers, rows, side="right") - 1
     known = run.sigmas if run.scene.object is None else run.errors

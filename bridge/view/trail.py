@@ -10,6 +10,7 @@ import numpy as np
 
 from canprobe.bridge.view.colours import Colours, scale
 from canprobe.bridge.view.meshes import Array
+from canprobe.cell.tasks.touch import Phase
 from canprobe.touch.objects import PlacedShape
 
 SPACING_M = 4e-4
@@ -18,6 +19,8 @@ LIFT_M = 1e-3
 """Off the surface, along the normal, so that the ghost does not hide the path."""
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
+OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
+"""Phases in which what the array still feels, or feels first, is no point of the path."""
 SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 

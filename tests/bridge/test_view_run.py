@@ -80,15 +80,16 @@ def test_live_and_recorded_show_the_same(run, recorded, samples):
     """The samples of the bridge, followed, against what was read from the folder, at every answer."""
     follower = Follower(true_object(recorded.result.plan.scene.object))
     first_s = recorded.first_ns * 1e-9
-    compared = 0
+    compared, touched = 0, None
     for sample in samples:
         live = follower.take(sample)
+        touched = sample.contact or touched
         if sample.patch is None:
             continue
         kept = run.at(live.t_s - first_s)
         assert live.q.tolist() == kept.q.tolist() and live.phase in {kept.phase, "retreat"}
         assert live.force == pytest.approx(kept.force) and live.error == pytest.approx(kept.error, nan_ok=True)
-        assert live.contact is sample.contact
+        assert live.contact is touched
         apart, normal = live.contact.point - kept.contact.point, kept.contact.normal
         assert np.linalg.norm(apart - (apart @ normal) * normal) < 5e-6  # its height is the sample's business
         assert live.contact.T_base_contact[:3, 2] == pytest.approx(kept.contact.T_base_contact[:3, 2], abs=1e-6)
