@@ -10,7 +10,7 @@ from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
-from canprobe.cell.drives import DriveGroup
+from canprobe.cell.drives import DriveGroup, Vector
 from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.observe import Observers
@@ -146,7 +146,8 @@ class Cell:
         Args:
             controller: has ``step(measurement) → command``, or is such a function. Where it has ``retreat(reason)`` the
                 cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
-                the contact to it.
+                the contact to it. Where it has ``inspect(q)`` it sees the joint angles (6,), rad, before the drives are
+                enabled, and may say why they must not be.
             progress: called after each cycle.
 
         Raises:
@@ -157,7 +158,7 @@ class Cell:
         step = controller.step if hasattr(controller, "step") else controller
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
         self._tracker = getattr(controller, "shape", None)
-        self._enable()
+        self._enable(getattr(controller, "inspect", None))
         assert self.cycle is not None
         while True:
             measurement = self.cycle.begin()
@@ -175,13 +176,15 @@ class Cell:
 
     # enabling and supervision
 
-    def _enable(self) -> None:
+    def _enable(self, inspect: Callable[[Vector], str | None] | None) -> None:
         if self.drives is None:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         self._cycle_until((), WARM_UP_S)
         self._await_rest()
+        if inspect is not None and (reason := inspect(self.drives.joints())) is not None:
+            raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
             i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)

@@ -71,18 +71,23 @@ class JointCheck:
         except StopIteration:
             return Command(done=True)
 
+    def inspect(self, q: Vector) -> str | None:
+        """Why an arm that stands at joint angles (6,), rad, must not be enabled."""
+        self.start = q
+        outside = np.flatnonzero((q < self._low) | (q > self._high))
+        if not outside.size:
+            return None
+        joint = int(outside[0])
+        low, high = np.degrees((self._low[joint], self._high[joint]))
+        return (
+            f"joint {joint + 1} stands at {math.degrees(q[joint]):.1f} deg, outside {low:.1f} to {high:.1f} deg:"
+            " move it there by hand, or its zero is wrong"
+        )
+
     def _all_joints(self) -> Generator[Command, Measurement, None]:
         measurement = yield Command()
         assert measurement.q is not None
         start = self.start = measurement.q
-        outside = np.flatnonzero((start < self._low) | (start > self._high))
-        if outside.size:
-            joint = int(outside[0])
-            low, high = np.degrees((self._low[joint], self._high[joint]))
-            yield Command(
-                stop_reason=f"joint {joint + 1} stands at {math.degrees(start[joint]):.1f} deg, outside {low:.1f} to"
-                f" {high:.1f} deg: move it there by hand, or its zero is wrong"
-            )
         for joint in range(len(start)):
             finding = yield from self._joint(joint, start)
             if finding is not None:
