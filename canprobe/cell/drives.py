@@ -149,7 +149,8 @@ class DriveGroup:
         self._heard[i] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
-        if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=enabled):
+        guarded = enabled and self._aimed is not None  # of a log without targets nobody knows where it was to go
+        if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
             self.implausible += 1
 
     def end_collect(self) -> None:
@@ -205,8 +206,6 @@ class DriveGroup:
         """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
         if q is not None:
             self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
-        if self._targets is not None:
-            self.aim(self._targets)
 
     def aim(self, targets: Sequence[int]) -> None:
         """The drives are told ``targets`` (counts) in this cycle: what they may do next follows from it."""
@@ -218,6 +217,7 @@ class DriveGroup:
     def frames(self) -> list[Frame]:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        self.aim(targets)
         key = (self.goal, *self.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
             words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]

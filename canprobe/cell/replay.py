@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from canprobe.cell.build import make_task
+from canprobe.cell.limits import limits_of
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
@@ -76,7 +77,10 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
     differences: list[int] = []
     away = 0
+    hold_cycles = limits_of(plan).hold_cycles
     for cycle in controller_cycles(cycles):
+        if max(cycle.measurement.q_age, default=0) >= hold_cycles:
+            continue  # a late drive: the cell held, and asked its controller nothing
         command = task.step(cycle.measurement)
         if cycle.targets is not None and command.q_target is not None:
             counts = np.round(joints_to_counts(model, command.q_target))

@@ -41,7 +41,7 @@ class SurfaceGains:
 
     height_hz: float = 8.0
     tilt_hz: float = 6.0
-    curvature_hz: float = 4.0
+    curvature_hz: float = 5.0
 
 
 class LocalSurface:
