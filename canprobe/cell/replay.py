@@ -13,7 +13,8 @@ from canprobe.cell.limits import limits_of
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
-from canprobe.cell.tasks.touch import TOUCH_FORCE, TouchTask
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.cell.tasks.touch_settings import TOUCH_FORCE
 from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS, joints_to_counts
 

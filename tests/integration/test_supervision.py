@@ -16,7 +16,7 @@ from canprobe.cell.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Command
 from canprobe.cell.supervision import Reaction
-from canprobe.cell.tasks.touch import Phase
+from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, SafetyStop

@@ -15,7 +15,8 @@ from canprobe.cell.tasks.calibration import array_calibration
 from canprobe.cell.tasks.probe_motion import MotionBounds, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
-from canprobe.cell.tasks.touch import TouchSettings, TouchTask
+from canprobe.cell.tasks.touch import TouchTask
+from canprobe.cell.tasks.touch_settings import TouchSettings
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.puma260 import MODELS

@@ -15,7 +15,7 @@ from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.touch import TOUCH_FORCE, Phase
+from canprobe.cell.tasks.touch_settings import TOUCH_FORCE, Phase
 from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.servo import ProbePose
