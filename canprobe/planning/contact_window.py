@@ -15,6 +15,8 @@ from canprobe.protocol.tactile import WINDOWS
 from canprobe.scene import ProbeSettings, Scene
 
 PITCH_M = 1.5875e-3
+PRESSING = ("scan", "press", "calibrate")
+"""Kinds of task with a force to hold."""
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
 
@@ -26,14 +28,19 @@ def patch_radius_m(force_n: float, probe: ProbeSettings) -> float:
     return math.sqrt(2.0 * radius * depth)
 
 
+def patch_across_taxels(force_n: float, probe: ProbeSettings) -> float:
+    """Diameter of the contact patch on a plane, in taxels."""
+    return 2.0 * patch_radius_m(force_n, probe) / PITCH_M
+
+
 def taxels_needed(force_n: float, probe: ProbeSettings) -> float:
     """Taxels along a window that always holds the patch."""
-    return 2.0 * (patch_radius_m(force_n, probe) / PITCH_M + FOLLOWING_TAXELS)
+    return patch_across_taxels(force_n, probe) + 2.0 * FOLLOWING_TAXELS
 
 
 def window_choices(scene: Scene) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason; without a force to hold the largest first."""
-    if scene.probe is None or scene.task.kind not in ("scan", "press", "calibrate"):
+    if scene.probe is None or scene.task.kind not in PRESSING:
         return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(WINDOWS))
     force, needed = scene.task.force_n, taxels_needed(scene.task.force_n, scene.probe)
     patch = (

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 from collections.abc import Callable
 
 from canprobe.planning.bridges import bridge_outputs
+from canprobe.planning.contact_window import PRESSING, patch_across_taxels, taxels_needed
 from canprobe.scene import Scene
 
 _Reason = Callable[[Scene], str | None]
@@ -22,9 +24,20 @@ def _no_sensor(scene: Scene) -> str | None:
 def _no_image(scene: Scene) -> str | None:
     if scene.sensor is None or scene.sensor.mode == "image":
         return None
+    return _by_window(scene) if scene.sensor.mode == "window" else _by_sensor(scene)
+
+
+def _by_window(scene: Scene) -> str:
+    assert scene.sensor is not None
     side = scene.sensor.window
-    why = f"the {side}×{side} window round the contact holds the patch"
-    return why if scene.sensor.mode == "window" else _by_sensor(scene)
+    name = f"the {side}×{side} window round the contact"
+    if scene.probe is None or scene.task.kind not in PRESSING or isinstance(side, str):
+        return f"{name} is sent"
+    across = patch_across_taxels(scene.task.force_n, scene.probe)
+    if side >= across:
+        return f"{name} holds the patch"
+    needed = math.ceil(taxels_needed(scene.task.force_n, scene.probe))
+    return f"{name} is sent, which cuts a patch of {across:.1f} taxels: the force reads low; {needed} taxels hold it"
 
 
 def _no_window(scene: Scene) -> str | None:

@@ -44,6 +44,15 @@ def test_features_map_no_taxels():
     assert {"full image (32 PDOs)", "window (8 PDOs)", "taxels and patch features in the master"} <= set(left)
 
 
+def test_a_window_smaller_than_the_patch_is_told():
+    cylinder = load_scene("cylinder")
+    small = make_plan(dataclasses.replace(cylinder, sensor=dataclasses.replace(cylinder.sensor, window=6)))
+    said = {what: why for what, why in small.left_out if what.startswith("full image")}
+    assert "cuts a patch of 6.7 taxels: the force reads low; 9 taxels hold it" in next(iter(said.values()))
+    whole = {what: why for what, why in make_plan(cylinder).left_out if what.startswith("full image")}
+    assert next(iter(whole.values())).endswith("holds the patch")
+
+
 def test_the_patch_is_left_out_where_it_is_switched_off_or_no_taxels_are_sent():
     axial = load_scene("axial")
     off = dataclasses.replace(axial, shape=dataclasses.replace(axial.shape, patch=False))
