@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from canopen import ObjectDictionary
+from canopen.objectdictionary import ObjectDictionaryError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import PumpedNetwork
@@ -283,7 +284,7 @@ class BringUp:
         variable = _variable(setup, index, subindex)
         try:
             return int(variable.decode_raw((yield from upload(index, subindex))))
-        except (SdoAbortedError, SdoCommunicationError) as error:
+        except (SdoAbortedError, SdoCommunicationError, ObjectDictionaryError) as error:  # the last: of another size
             raise NodeError(
                 setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
             ) from error
