@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.supervision import Contact, Limits
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion
+from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.touch_settings import TOUCH_FORCE, Phase
 from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
@@ -57,7 +57,7 @@ class CalibrationSettings:
     lead_s: float
 
 
-class CalibrateTask:
+class CalibrateTask(ProbingTask):
     """Touch after touch; the estimate in the end.
 
     Args:
@@ -73,33 +73,14 @@ class CalibrateTask:
     def __init__(
         self, settings: CalibrationSettings, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]
     ) -> None:
-        self.phase = Phase.MOVE
+        super().__init__(sensing, motion_from)
         self.touches: list[BallTouch] = []
         self.estimate: ToolEstimate | None = None
-        self.reason: str | None = None
-        self.taxels: NDArray[np.uint8] | None = None
-        self.sensing = sensing
         self._s = settings
-        self._motion_from = motion_from
-        self._motion: ProbeMotion | None = None
         self._line: LineMotion | ArcMotion | None = None
-        self._t = 0.0
         self._number = 0
-        self._force = 0.0
-        self._hidden = HiddenForce()
         self._gone = 0.0
         self._felt: list[ContactSample] = []
-        self._columns: dict[str, float | Vector] = {}
-
-    @property
-    def unplaced(self) -> int:
-        """Contacts that were not used because the joints of their instant are unknown."""
-        return self.sensing.dropped
-
-    @property
-    def slowed(self) -> int:
-        """Cycles in which a joint could not keep up with the probe's path."""
-        return self._motion.slowed if self._motion is not None else 0
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -111,17 +92,7 @@ class CalibrateTask:
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
         self._t += self._s.period_s
-        target = self._motion.step(pose)
-        if self._motion.limit is not None:
-            self.retreat(self._motion.limit)
-        self._columns["phase"] = float(self.phase)
-        done = self.phase is Phase.DONE
-        return Command(
-            q_target=target,
-            done=done and self.reason is None,
-            stop_reason=self.reason if done else None,
-            columns=self._columns,
-        )
+        return self._command(pose)
 
     def retreat(self, reason: str) -> None:
         """Let go and end for a reason that the cell has."""
@@ -148,17 +119,8 @@ class CalibrateTask:
             self.taxels = measurement.tactile.frame.taxels
             if contact is not None and self._t > SETTLE_S:
                 self._felt.append(contact)
-        nothing = np.full(3, np.nan)
-        self._columns = {
-            "phase": float(self.phase),
-            "sample_cycle": float(measurement.tactile.cycle),
-            "force_n": patch.force,
-            "pad_u_mm": patch.u * 1e3,
-            "pad_v_mm": patch.v * 1e3,
-            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
-            "normal": contact.n_base if contact is not None else nothing,
-            "touch": float(self._number + 1),
-        }
+        touch: dict[str, float | Vector] = {"touch": float(self._number + 1)}
+        self._columns = self._felt_columns(measurement.tactile, patch, contact) | touch
 
     def _watch(self, measurement: Measurement) -> None:
         if self.reason is not None or self.phase is Phase.DONE:
@@ -169,9 +131,6 @@ class CalibrateTask:
             self.retreat(str(finding.error))
 
     # phases: each returns the pose for this cycle
-
-    def _enter(self, phase: Phase) -> None:
-        self.phase, self._t = phase, 0.0
 
     def _at(self, gap: float) -> ProbePose:
         """Probe at a distance from the expected ball, with this touch's direction and pole."""
@@ -249,10 +208,6 @@ class CalibrateTask:
         if self._t >= self._line.duration + self._s.lead_s:
             self._move_on()
         return pose
-
-    def _done(self) -> ProbePose:
-        assert self._motion is not None
-        return self._motion.pose
 
 
 _STEPS: dict[Phase, Callable[[CalibrateTask], ProbePose]] = {

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.supervision import Contact, Reaction
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
+from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.regain import REST_S, SPEED, Loss, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
@@ -21,7 +21,6 @@ from canprobe.cell.tasks.touch_settings import Phase, TouchSettings
 from canprobe.touch.at_rest import AtRest
 from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.patch import Patch
 from canprobe.touch.servo import LocalSurface, ProbePose, TactileServo
 from canprobe.touch.strategy import PathFollower, Strategy
 
@@ -43,7 +42,7 @@ LOST = 0.1
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
-class TouchTask:
+class TouchTask(ProbingTask):
     """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
 
     Args:
@@ -62,27 +61,19 @@ class TouchTask:
         strategy: Strategy | None,
         shape: ShapeTracker | None,
     ) -> None:
-        self.phase = Phase.MOVE
+        super().__init__(sensing, motion_from)
         self.shape = shape
-        self.sensing = sensing
-        self.reason: str | None = None
-        self.taxels: NDArray[np.uint8] | None = None
         self._scan_start: int | None = None
         self._scan_end: int | None = None
         self._s = settings
-        self._motion_from = motion_from
         self._strategy = strategy
-        self._motion: ProbeMotion | None = None
         self._line: LineMotion | None = None
         self._servo: TactileServo | None = None
-        self._t = 0.0
         self._dt = settings.period_s
         self._last_ns: int | None = None
         self._cycle = 0
         self._sample_t: float | None = None
-        self._force = 0.0
         self._lost = 0.0
-        self._hidden = HiddenForce()
         self.losses: list[Loss] = []
         self._search: Search | None = None
         self._asked: ProbePose | None = None
@@ -94,7 +85,6 @@ class TouchTask:
         self._push_from: tuple[Vector, Vector] | None = None
         self._at_rest = AtRest()
         self._pole0: Vector = np.zeros(3)
-        self._columns: dict[str, float | Vector] = {}
         self._shape_columns: dict[str, float | Vector] = {}
         self._estimate: SurfaceEstimate | None = None
 
@@ -104,16 +94,6 @@ class TouchTask:
         if self._scan_start is None:
             return None
         return self._scan_start, self._cycle if self._scan_end is None else self._scan_end
-
-    @property
-    def unplaced(self) -> int:
-        """Contacts that were not used because the joints of their instant are unknown."""
-        return self.sensing.dropped
-
-    @property
-    def slowed(self) -> int:
-        """Cycles in which a joint could not keep up with the probe's path."""
-        return self._motion.slowed if self._motion is not None else 0
 
     @property
     def targets(self) -> dict[str, float]:
@@ -145,17 +125,7 @@ class TouchTask:
         self._t += self._dt
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
-        target = self._motion.step(pose)
-        if self._motion.limit is not None:
-            self.retreat(self._motion.limit)
-        self._columns["phase"] = float(self.phase)
-        return Command(
-            q_target=target,
-            done=self.phase is Phase.DONE and self.reason is None,
-            stop_reason=self.reason if self.phase is Phase.DONE else None,
-            columns=self._columns,
-            estimate=self._estimate,
-        )
+        return self._command(pose, self._estimate)
 
     # sensing and supervision
 
@@ -190,7 +160,8 @@ class TouchTask:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
-        self._columns = self._columns_of(measurement, patch, contact) | {"depth_at_1n_mm": depth_at_1n_mm}
+        felt_columns = self._felt_columns(measurement.tactile, patch, contact)
+        self._columns = felt_columns | self._shape_columns | {"depth_at_1n_mm": depth_at_1n_mm}
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
         """Learn from the growing force how stiff this touch is; what was measured so far moves with it, no bump."""
@@ -230,22 +201,6 @@ class TouchTask:
             if self.phase not in _LEAVING and is_too_hollow(estimate, self.sensing.radius):
                 hollow = -1e3 / float(estimate.kappa[1])
                 self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
-
-    def _columns_of(
-        self, measurement: Measurement, patch: Patch, contact: ContactSample | None
-    ) -> dict[str, float | Vector]:
-        nothing = np.full(3, np.nan)
-        assert measurement.tactile is not None
-        return {
-            "phase": float(self.phase),
-            "sample_cycle": float(measurement.tactile.cycle),
-            "force_n": patch.force,
-            "pad_u_mm": patch.u * 1e3,
-            "pad_v_mm": patch.v * 1e3,
-            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
-            "normal": contact.n_base if contact is not None else nothing,
-            **self._shape_columns,
-        }
 
     def _watch(self, measurement: Measurement) -> None:
         if self.phase in _LEAVING:
@@ -291,10 +246,6 @@ class TouchTask:
         away = ProbePose(pose.centre - pose.pole * self._s.retreat, pose.pole)
         self._line = LineMotion(pose, away, self._s.retreat_speed, at_once=True)
         self._enter(Phase.RETREAT)
-
-    def _enter(self, phase: Phase) -> None:
-        self.phase = phase
-        self._t = 0.0
 
     # phases: each returns the pose for this cycle
 
@@ -405,10 +356,6 @@ class TouchTask:
         if self._t >= self._line.duration + self._s.lead_s:
             self._enter(Phase.DONE)
         return pose
-
-    def _done(self) -> ProbePose:
-        assert self._motion is not None
-        return self._motion.pose
 
 
 _STEPS: dict[Phase, Callable[[TouchTask], ProbePose]] = {

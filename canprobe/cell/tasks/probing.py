@@ -1,0 +1,102 @@
+"""What every task that touches with the probe has: a phase, the probe's motion, and what it says in each cycle."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.hidden_force import HiddenForce
+from canprobe.cell.measurement import Command, TactileSample
+from canprobe.cell.tasks.probe_motion import ProbeMotion
+from canprobe.cell.tasks.sensing import ContactSensing
+from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.patch import Patch
+from canprobe.touch.servo import ProbePose
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate import SurfaceEstimate
+
+Vector = NDArray[np.float64]
+
+
+class ProbingTask:
+    """Base of the tasks that touch.
+
+    Args:
+        sensing: contacts from measurements.
+        motion_from: makes the probe's motion from the first joint angles.
+
+    Attributes:
+        phase: what it is about.
+        reason: why it stopped; None while all is well.
+        taxels: last image of the touch itself.
+    """
+
+    def __init__(self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]) -> None:
+        self.phase = Phase.MOVE
+        self.sensing = sensing
+        self.reason: str | None = None
+        self.taxels: NDArray[np.uint8] | None = None
+        self._motion_from = motion_from
+        self._motion: ProbeMotion | None = None
+        self._t = 0.0
+        self._force = 0.0
+        self._hidden = HiddenForce()
+        self._columns: dict[str, float | Vector] = {}
+
+    @property
+    def unplaced(self) -> int:
+        """Contacts that were not used because the joints of their instant are unknown."""
+        return self.sensing.dropped
+
+    @property
+    def slowed(self) -> int:
+        """Cycles in which a joint could not keep up with the probe's path."""
+        return self._motion.slowed if self._motion is not None else 0
+
+    def retreat(self, reason: str) -> None:
+        """Let go and end for a reason that the cell has."""
+        raise NotImplementedError
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._t = 0.0
+
+    def _done(self) -> ProbePose:
+        assert self._motion is not None
+        return self._motion.pose
+
+    def _command(self, pose: ProbePose, estimate: SurfaceEstimate | None = None) -> Command:
+        """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""
+        assert self._motion is not None
+        target = self._motion.step(pose)
+        if self._motion.limit is not None:
+            self.retreat(self._motion.limit)
+        self._columns["phase"] = float(self.phase)
+        done = self.phase is Phase.DONE
+        return Command(
+            q_target=target,
+            done=done and self.reason is None,
+            stop_reason=self.reason if done else None,
+            columns=self._columns,
+            estimate=estimate,
+        )
+
+    def _felt_columns(
+        self, sample: TactileSample, patch: Patch, contact: ContactSample | None
+    ) -> dict[str, float | Vector]:
+        """What an image says, for the log."""
+        nothing = np.full(3, np.nan)
+        return {
+            "phase": float(self.phase),
+            "sample_cycle": float(sample.cycle),
+            "force_n": patch.force,
+            "pad_u_mm": patch.u * 1e3,
+            "pad_v_mm": patch.v * 1e3,
+            "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
+            "normal": contact.n_base if contact is not None else nothing,
+        }
