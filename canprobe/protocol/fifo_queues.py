@@ -81,7 +81,7 @@ def _in_the_queue(sent: Sequence[_Sent], rank: int, total: int) -> int:
 
 
 def _response(sent: Sequence[_Sent], rank: int, delays: Sequence[int | None], bit: int) -> int | None:
-    """From the event to the end of the frame; None where that is no bound. Source: Davis et al. 2011, (10)."""
+    """From the event to the end of the frame; None where that is no bound."""
     one = sent[rank]
     lowest, frames = max(one.queue), [sent[other].frame_ns for other in one.queue]
     above = [other for other in range(lowest) if other not in one.queue]
