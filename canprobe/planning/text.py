@@ -41,6 +41,9 @@ def _lines(plan: Plan) -> Iterator[str]:
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "
         f"heartbeat every {HEARTBEAT_PRODUCED_MS} ms, lost after {HEARTBEAT_CONSUMED_MS} ms"
     )
+    if bus.transmit_queue == "fifo":
+        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat holds up what follows it'
+    yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan.nodes))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
     for one in plan.buses:
