@@ -76,6 +76,8 @@ def analyse_cycle(messages: CycleMessages, compute_ns: int, bitrate: int) -> tup
         ):
             break
         sync_ns, feedback_ns = late_sync, late_feedback
+    else:
+        analysis = _without_bound(analysis)
     return analysis, _budget(messages, analysis, looks, feedback_ns, compute_ns)
 
 
@@ -83,6 +85,13 @@ def _analyse(placed: Sequence[Message], fifo_nodes: Mapping[str, int], bitrate: 
     if fifo_nodes:
         return worst_case_response_fifo(placed, fifo_nodes, bitrate)
     return worst_case_response(placed, bitrate)
+
+
+def _without_bound(analysis: BusAnalysis) -> BusAnalysis:
+    """What is left where the rounds do not come to an end."""
+    return dataclasses.replace(
+        analysis, responses=tuple(dataclasses.replace(one, response_ns=None) for one in analysis.responses)
+    )
 
 
 def look_times(period_ns: int, feedback_ns: int | None) -> tuple[int, ...]:
