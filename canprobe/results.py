@@ -115,8 +115,8 @@ def summarise(
     cycle = cell.cycle
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = cell.log.arrays()
-    return {
+    log = log_columns(cell)
+    summary = {
         "schema": SCHEMA,
         "scene": scene.name,
         "bus": scene.bus.interface,
@@ -142,6 +142,21 @@ def summarise(
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+    return {name: _without_nan(value) for name, value in summary.items()}
+
+
+def log_columns(cell: Cell) -> dict[str, Array]:
+    """The columns of ``log.npz``; a run that was stopped before its first cycle has the time's, without a row."""
+    return {"t_s": np.empty(0), **cell.log.arrays()}
+
+
+def _without_nan(value: Any) -> Any:
+    """The same for JSON: what is not finite does not apply."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _traffic(session: Session) -> dict[str, Any]:
@@ -173,7 +188,7 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
-            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
         "losses": summarise_losses(getattr(controller, "losses", ()))
     }
