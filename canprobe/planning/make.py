@@ -23,7 +23,7 @@ from canprobe.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.planning.needs import missing_objects
+from canprobe.planning.needs import missing_bitrate, missing_objects
 from canprobe.planning.open_keys import candidates
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_traffic
@@ -207,7 +207,7 @@ def _devices(scene: Scene) -> tuple[dict[int, Abilities], list[str]]:
         except EdsError as error:
             problems.append(str(error))
             continue
-        problems += missing_objects(device, kind, scene)
+        problems += missing_objects(device, kind, scene) + missing_bitrate(device, kind, scene)
         devices.update(dict.fromkeys(node_ids, device))
     return devices, problems
 
