@@ -50,6 +50,11 @@ def test_it_presses_gently_and_lets_go_between_the_touches(calibrated):
     assert all(force[a:b].min() == 0.0 for a, b in itertools.pairwise(touches))
 
 
+def test_its_frames_are_those_the_plan_lists(calibrated):
+    measured = canprobe.measure_traffic(calibrated.out, calibrated.plan)
+    assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
+
+
 def test_terminal_and_files_say_it(calibrated):
     text = calibrated.text()
     assert "7 touches, condition number" in text

@@ -40,6 +40,18 @@ def test_a_touch_is_as_planned_to_the_frame(press):
     assert measured.load < measured.planned_worst
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["axial", "cylinder", "free", "listen", "plane", "saddle", "sphere"])
+def test_a_packaged_scene_sends_what_its_plan_lists_and_nothing_else(name, tmp_path):
+    """The others are measured where they are run anyway."""
+    result = undrawn_run(canprobe.load_scene(name), out=tmp_path, duration_s=0.5)
+    measured = canprobe.measure_traffic(tmp_path, result.plan)
+    assert measured.as_planned and measured.exact
+    assert measured.unlisted == {} and measured.missing == () and measured.error_frames == 0
+    assert all(one.late == 0 for one in measured.classes)
+    assert measured.load < measured.planned_worst
+
+
 def test_the_summary_says_the_same(press):
     result, folder = press
     measured = canprobe.measure_traffic(folder / "bus.log", result.plan).as_dict()
