@@ -217,7 +217,8 @@ class BringUpSettings:
     boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0  # from the reset to the boot-up message
     sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5  # for one answer
     start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0  # from NMT start to the heartbeat that tells it
-    retries: Annotated[int, Range(0, 100)] = 1  # of a reset and of a request without an answer
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0  # for the emulated nodes' process to start
+    retries: Annotated[int, Range(0, 100)] = 2  # of a reset, a request or a start without an answer
     store: bool = False  # 1010h keeps the configuration in the nodes; 1020h tells the next bring-up to leave it out
 
 

@@ -79,7 +79,7 @@ class BringUpTimes:
         sdo: for one answer.
         start: from NMT start to the first heartbeat that tells it.
         release: for one answer when the nodes are let go.
-        retries: how often a reset or a request without an answer is sent again.
+        retries: how often a reset, a request or a start without an answer is sent again.
         store: let the nodes keep their configuration (1010h), and leave it out where 1020h says that it is there.
     """
 
@@ -89,7 +89,7 @@ class BringUpTimes:
     sdo: float = 0.5
     start: float = 1.0
     release: float = 0.1
-    retries: int = 1
+    retries: int = 2
     store: bool = False
 
 
@@ -307,20 +307,31 @@ class BringUp:
             )
 
     def _start(self) -> None:
-        self._say("start all nodes")
         self._watch.forget()
-        self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in self._setups])
-        ids = [s.node_id for s in self._setups]
-        if not self._network.pump_until(
-            lambda: all(self._watch.states.get(i) is NmtState.OPERATIONAL for i in ids), self._times.start
-        ):
-            slow = next(s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL)
-            state = self._watch.states.get(slow.node_id)
-            raise NodeError(
-                slow.node_id,
-                f"({slow.name}) is not operational {self._times.start:g} s after NMT start:"
-                f" {'no heartbeat' if state is None else state.name}",
-            )
+        waiting = list(self._setups)
+        for _ in range(1 + self._times.retries):
+            all_of_them = len(waiting) == len(self._setups)
+            which = "all nodes" if all_of_them else f"nodes {', '.join(str(s.node_id) for s in waiting)} again"
+            self._say(f"start {which}")
+            self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in waiting])
+            self._network.pump_until(lambda: not self._not_operational(), self._times.start)
+            if not (waiting := self._not_operational()):
+                return
+        self._raise_not_operational(waiting)
+
+    def _not_operational(self) -> list[NodeSetup]:
+        return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
+
+    def _raise_not_operational(self, waiting: Sequence[NodeSetup]) -> None:
+        slow, *others = waiting
+        state = self._watch.states.get(slow.node_id)
+        tries = f", {1 + self._times.retries} times" if self._times.retries else ""
+        raise NodeError(
+            slow.node_id,
+            f"({slow.name}) is not operational {self._times.start:g} s after NMT start{tries}:"
+            f" {'no heartbeat' if state is None else state.name}"
+            + (f"; nor are {', '.join(f'{s.node_id} ({s.name})' for s in others)}" if others else ""),
+        )
 
     def release(self) -> None:
         """Take the nodes out of operation: pre-operational, heartbeat consumers off. Every node is tried."""
