@@ -125,9 +125,7 @@ def scene_of(case: Case) -> Scene:
     scene = resolve_scene(load_scene("press" if case.speed_mm_s == 0.0 else "cylinder"), duration_s=case.hold_s)
     assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
     stiffness = layer_stiffness(case)
-    task = replace(
-        scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal
-    )
+    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal)
     if case.speed_mm_s > 0.0:
         task = replace(task, speed_mm_s=case.speed_mm_s, regain_mm=0.0)
     return replace(

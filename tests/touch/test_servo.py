@@ -181,7 +181,9 @@ def off_curve(contacts, strategy):
 
 
 @pytest.mark.parametrize("name", ["weave", "circle", "straight"])
-@pytest.mark.parametrize("n", [(0, -0.717, 0.697), (0.717, 0, 0.697), (0.5, 0.5, 0.707)], ids=["along", "across", "both"])
+@pytest.mark.parametrize(
+    "n", [(0, -0.717, 0.697), (0.717, 0, 0.697), (0.5, 0.5, 0.707)], ids=["along", "across", "both"]
+)
 def test_a_path_over_a_slope_is_the_one_in_the_scan_plane(name, n):
     """A step is shorter in the plane by what it climbs itself: 46 degrees uphill, nothing along the slope."""
     n = np.array(n) / np.linalg.norm(n)

@@ -39,9 +39,7 @@ class ProbingTask:
         taxels: last image of the touch itself.
     """
 
-    def __init__(
-        self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion], period_s: float
-    ) -> None:
+    def __init__(self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion], period_s: float) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
