@@ -1,9 +1,10 @@
-"""What a window that cuts the contact patch does to the force: what lies outside it presses unmeasured.
+"""What a window that cuts the contact patch does to the force.
 
-The servo holds the measured force, so that the true one is as much larger as the window misses. The patch is that of
-`contact_window`, the elastic foundation on a plane: its pressure falls from the middle to the rim as 1 - r²/a². The
-window follows the contact and may be off its middle by `FOLLOWING_TAXELS`; the array's blur, which carries some of the
-rim back inside, is left out.
+Where enough of the patch is inside, the cell carries it on beyond the window (`canprobe.touch.patch_beyond`), and the
+force errs by a little. Else what lies outside presses unmeasured: the servo holds the measured force, so that the true
+one is as much larger as the window misses. The patch is that of `contact_window`, the elastic foundation on a plane:
+its pressure falls from the middle to the rim as 1 - r²/a². The window follows the contact and may be off its middle by
+`FOLLOWING_TAXELS`; the array's blur, which carries some of the rim back inside, is left out.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from canprobe.scene import ProbeSettings, Scene
 
 TOLERATED = 0.05
 """Share of the force that a window may miss without a warning; the array itself errs by as much."""
+CARRIED_SIDE, CARRIED_SHARE = 6, 0.5
+"""Smallest window, and share of the force inside, from which the rest of a patch follows."""
+CARRIED_ERROR = 0.1
+"""Share of the force by which it then errs at the most, on the emulated array with its spread, blur and noise."""
 _STEPS = 200
 _HALVINGS = 40
 
@@ -60,8 +65,8 @@ class CutPatch:
 
     Attributes:
         text: for people, with the numbers.
-        true_n: what presses at the most where the window measures the target; None: more than `limits.force_max_n`,
-            which only the measured force is held against.
+        true_n: what presses at the most where the target is measured; None: more than `limits.force_max_n`, which only
+            the measured force is held against.
         ways: to feel it.
     """
 
@@ -79,15 +84,18 @@ def cut_patch(scene: Scene) -> CutPatch | None:
     share = measured_share(task.force_n, probe, side)
     if share >= 1.0 - TOLERATED:
         return None
-    true_n = true_force_n(task.force_n, probe, side, most)
     across = 2.0 * patch_radius_m(task.force_n, probe) / PITCH_M
-    presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
-    text = (
+    cuts = (
         f"sensor.window = {side} cuts the contact patch, which is {across:.1f} taxels across on a plane at "
-        f"{task.force_n:g} N; as little as {100 * share:.0f} % of that force lies inside, and where the window "
-        f"measures {task.force_n:g} N, {presses} can press"
+        f"{task.force_n:g} N; as little as {100 * share:.0f} % of that force lies inside"
     )
-    return CutPatch(text, true_n, _ways(scene, probe))
+    if side >= CARRIED_SIDE and share >= CARRIED_SHARE:
+        carried = f"the rest is carried on from there, and the force errs by up to {100 * CARRIED_ERROR:.0f} %"
+        return CutPatch(f"{cuts}; {carried}", task.force_n * (1.0 + CARRIED_ERROR), _ways(scene, probe))
+    true_n = true_force_n(task.force_n, probe, side, most)
+    presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
+    unfelt = f"and where the window measures {task.force_n:g} N, {presses} can press"
+    return CutPatch(f"{cuts}, {unfelt}", true_n, _ways(scene, probe))
 
 
 def _ways(scene: Scene, probe: ProbeSettings) -> tuple[str, ...]:

@@ -17,7 +17,9 @@ def plan_warnings(scene: Scene, pdos: Sequence[PlannedPdo]) -> tuple[str, ...]:
 
 def _window(scene: Scene) -> list[str]:
     cut = cut_patch(scene)
-    return [] if cut is None else [f"{cut.text}; {' or '.join(cut.ways)} keeps that below {100 * TOLERATED:.0f} %"]
+    return (
+        [] if cut is None else [f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"]
+    )
 
 
 def _errors(bus: BusSettings, pdos: Sequence[PlannedPdo]) -> list[str]:

@@ -50,16 +50,13 @@ def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
 
 
-def test_a_larger_window_feels_more_of_a_soft_contact():
-    """The truth is the plant's: 8×8 taxels cut the patch of a soft pad, 10×10 less of it."""
+def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
+    """The truth is the plant's: 10×10 taxels hold the patch of a soft pad; what 8×8 cut off is carried on."""
     foam = canprobe.load_scene("foam")
     assert make_plan(foam).scene.sensor.window == 10
-    contacts = [
-        canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
-        for scene in (change(foam, sensor={"window": 8}), foam)
-    ]
-    assert contacts[1]["force_rms_error_n"] < 0.5 * contacts[0]["force_rms_error_n"]
-    assert contacts[1]["force_rms_error_n"] < 0.1
+    for scene in (foam, change(foam, sensor={"window": 8})):
+        contact = canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
+        assert contact["force_rms_error_n"] < 0.06 * contact["force_target_n"]
 
 
 # --- the choice -------------------------------------------------------------------------------------------------------
