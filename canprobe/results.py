@@ -139,6 +139,7 @@ def summarise(
         },
         "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
+        "warnings": list(session.plan.warnings),
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
@@ -374,6 +375,8 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     if summary.get("calibration") is not None:
         lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)

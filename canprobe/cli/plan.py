@@ -101,5 +101,5 @@ def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     if as_json:
         print_json({channel: one.as_dict() for channel, one in measured.items()})
     else:
-        print("\n".join(one.text() for one in measured.values()), end="")
+        print("\n".join(f"bus {channel}, {one.text()}" for channel, one in measured.items()), end="")
     return 0 if all(one.as_planned for one in measured.values()) else 3

@@ -111,3 +111,12 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     assert len(lines) == measured.error_frames
     recording = read_recording(tmp_path / "bus.log", first.plan, as_taken=False)
     assert recording.error_frames == measured.error_frames
+
+
+def test_a_run_on_a_bus_with_errors_says_so():
+    scene = timed(canprobe.load_scene("free"), bit_error_rate=1e-4)
+    result = canprobe.run(scene, files=False, duration_s=0.2)
+    (warning,) = result.summary["warnings"]
+    assert warning.startswith("bus.bit_error_rate = 0.0001: ") and f"  warning    {warning}" in result.text()
+    frames = result.summary["traffic"]["can0"]["error_frames"]
+    assert frames > 0 and f"  noted      bus error frames: {frames}, the first in cycle 0" in result.text()
