@@ -115,7 +115,7 @@ def test_the_score_sees_a_force_above_the_limit(monkeypatch):
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.cell.Cell._stop_drives", lambda self: None)
     monkeypatch.setattr("canprobe.cell.bringup.BringUp.release", lambda self: None)
-    monkeypatch.setattr("canprobe.emulator.drive_supervision.Supervision._await_sync", lambda self, t_ns: None)
+    monkeypatch.setattr("canprobe.emulator.drive_supervision.Supervision._sync_missing", lambda self, due_ns: None)
     monkeypatch.setattr("canprobe.emulator.node.SlaveNode._communication_error", lambda self, t_ns: None)
     run = carry_out(FaultCase(0, FEATURES, "", ()))
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])
