@@ -129,6 +129,7 @@ class PatchCalibration:
     bias: float = 0.0
     pascals: Array = field(init=False, repr=False)
     weights: Array = field(init=False, repr=False)
+    active: bytes = field(init=False, repr=False)  # 1 at each of 256 counts that is a pressure
 
     def __post_init__(self) -> None:
         for name in ("full_scale_pa", "exponent", "counts_max", "pitch_m", "radius_m", "force_gain"):
@@ -137,6 +138,7 @@ class PatchCalibration:
         pascals = self.full_scale_pa * (counts / self.counts_max) ** self.exponent
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
+        object.__setattr__(self, "active", bytes(p > 0.0 for p in pascals.tolist()))
         object.__setattr__(self, "weights", read_only(_moment_weights(self.pitch_m, self.radius_m)))
 
 
@@ -170,9 +172,10 @@ def compute_patch(
     taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
-    active = pressure > 0.0
-    n_active = int(np.count_nonzero(active))
-    peak = int(taxels.max())
+    counts = taxels.tobytes()
+    active = counts.translate(calibration.active)
+    n_active = active.count(1)
+    peak = max(counts)
     cut_by_pad, cut_by_window = _cuts(active, window) if n_active else (False, False)
     return _patch(
         moments,
@@ -221,18 +224,16 @@ def _patch(
     )
 
 
-def _cuts(active: NDArray[np.bool_], window: Sequence[int] | None) -> tuple[bool, bool]:
-    """Whether active taxels touch the pad's edge, and an edge of the window inside the pad."""
-    rows = np.logical_or.reduce(active, axis=1).tolist()
-    cols = np.logical_or.reduce(active, axis=0).tolist()
-    cut_by_pad = rows[0] or rows[-1] or cols[0] or cols[-1]
+def _cuts(active: bytes, window: Sequence[int] | None) -> tuple[bool, bool]:
+    """Whether active taxels (1 of 0 and 1) touch the pad's edge, and an edge of the window inside the pad."""
+    edge = active[:SIDE] + active[-SIDE:] + active[::SIDE] + active[SIDE - 1 :: SIDE]
     if window is None:
-        return cut_by_pad, False
+        return 1 in edge, False
     r0, c0, n_rows, n_cols = window
-    r1, c1 = r0 + n_rows - 1, c0 + n_cols - 1
-    return cut_by_pad, (
-        (r0 > 0 and rows[r0]) or (r1 < SIDE - 1 and rows[r1]) or (c0 > 0 and cols[c0]) or (c1 < SIDE - 1 and cols[c1])
-    )
+    rows = [r for r, end in ((r0, 0), (r0 + n_rows - 1, SIDE - 1)) if r != end]
+    cols = [c for c, end in ((c0, 0), (c0 + n_cols - 1, SIDE - 1)) if c != end]
+    inside = [active[SIDE * r : SIDE * (r + 1)] for r in rows] + [active[c::SIDE] for c in cols]
+    return 1 in edge, 1 in b"".join(inside)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
