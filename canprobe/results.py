@@ -115,8 +115,8 @@ def summarise(
     cycle = cell.cycle
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = cell.log.arrays()
-    return {
+    log = log_columns(cell)
+    summary = {
         "schema": SCHEMA,
         "scene": scene.name,
         "bus": scene.bus.interface,
@@ -142,6 +142,21 @@ def summarise(
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+    return {name: _without_nan(value) for name, value in summary.items()}
+
+
+def log_columns(cell: Cell) -> dict[str, Array]:
+    """The columns of ``log.npz``; a run that was stopped before its first cycle has the time's, without a row."""
+    return {"t_s": np.empty(0), **cell.log.arrays()}
+
+
+def _without_nan(value: Any) -> Any:
+    """The same for JSON: what is not finite does not apply."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _traffic(session: Session) -> dict[str, Any]:
@@ -167,17 +182,22 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
     if scan is not None:
-        force = log["force_n"][scan[0] : scan[1]]
-        measured = float(np.sqrt(np.mean((force - task.force_n) ** 2)))
+        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
         if session.truth:
             figures = score_contact(session.truth, *scan, task.force_n)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
-            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
         "losses": summarise_losses(getattr(controller, "losses", ()))
     }
+
+
+def _rms_error(values: Array, target: float) -> float | None:
+    """RMS error over the cycles that have a value: one in which the cell held has none."""
+    told = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((told - target) ** 2))) if len(told) else None
 
 
 def summarise_shape(

@@ -91,6 +91,7 @@ class Seen:
         controller_state: of the CAN controller.
         measurement: of this cycle.
         sync_ns: when its SYNC went out, on the port's clock.
+        gap_ns: from the SYNC before to it; 0 for the first.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
         passive_ns: how long the controller has been error-passive.
@@ -108,6 +109,7 @@ class Seen:
     controller_state: ControllerState = ControllerState.ACTIVE
     measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))
     sync_ns: int = 0
+    gap_ns: int = 0
     overruns: int = 0
     late_share: float = 0.0
     passive_ns: int = 0

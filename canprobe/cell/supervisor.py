@@ -75,6 +75,7 @@ class Supervisor:
         self._late.append(late)
         seen.late_share = self._late_sum / len(self._late)
         seen.overruns = overruns
+        seen.gap_ns = sync_ns - seen.sync_ns if seen.sync_ns else 0
         seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
         if controller_state is not ControllerState.PASSIVE:
             self._active_ns = measurement.t_ns

@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, positive, read_only
 from canprobe.touch.contact import Doubt
+from canprobe.touch.patch_beyond import WORTH_COMPLETING, completed
 from canprobe.touch.patch_mending import mended
 
 SIDE = 16
@@ -60,7 +61,8 @@ class Patch(NamedTuple):
         n_active: taxels at or above the threshold; −1 where only features were sent.
         peak_pa: highest taxel pressure, Pa.
         saturated: a taxel is at its largest count.
-        cut_by_window: the patch reaches an edge of the window inside the pad.
+        cut_by_window: the patch reaches an edge of the window inside the pad; what is beyond it is carried on
+            (`patch_beyond`) in force, centroid and moments.
         cut_by_pad: the patch reaches the pad's edge.
         too_few: fewer than four active taxels: no moments to speak of.
         dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`patch_mending`).
@@ -129,7 +131,6 @@ class PatchCalibration:
     bias: float = 0.0
     pascals: Array = field(init=False, repr=False)
     weights: Array = field(init=False, repr=False)
-    active: bytes = field(init=False, repr=False)  # 1 at each of 256 counts that is a pressure
 
     def __post_init__(self) -> None:
         for name in ("full_scale_pa", "exponent", "counts_max", "pitch_m", "radius_m", "force_gain"):
@@ -138,7 +139,6 @@ class PatchCalibration:
         pascals = self.full_scale_pa * (counts / self.counts_max) ** self.exponent
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
-        object.__setattr__(self, "active", bytes(p > 0.0 for p in pascals.tolist()))
         object.__setattr__(self, "weights", read_only(_moment_weights(self.pitch_m, self.radius_m)))
 
 
@@ -171,20 +171,21 @@ def compute_patch(
         raise UsageError(f"taxels: expected (16, 16) uint8, got {taxels.shape} {taxels.dtype}")
     taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
-    moments = (pressure.reshape(-1) @ calibration.weights).tolist()
+    n_active = int(np.count_nonzero(pressure))
     counts = taxels.tobytes()
-    active = counts.translate(calibration.active)
-    n_active = active.count(1)
     peak = max(counts)
-    cut_by_pad, cut_by_window = _cuts(active, window) if n_active else (False, False)
+    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
+    if window is not None and at_window > WORTH_COMPLETING * peak_pa:
+        pressure = completed(pressure, window, calibration.weights, float(calibration.pascals[calibration.counts_max]))
+    moments = (pressure.reshape(-1) @ calibration.weights).tolist()
     return _patch(
         moments,
         calibration,
         n_active=n_active,
-        peak_pa=float(calibration.pascals[peak]),
+        peak_pa=peak_pa,
         saturated=peak >= calibration.counts_max,
-        cut_by_window=cut_by_window,
-        cut_by_pad=cut_by_pad,
+        cut_by_window=at_window > 0.0,
+        cut_by_pad=at_pad > 0.0,
         dead=dead,
     )
 
@@ -224,16 +225,16 @@ def _patch(
     )
 
 
-def _cuts(active: bytes, window: Sequence[int] | None) -> tuple[bool, bool]:
-    """Whether active taxels (1 of 0 and 1) touch the pad's edge, and an edge of the window inside the pad."""
-    edge = active[:SIDE] + active[-SIDE:] + active[::SIDE] + active[SIDE - 1 :: SIDE]
+def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
+    """Highest count at the pad's edge, and at an edge of the window inside the pad."""
+    at_pad = max(counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE])
     if window is None:
-        return 1 in edge, False
+        return at_pad, 0
     r0, c0, n_rows, n_cols = window
-    rows = [r for r, end in ((r0, 0), (r0 + n_rows - 1, SIDE - 1)) if r != end]
-    cols = [c for c, end in ((c0, 0), (c0 + n_cols - 1, SIDE - 1)) if c != end]
-    inside = [active[SIDE * r : SIDE * (r + 1)] for r in rows] + [active[c::SIDE] for c in cols]
-    return 1 in edge, 1 in b"".join(inside)
+    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < SIDE - 1]
+    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < SIDE - 1]
+    inside = [counts[SIDE * r : SIDE * (r + 1)] for r in rows] + [counts[c::SIDE] for c in cols]
+    return at_pad, max(b"".join(inside), default=0)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:
