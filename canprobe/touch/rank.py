@@ -47,7 +47,7 @@ class Decision(NamedTuple):
     @property
     def rank(self) -> int:
         """Number of observed combinations."""
-        return int(np.count_nonzero(self.passed))
+        return int(self.passed.tolist().count(True))
 
 
 def nothing_observed() -> Decision:
