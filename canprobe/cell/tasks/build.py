@@ -154,6 +154,7 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
         memory_m=memory,
         window=window,
         correlation=Correlation(*CORRELATION),
+        coupling=1e3 / scene.probe.radius_mm,
     )
     if method not in WITH_PATCH or not _uses_patch(scene):
         return estimator

@@ -65,6 +65,7 @@ class RecursiveEstimator:
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
         correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
             is what such an answer has under correlated noise.
         quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`left_out`).
@@ -78,9 +79,11 @@ class RecursiveEstimator:
         memory_m: float = 0.02,
         window: int = 160,
         prior: Prior | None = None,
+        coupling: float = 0.0,
         correlation: Correlation | None = None,
         quadric: bool = False,
     ) -> None:
+        self._coupling = coupling
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
@@ -108,7 +111,7 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample))
+        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
