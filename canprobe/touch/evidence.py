@@ -13,6 +13,7 @@ from canprobe.touch.rank import spread_share
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 """K11, K12, K22 to q."""
+_TO_Q2 = np.outer(TO_Q, TO_Q)
 REFUTED = 11.34
 """χ² of 3 from which a surface is no plane: its 99 % point."""
 
@@ -29,17 +30,17 @@ class CurvatureInformation(NamedTuple):
     information: Array
 
 
-def evidence_of(c: Array, deviation: Array, spread: Array | None, length: float) -> CurvatureInformation:
+def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
     """The evidence of a solution with all its parameters free.
 
     Args:
         c: (9,) parameters in the contact frame, in units of `length`.
-        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
         spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
             not spread for is weighed down (`rank.spread_share`). None where that has been seen to.
         length: m.
     """
-    information = inverted(np.outer(TO_Q, TO_Q) * curvature_covariance(c, deviation))
+    information = inverted(_TO_Q2 * covariance)
     if spread is not None:
         share = spread_share(spread)
         information = share @ information @ share

@@ -41,6 +41,9 @@ CERTAIN = 0.99
 """Probability of a misfit from which an estimate mentions it."""
 _NEVER_LESS = 0.1
 """‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
+_USUAL = np.concatenate([[0.0], np.square(CHANGES) / 36.0])
+_VARIANCES = np.concatenate([_USUAL, EVIDENCE])
+"""No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
 _PRIOR = np.concatenate(
     [[NONE], np.full(len(CHANGES), USUAL / len(CHANGES)), np.full(len(EVIDENCE), TAIL / len(EVIDENCE))]
 )
@@ -93,18 +96,20 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
         carried: (9, 9) what a unit of each puts the parameters off by, with the sign turned.
         curvature: ‖K‖ · length.
     """
-    usual = np.square(np.array(CHANGES) * curvature**2 / 6.0)
-    variance = np.concatenate([[0.0], usual, EVIDENCE / max(float(m.max()), 1e-300)])[:, None]
-    share = variance / (1.0 + variance * m)
-    weight = _PRIOR * _relative(0.5 * (s * s * share - np.log1p(variance * m)).sum(axis=1))
+    variance = _VARIANCES.copy()
+    variance[: len(_USUAL)] *= curvature**4
+    variance[len(_USUAL) :] /= max(float(m.max()), 1e-300)
+    seen = variance[:, None] * m
+    share = variance[:, None] / (1.0 + seen)
+    weight = _PRIOR * _relative(0.5 * (share @ (s * s) - np.log1p(seen).sum(axis=1)))
     weight /= weight.sum()
     shifts = -(share * s) @ carried.T
     mean = weight @ shifts
     apart = shifts - mean
     left = weight @ share
     spread = (carried * left) @ carried.T + (apart.T * weight) @ apart
-    changed = float(weight @ np.square(shifts[:, 6:] / UNIT).sum(axis=1))
-    spread[6:, 6:] += np.diag(UNIT**2) * (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed
+    changed = float(weight @ np.square(shifts[:, 6:]) @ UNIT**-2)
+    spread.flat[60::10] += UNIT**2 * ((LEFT_OUT * min(curvature, 1.0)) ** 2 * changed)  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
     return Averaged(mean, spread, left, 1.0 - float(weight[0]), trusted)
 

@@ -225,12 +225,14 @@ class PatchCurvature:
                 J, r, W = self.model.linearised(seen.moments, self.force, self.frames, k)
                 W = _less_certain(W, seen)
                 W *= weight * self.model.trust(k, self.force)
-                off = motion.q - TO_Q * k
-                patch = J.T @ W @ J
-                way = solved(patch + motion.information, J.T @ W @ r + motion.information @ off)
-                cost = float(r @ W @ r + off @ motion.information @ off)
-                k = _entries(TO_Q * k + way)
-                step = float(np.abs(way).max())
+                JW, q = J.T @ W, TO_Q * k
+                patch = JW @ J
+                off = motion.q - q
+                pull = motion.information @ off
+                way = solved(patch + motion.information, JW @ r + pull)
+                cost = float(r @ W @ r + off @ pull)
+                k = _entries(q + way)
+                step = max(map(abs, way.tolist()))
                 if step < SETTLED / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):

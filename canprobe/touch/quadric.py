@@ -31,8 +31,8 @@ _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
 _WIDE = np.concatenate([BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
 """S as the sum of ten matrices, side by side."""
-_ENTRY = np.array([*_INDEX, (2, 3)]).T
-"""Where the parameters stand in S, and c34."""
+_ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX, (2, 3))])
+"""Where the parameters stand in each of them, and c34."""
 
 
 class Rows(NamedTuple):
@@ -229,7 +229,7 @@ def transport(c: Array, T: Array) -> tuple[Array, Array]:
     Returns:
         c' (9,) and M (9, 9).
     """
-    moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(4, 10, 4)[_ENTRY[0], :, _ENTRY[1]]
+    moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(-1).take(_ENTRIES)
     entries = moved[:, :9] @ c + moved[:, 9]
     scale = -0.5 / float(entries[9])
     c_new = scale * entries[:9]

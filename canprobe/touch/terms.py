@@ -28,11 +28,11 @@ _POWERS = [_QUADRIC[k] for k in (2, 0, 1)] + [(0, 0, 1), (2, 0, 0), (1, 1, 0), (
 _POWERS += [(0, 0, 2), *_HIGHER]
 
 
-def _monomials(x: Any, y: Any, z: Any) -> Array:
-    """(19, ...) the monomials of `_POWERS` at places, numbers or arrays."""
+def monomials(x: Any, y: Any, z: Any) -> list[Any]:
+    """The 19 monomials at a place, or at places given as arrays."""
     xx, xy, yy = x * x, x * y, y * y
     rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
-    return np.array([1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest])
+    return [1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest]
 
 
 def _basis() -> Array:
@@ -64,15 +64,14 @@ def _shift() -> Array:
 _BASIS, _SHIFT = _basis(), _shift()
 
 
-def basis(X: Array) -> Array:
-    """Values and derivatives by x, y, z (n, 4, 18) of all terms, those of the quadric first, at places (n, 3)."""
-    x, y, z = X.T
-    return (_monomials(x, y, z).T @ _BASIS).reshape(len(X), 4, 18)
+def basis(places: Array) -> Array:
+    """Values and derivatives by x, y, z (n, 4, 18) of all terms, a quadric's first, from the `monomials` (n, 19)."""
+    return (places @ _BASIS).reshape(len(places), 4, 18)
 
 
 def terms(x: Array, y: Array) -> Array:
     """Values and derivatives by x and y (n, 3, 9) of the terms that a quadric leaves out, at places (n,), (n,)."""
-    return basis(np.stack([x, y, np.zeros(len(x))], axis=1))[:, :3, 9:]
+    return basis(np.array(monomials(x, y, np.zeros(len(x)))).T)[:, :3, 9:]
 
 
 def shifted(x: float, y: float) -> tuple[Array, Array]:
@@ -81,5 +80,5 @@ def shifted(x: float, y: float) -> tuple[Array, Array]:
     Returns:
         A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the parameters of `quadric`.
     """
-    both = (_monomials(x, y, 0.0) @ _SHIFT).reshape(18, 9)
+    both = (np.array(monomials(x, y, 0.0)) @ _SHIFT).reshape(18, 9)
     return both[:9], both[9:]

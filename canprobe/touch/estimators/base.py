@@ -90,6 +90,8 @@ class Gate:
 
     def notes(self) -> tuple[str, ...]:
         """What was in doubt about the images of the last contacts."""
+        if not any(self._doubts):
+            return ()
         counts = Counter(doubt for doubts in self._doubts if doubts for doubt in doubts)
         return tuple(f"{n} of the last {len(self._doubts)} contacts: {doubt.value}" for doubt, n in counts.items())
 

@@ -12,7 +12,7 @@ from canprobe.touch.noise import Noise
 from canprobe.touch.nonlinear import CHI2_999
 from canprobe.touch.quadric import Design, design
 from canprobe.touch.quadric_row import sample_rows
-from canprobe.touch.terms import basis
+from canprobe.touch.terms import basis, monomials
 
 
 class Touch(NamedTuple):
@@ -55,7 +55,7 @@ def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Tou
         sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
         for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
     ]
-    table = np.array([s.weights + s.residuals + s.place for s in found])
+    table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
     return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
 
 

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, inverted, lower_root, upper_root
+from canprobe.touch._arrays import Array, inverted, inverted_upper, lower_root, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.evidence import curvature_covariance, evidence_of
 from canprobe.touch.misfit import misfit_notes
-from canprobe.touch.nonlinear import DIFFUSE
+from canprobe.touch.nonlinear import DIFFUSE, size_of
 from canprobe.touch.quadric import UNIT
 from canprobe.touch.rank import Decision, decide, nothing_observed
 
@@ -59,15 +59,18 @@ def filter_estimate(
     """
     found = _answered(state, point, spread, quadric=quadric)
     a, decision = found.anchor, found.decision
-    evidence = evidence_of(a.c, a.M @ found.deviation, found.spread, state.length)
-    known = decision.vectors[:, decision.passed]
-    a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-    singular = np.linalg.svd(state.root, compute_uv=False)
+    deviation = a.M @ found.deviation
+    covariance = curvature_covariance(a.c, deviation)
+    evidence = evidence_of(a.c, covariance, found.spread, state.length)
+    if decision.rank < 3:
+        known = decision.vectors[:, decision.passed]
+        a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+        covariance = np.full((3, 3), math.nan)
     return build_estimate(
-        _solution(a, decision, found.deviation),
+        Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
         length=state.length,
         T_frame_contact=a.T_frame_contact,
-        condition_number=float(singular[0] / singular[-1]),
+        problem_root=state.root,
         innovation=innovation,
         distance=distance,
         samples=samples,
@@ -85,7 +88,7 @@ def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric:
     tangent = a.T_frame_contact[:3, :2]
     flat = tangent.T @ spread @ tangent
     q = a.M[6:] @ state.inverse / UNIT[:, None]
-    decision = decide(inverted(upper_root(q.T)).T, flat, float(np.linalg.norm(a.c[6:] / UNIT)))
+    decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
     noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
     notes: tuple[str, ...] = ()
     if decision.rank == 3 and not quadric:
@@ -96,10 +99,3 @@ def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric:
         a = anchor(amended.c, state.T, place, state.length)
         noise += state.root @ amended.covariance @ state.root.T
     return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)
-
-
-def _solution(a: Anchor, decision: Decision, deviation: Array) -> Solution:
-    root = inverted(a.M @ deviation)
-    if decision.rank < 3:
-        return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
-    return Solution(a.c, curvature_covariance(a.c, a.M @ deviation), decision, has_prior=False, root=root)

@@ -15,7 +15,7 @@ from canprobe.touch._arrays import Array, eigen, solved
 from canprobe.touch.estimators.score import Score
 from canprobe.touch.misfit import averaged, scales
 from canprobe.touch.noise import Correlation
-from canprobe.touch.quadric import UNIT
+from canprobe.touch.nonlinear import size_of
 from canprobe.touch.terms import shifted
 
 _REGULAR = 1e-9
@@ -92,22 +92,21 @@ class LeftOut:
             H: (9, 9) inverse of their information.
             place: (3,) where the answer is wanted, in the filter's frame.
         """
-        curvature = float(np.linalg.norm(c[6:] / UNIT))
+        curvature = size_of(c)
         D = scales(curvature)
-        N, M = self._information[:9, 9:] * D, self._information[9:, 9:] * np.outer(D, D)
-        S = self.score.matrix
-        S_cc, S_ca, S_aa = S[:9, :9], S[:9, 9:] * D, S[9:, 9:] * np.outer(D, D)
-        HN = H @ N
-        shared = S_ca - S_cc @ HN
-        V = S_aa - S_ca.T @ HN - HN.T @ shared  # of y = m a + noise, all that the samples say about the terms
-        V += _REGULAR * np.trace(V) * np.eye(9)
-        m = M - N.T @ HN
+        X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
+        X[:9] = H @ self._information[:9, 9:] * -D
+        X[9:].flat[::10] = D
+        shared = self.score.matrix @ X
+        V = X.T @ shared  # of y = m a + noise, all that the samples say about the terms
+        V.flat[::10] += _REGULAR * V.trace()
+        m = D[:, None] * (self._information[9:] @ X)
         weighted = solved(V, m)
         values, U = eigen(m @ weighted)
         s = U.T @ (weighted.T @ (D * self._slope))
-        off = -HN
+        off = X[:9]
         off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
         off = off @ U
         found = averaged(np.maximum(values, 0.0), s, -off, curvature)
-        both = H @ shared @ (weighted @ U * found.share) @ off.T
+        both = H @ shared[:9] @ (weighted @ U * found.share) @ off.T
         return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
