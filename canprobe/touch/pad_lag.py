@@ -1,4 +1,4 @@
-"""The centroid on an array with hysteresis trails the contact as it moves over the pad; what is known of it is taken off.
+"""The centroid on an array with hysteresis trails the contact over the pad; what is known of that is taken off.
 
 A taxel under the patch's front reads less than it should and one under its end more, and what has crept lags behind as
 well. So the centroid lies back along its own way, by some tens of micrometres: much more than its noise, and alike for

@@ -63,7 +63,9 @@ def make_estimator(
     if method == "ml":
         from canprobe.touch.estimators.ml import MlEstimator
 
-        return MlEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior, coupling=coupling)
+        return MlEstimator(
+            sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior, coupling=coupling
+        )
     if method == "chord":
         from canprobe.touch.estimators.chord import ChordEstimator
 
