@@ -38,6 +38,8 @@ MOST_FRAMES = 32
 """Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
 FEW_FRAMES = 8
 """The same of the shorter mean."""
+FINE = 0.05
+"""`GROSS` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
 YOUNGER = 4.0
 """Frames by which the shorter mean must be the younger one to tell a drift."""
 GROSS = 0.2
@@ -71,12 +73,12 @@ class _Seen(NamedTuple):
 
 
 class _Mean:
-    """Running mean of moments over so many frames at most, and how old it is."""
+    """Running mean of moments over so many frames at most, and how old it is; `gross`: as `GROSS`."""
 
-    def __init__(self, most: int) -> None:
+    def __init__(self, most: int, gross: float) -> None:
         self.moments: Moments = (0.0, 0.0, 0.0)
         self.age = 0.0
-        self._most = most
+        self._most, self._gross = most, gross
         self._frames = 0
 
     def add(self, xx: float, xy: float, yy: float) -> float:
@@ -85,8 +87,8 @@ class _Mean:
         share = 1.0 / self._frames
         mxx, mxy, myy = self.moments
         dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
-        if self._frames > LEAST_FRAMES:
-            share *= min(1.0, GROSS * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
+        if self._frames >= LEAST_FRAMES:
+            share *= min(1.0, self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
         self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
         self.age = (1.0 - share) * (self.age + 1.0)
         return share
@@ -124,7 +126,7 @@ class PatchCurvature:
         self._memory = PadMemory()
         self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
         self._last: tuple[float, float, float] | None = None
-        self._mean, self._recent = _Mean(MOST_FRAMES), _Mean(FEW_FRAMES)
+        self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
