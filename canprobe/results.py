@@ -283,6 +283,7 @@ def _bound_ratio(
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=0.0 if scene.probe is None else 1e3 / scene.probe.radius_mm,
     )
     return None if bound is None else score.kappa_rms / bound
 

@@ -180,9 +180,10 @@ def linearise(c: Array, d: Design) -> Linearised:
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
     bend = (V.reshape(-1, 3) @ B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
-    W = _whitener(bend[:, 1:], V[:, 0], d)
+    felt = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn against the surface that an error of the point is felt as
+    W = _whitener(felt, V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
-    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], bend[:, 1:], V[:, 0])
+    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], felt, V[:, 0])
     g = X @ B + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]

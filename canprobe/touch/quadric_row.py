@@ -22,15 +22,17 @@ class SampleRows(NamedTuple):
 
 
 def sample_rows(
-    c: Sequence[float], x: Sequence[float], n: Sequence[float], point_variance: float, normal_variance: float
+    c: Sequence[float], x: Sequence[float], n: Sequence[float], variances: tuple[float, float], coupling: float = 0.0
 ) -> SampleRows:
     """The rows of one sample with isotropic noise.
 
     Args:
         c: nine parameters in the order of `quadric`.
         x, n: point and outward normal in the working frame, dimensionless.
-        point_variance, normal_variance: per axis, dimensionless.
+        variances: of point and normal per axis, dimensionless.
+        coupling: `Noise.coupling`, dimensionless.
     """
+    point_variance, normal_variance = variances
     c14, c24, c44, c13, c23, c33, c11, c12, c22 = c
     px, py, pz = x
     # value and gradient at the measured point, then at its foot
@@ -49,14 +51,14 @@ def sample_rows(
     ax, az = nz / size, -nx / size
     bx, by, bz = -ny * nx / size, size, -ny * nz / size
     ra, rb = ax * hx + az * hz, bx * hx + by * hy + bz * hz
-    # 2 S3 along the axes, and the shape operator on them
+    # 2 S3 along the axes, and on them the shape operator with the coupling
     ux, uy, uz = 2 * (c11 * ax + c13 * az), 2 * (c12 * ax + c23 * az), 2 * (c13 * ax + c33 * az)
     wx = 2 * (c11 * bx + c12 * by + c13 * bz)
     wy = 2 * (c12 * bx + c22 * by + c23 * bz)
     wz = 2 * (c13 * bx + c23 * by + c33 * bz)
-    k11 = (ax * ux + az * uz) * inverse
+    k11 = (ax * ux + az * uz) * inverse + coupling
     k12 = (bx * ux + by * uy + bz * uz) * inverse
-    k22 = (bx * wx + by * wy + bz * wz) * inverse
+    k22 = (bx * wx + by * wy + bz * wz) * inverse + coupling
     bend_a = (hx * ux + hy * uy + hz * uz) * inverse
     bend_b = (hx * wx + hy * wy + hz * wz) * inverse
     # whitening: Cholesky of σ_n² I + K² σ_p²

@@ -64,7 +64,7 @@ def test_a_misfit_that_shows_is_corrected(method, scale, share_left):
 @pytest.mark.parametrize(
     ("method", "scale", "least", "plain_most"),
     [
-        ("ml", 1.0, 0.6, 0.45),
+        ("ml", 1.0, 0.5, 0.45),
         ("ml", 3.0, 0.90, 0.05),
         ("ml", 8.0, 0.90, 0.05),
         ("recursive", 3.0, 0.90, 0.1),

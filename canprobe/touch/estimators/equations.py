@@ -16,12 +16,16 @@ from canprobe.touch.terms import basis, monomials
 
 
 class Touch(NamedTuple):
-    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise (m, rad)."""
+    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise.
+
+    The noise is in m, rad and, what couples them (`Noise.coupling`), 1/m.
+    """
 
     point: Array
     normal: Array
     sigma_point: float
     sigma_normal: float
+    coupling: float = 0.0
 
 
 class Equations(NamedTuple):
@@ -48,7 +52,7 @@ def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Tou
     points, normals = _in_frame(T_base_work, length, touches)
     at, square = c.tolist(), 1.0 / length**2
     found = [
-        sample_rows(at, x, n, square * t.sigma_point**2, t.sigma_normal**2)
+        sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
         for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
     ]
     table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
@@ -73,7 +77,8 @@ def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) ->
     """The constant parts of many contacts at once (`quadric.design`)."""
     points, normals = _in_frame(T_base_work, length, touches)
     sigma_point = np.array([t.sigma_point for t in touches]) / length
-    return design(points, normals, Noise(sigma_point, np.array([t.sigma_normal for t in touches])))
+    sigma_normal = np.array([t.sigma_normal for t in touches])
+    return design(points, normals, Noise(sigma_point, sigma_normal, touches[0].coupling * length))
 
 
 def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ from canprobe.touch._arrays import Array, inverted, inverted_upper, lower_root, 
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
+from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.evidence import curvature_covariance, evidence_of
 from canprobe.touch.misfit import misfit_notes
 from canprobe.touch.nonlinear import DIFFUSE, size_of
@@ -46,7 +47,7 @@ def filter_estimate(
     samples: float,
     prior: str,
     notes: tuple[str, ...],
-    quadric: bool,
+    expected: Expected | None,
 ) -> SurfaceEstimate:
     """The answer at the foot of a point.
 
@@ -55,9 +56,9 @@ def filter_estimate(
         point: (3,) in base, m.
         spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
         innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
-        quadric: the surface is one exactly; else what a quadric leaves out is allowed for (`left_out`).
+        expected: of the samples, to allow for what a quadric leaves out (`left_out`); None: the surface is one exactly.
     """
-    found = _answered(state, point, spread, quadric=quadric)
+    found = _answered(state, point, spread, expected)
     a, decision = found.anchor, found.decision
     deviation = a.M @ found.deviation
     covariance = curvature_covariance(a.c, deviation)
@@ -81,7 +82,7 @@ def filter_estimate(
     )
 
 
-def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric: bool) -> _Answer:
+def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
     """With the sandwich covariance, amended where all is observed."""
     place = state.place(point)
     a = anchor(state.c, state.T, place, state.length)
@@ -91,8 +92,8 @@ def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric:
     decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
     noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
     notes: tuple[str, ...] = ()
-    if decision.rank == 3 and not quadric:
-        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place)
+    if decision.rank == 3 and expected is not None:
+        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, expected)
         notes = misfit_notes(amended.misfit, trusted=amended.trusted)
         if not amended.trusted:
             return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)

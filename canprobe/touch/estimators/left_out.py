@@ -38,6 +38,21 @@ class Amended(NamedTuple):
     trusted: bool
 
 
+class Expected(NamedTuple):
+    """What is known beforehand of what a filter is given.
+
+    Attributes:
+        noise: variance of the residuals over what is stated. Generous deviations make a misfit look like noise.
+        curvature: least ‖K‖ · length whose usual changes are reckoned with: a flat place need not lie on a plane.
+    """
+
+    noise: float = 1.0
+    curvature: float = 0.0
+
+
+AS_STATED = Expected()
+
+
 class LeftOut:
     """Sums over the rows of parameters and terms.
 
@@ -84,15 +99,16 @@ class LeftOut:
         self._information = wide.T @ self._information @ wide
         self._slope = away.T @ self._slope
 
-    def amend(self, c: Array, H: Array, place: Array) -> Amended:
+    def amend(self, c: Array, H: Array, place: Array, expected: Expected = AS_STATED) -> Amended:
         """Average an answer over the terms.
 
         Args:
             c: (9,) parameters of the filter.
             H: (9, 9) inverse of their information.
             place: (3,) where the answer is wanted, in the filter's frame.
+            expected: of the samples.
         """
-        curvature = size_of(c)
+        curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
         X[:9] = H @ self._information[:9, 9:] * -D
@@ -107,6 +123,6 @@ class LeftOut:
         off = X[:9]
         off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
         off = off @ U
-        found = averaged(np.maximum(values, 0.0), s, -off, curvature)
+        found = averaged(np.maximum(values, 0.0) / expected.noise, s / expected.noise, -off, curvature)
         both = H @ shared[:9] @ (weighted @ U * found.share) @ off.T
         return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)

@@ -24,6 +24,7 @@ from canprobe.touch.estimators.change import ChangeTest
 from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
 from canprobe.touch.estimators.filter_answer import filter_estimate
 from canprobe.touch.estimators.information import InformationFilter
+from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.estimators.start import Start
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation
@@ -38,6 +39,8 @@ MOST_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
 STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+GENEROUS = 0.5
+"""Usual innovation below which the stated noise is not believed where a misfit is looked for."""
 AGREEING = 11.34
 """Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
@@ -65,6 +68,7 @@ class RecursiveEstimator:
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
         correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
             is what such an answer has under correlated noise.
         quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`left_out`).
@@ -78,9 +82,11 @@ class RecursiveEstimator:
         memory_m: float = 0.02,
         window: int = 160,
         prior: Prior | None = None,
+        coupling: float = 0.0,
         correlation: Correlation | None = None,
         quadric: bool = False,
     ) -> None:
+        self._coupling = coupling
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
@@ -108,7 +114,7 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample))
+        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
@@ -132,8 +138,13 @@ class RecursiveEstimator:
             samples=self._spread.weight,
             prior=self._prior.name,
             notes=self._notes(),
-            quadric=self._quadric,
+            expected=None if self._quadric else self._expected(),
         )
+
+    def _expected(self) -> Expected:
+        """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
+        usual = self._change.usual
+        return Expected(usual if usual < GENEROUS else 1.0, self._coupling * self._memory)
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
