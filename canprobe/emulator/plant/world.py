@@ -6,7 +6,7 @@ and only when somebody asks. Contact pushes the dynamic arm back, not the ideal 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos, pi, sin
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -302,7 +302,7 @@ class Plant:
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
-        return replace(NO_CONTACT, force=float(np.linalg.norm(force)))
+        return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
 
 
 def _turned(axes: Axes, R: Array) -> Axes:
