@@ -1,10 +1,10 @@
 """What a window cuts off the contact patch: carried on from what is in it.
 
-A window of 8 × 8 taxels cuts the patch of a soft contact, and force and centroid read wrong by what is outside. On a bed
-of springs the pressure falls off from its summit as a quadratic does, so that the rest of the patch follows from the
-part that is seen: a quadratic is fitted to the well pressed taxels and read off outside the window where it is above
-zero. Of the emulated array the force is then 2 % low at 4 kN/m instead of 3–11 %, and the centroid 0.09 mm off instead
-of 0.2–0.4 mm. Stops being true where the curvature of the object changes within the patch.
+A window of 8 × 8 taxels cuts the patch of a soft contact, and force and centroid read wrong by what is outside. On a
+bed of springs the pressure falls off from its summit as a quadratic does, so that the rest of the patch follows from
+the part that is seen: a quadratic is fitted to the well pressed taxels and read off outside the window where it is
+above zero. Of the emulated array the force is then 2 % low at 4 kN/m instead of 3–11 %, and the centroid 0.09 mm off
+instead of 0.2–0.4 mm. Stops being true where the curvature of the object changes within the patch.
 Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
 """
 

@@ -209,8 +209,8 @@ class CalibrateTask(ProbingTask):
     def _depth(self, centre: Vector, felt: Sequence[ContactSample]) -> float:
         """How far the probe has been pushed in since the force began, m.
 
-        What the arm tells of it needs neither the layer's stiffness nor the array's gain: an array that was only pressed
-        reads 8 % low. Without a line the force has to tell.
+        What the arm tells of it needs neither the layer's stiffness nor the array's gain: an array that was only
+        pressed reads 8 % low. Without a line the force has to tell.
         """
         if self._push.certain(CERTAIN):
             return self._pushed(centre) - self._push.start
