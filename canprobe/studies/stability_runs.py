@@ -22,8 +22,10 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.emulator.plant.arm import natural_frequency
 from canprobe.errors import CanprobeError, PlanError, SafetyStop
+from canprobe.robot.inverse import inverse_near
+from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import ObjectSettings, PlantSettings, Scene, ServoSettings
+from canprobe.scene import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
 from canprobe.scene_geometry import T_flange_probe, true_object
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
@@ -104,6 +106,28 @@ def _kappa(case: Case) -> np.ndarray[Any, np.dtype[np.float64]]:
 def _object(case: Case) -> ObjectSettings:
     radius = None if case.kind == "plane" else case.radius_mm
     return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
+
+
+def touch_in_posture(
+    posture_deg: tuple[float, ...], above_mm: float = 10.0
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+    """A touch with the pole of the default probe and these joint angles, deg.
+
+    Returns:
+        Where it is, mm; the outward normal there; joint angles (6,) so far above it, deg.
+    """
+    model, probe = MODELS["upenn"], ProbeSettings()
+    q = np.radians(posture_deg)
+    T_flange_centre = T_flange_probe(probe)
+    T = forward(model, q) @ T_flange_centre
+    pole = T[:3, 2]
+    above = T.copy()
+    above[:3, 3] -= above_mm * 1e-3 * pole
+    away = np.degrees(inverse_near(model, above @ np.linalg.inv(T_flange_centre), q))
+    at = 1e3 * T[:3, 3] + probe.radius_mm * pole
+    x, y, z = (float(value) for value in at)
+    nx, ny, nz = (-float(value) for value in pole)
+    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
 
 
 def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,7 @@ class CalibrateTask(ProbingTask):
         self._gone = 0.0
         self._felt: list[ContactSample] = []
         self._push = PushFit()
+        self._depths: list[tuple[float, float]] = []
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -149,7 +150,7 @@ class CalibrateTask(ProbingTask):
         assert self._motion is not None
         if self.reason is not None or self._number >= len(self._s.approaches):
             if self.reason is None and len(self.touches) >= 2:
-                self.estimate = calibrate_tool(self.touches, self._s.ball)
+                self.estimate = calibrate_tool(self._corrected(), self._s.ball)
             return self._enter(Phase.DONE)
         self._push = PushFit()
         self._line = ArcMotion(self._s.ball.c_base, self._motion.pose, self._at(self._s.clearance), MOVE_SPEED)
@@ -193,10 +194,6 @@ class CalibrateTask(ProbingTask):
                 self.retreat(f"touch {self._number + 1}: no tactile sample while it rested")
         return self._at(-self._gone) if self.phase is Phase.SCAN else self._retreat()
 
-    def _pushed(self, centre: Vector) -> float:
-        """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
-        return -float(self._s.approaches[self._number].n_base @ (centre - self._s.ball.c_base))
-
     def _touch(self, felt: Sequence[ContactSample]) -> BallTouch:
         """Mean of the samples of a touch at rest."""
         n = np.mean([contact.n_base for contact in felt], axis=0)
@@ -204,17 +201,24 @@ class CalibrateTask(ProbingTask):
         T_base_probe[:3, 3] = np.mean([contact.T_base_probe[:3, 3] for contact in felt], axis=0)
         T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
         d_flange = -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n))
-        return BallTouch(T_base_flange, d_flange, self._depth(T_base_probe[:3, 3], felt))
-
-    def _depth(self, centre: Vector, felt: Sequence[ContactSample]) -> float:
-        """How far the probe has been pushed in since the force began, m.
-
-        What the arm tells of it needs neither the layer's stiffness nor the array's gain: an array that was only
-        pressed reads 8 % low. Without a line the force has to tell.
-        """
+        depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
         if self._push.certain(CERTAIN):
-            return self._pushed(centre) - self._push.start
-        return float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
+            self._depths.append((depth, self._pushed(T_base_probe[:3, 3]) - self._push.start))
+        return BallTouch(T_base_flange, d_flange, depth)
+
+    def _pushed(self, centre: Vector) -> float:
+        """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
+        return -float(self._s.approaches[self._number].n_base @ (centre - self._s.ball.c_base))
+
+    def _corrected(self) -> list[BallTouch]:
+        """The touches with depths as the arm made them, from where the force began to where the probe rested.
+
+        A depth by the force is off by what the layer's stiffness and the array's gain are: an array that was only
+        pressed reads 8 % low. All touches are of one ball and share that factor; by itself the arm's way of one touch
+        is known no better than its encoders' counts.
+        """
+        felt, pushed = np.sum(self._depths or [(1.0, 1.0)], axis=0)
+        return [replace(touch, depth=touch.depth * float(pushed / felt)) for touch in self.touches]
 
     def _let_go(self) -> None:
         assert self._motion is not None
