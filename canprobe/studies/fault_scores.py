@@ -1,7 +1,11 @@
 """What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
 
-The peak of the force. Two criteria hold at once: the force may not stay above the limit for longer than reaction and
-retreat take, and it may never exceed what a probe can reach that nobody controls for the time until the cell reacts.
+The force is judged where the cell presses, as it truly is in the plant and against the limit of the run's own scene
+(`limits.force_max_n`, 3 N here, 5 N by default). Two criteria hold at once, whatever the fault: it may not stay above
+the limit for longer than the reaction to a measured force and the way back take (`force` in the table of conditions,
+and `RELEASE_NS`); and it may never exceed what a probe can reach that nobody controls until the cell reacts.
+
+The peak of the force.
 Between a fault and the reaction the probe is driven on in one of two ways:
 
 - blind: without tactile frames the approach goes on, at `approach_speed`, until `sensor_stale` lets the probe retreat;
