@@ -187,9 +187,7 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
     if scan is not None:
-        force = log["force_n"][scan[0] : scan[1]]
-        force = force[np.isfinite(force)]  # the task is not asked in a cycle that holds
-        measured = float(np.sqrt(np.mean((force - task.force_n) ** 2))) if len(force) else None
+        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
         if truth := _truth(session):
             figures = score_contact(truth, *scan, task.force_n)
             if task.kind != "scan":
@@ -199,6 +197,12 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
         "losses": summarise_losses(getattr(controller, "losses", ()))
     }
+
+
+def _rms_error(values: Array, target: float) -> float | None:
+    """RMS error over the cycles that have a value: one in which the cell held has none."""
+    told = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((told - target) ** 2))) if len(told) else None
 
 
 def summarise_shape(

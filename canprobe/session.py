@@ -161,6 +161,8 @@ class Session:
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
         hush_canopen()
+        for warning in self.plan.warnings:
+            self._say(f"warning: {warning}")
         try:
             port = self._open()
             self._cell = make_cell(

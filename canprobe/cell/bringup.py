@@ -46,6 +46,24 @@ class Write:
 
 
 @dataclass(frozen=True, slots=True)
+class Given:
+    """One entry that the device cannot change and the scene relies on.
+
+    Attributes:
+        index, subindex: the entry.
+        value: that it must hold.
+        key: of the scene that says so.
+        otherwise: what would be wrong.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    key: str
+    otherwise: str
+
+
+@dataclass(frozen=True, slots=True)
 class NodeSetup:
     """What one node must be and become.
 
@@ -56,6 +74,7 @@ class NodeSetup:
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
         writes: its configuration, in order.
+        given: what it must hold by itself.
         lacks: objects that the cell would have set and that this make of device does not have.
     """
 
@@ -65,6 +84,7 @@ class NodeSetup:
     dictionary: ObjectDictionary
     identity: dict[int, int]
     writes: tuple[Write, ...]
+    given: tuple[Given, ...] = ()
     lacks: tuple[int, ...] = ()
 
 
@@ -238,6 +258,7 @@ class BringUp:
     def _configure(self, setup: NodeSetup, report: NodeReport) -> Generator[bytes | None, bytes, None]:
         try:
             yield from self._identify(setup, report)
+            yield from self._check_given(setup)
             kept = self._times.store and (yield from self._is_kept(setup))
             report.kept = kept
             for write in setup.writes:
@@ -263,6 +284,16 @@ class BringUp:
                 report.software = version.decode("latin-1").rstrip("\0")
             except (SdoAbortedError, SdoCommunicationError):
                 report.software = None
+
+    def _check_given(self, setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
+        for given in setup.given:
+            got = yield from self._read(setup, given.index, given.subindex)
+            if got != given.value:
+                raise NodeError(
+                    setup.node_id,
+                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value}, as the scene's"
+                    f" {given.key} says, got {got}: {given.otherwise}; put right {given.key}",
+                )
 
     def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
         """Whether the node says that it was configured with these very values."""

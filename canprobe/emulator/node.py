@@ -131,8 +131,8 @@ class SlaveNode:
         if route is None:
             return []
         core = self.core
-        due = core.timers.next_ns
-        if due is not None and due < t_ns:
+        timers = core.timers
+        if timers.quiet_ns < t_ns and (due := timers.next_ns) is not None and due < t_ns:
             self._run(t_ns)
         core.now_ns = t_ns
         route(data, t_ns)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappop, heappush, heapreplace
 
 _ROOM = 64
+_NEVER = 1 << 62
 
 
 class Timer:
@@ -48,6 +49,12 @@ class Timer:
             self._queued_ns = None
         return self.due_ns is not None
 
+    def requeued(self) -> int:
+        """The entry on the heap moves to where the deadline is now, which is returned."""
+        assert self.due_ns is not None
+        self._queued_ns = self.due_ns
+        return self.due_ns
+
     def surfaced(self, queued_ns: int) -> bool:
         """Take the entry of `queued_ns` off the heap; queue again when it was re-armed. True when it is due then."""
         if queued_ns != self._queued_ns:
@@ -70,15 +77,17 @@ class Timers:
 
     Attributes:
         now_ns: the time up to which `run` was last called.
+        quiet_ns: no deadline lies before this time; asked first, because it costs nothing.
     """
 
-    __slots__ = ("_count", "_heap", "_most", "now_ns")
+    __slots__ = ("_count", "_heap", "_most", "now_ns", "quiet_ns")
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
         self._count = 0
         self._most = _ROOM
         self.now_ns = 0
+        self.quiet_ns = _NEVER
 
     def new(self, callback: Callable[[int], None]) -> Timer:
         """A timer that calls `callback(due_ns)`; not armed."""
@@ -88,6 +97,7 @@ class Timers:
         """Put an entry on the heap (for `Timer`)."""
         self._count += 1
         heappush(self._heap, (due_ns, self._count, timer))
+        self.quiet_ns = min(self.quiet_ns, due_ns)
         if len(self._heap) > self._most:
             self._compact()
 
@@ -105,9 +115,14 @@ class Timers:
         while heap:
             due, _, timer = heap[0]
             if timer.due_ns == due:
+                self.quiet_ns = due
                 return due
-            heappop(heap)
-            timer.surfaced(due)
+            if timer.holds(due):
+                self._count += 1
+                heapreplace(heap, (timer.requeued(), self._count, timer))
+            else:
+                heappop(heap)
+        self.quiet_ns = _NEVER
         return None
 
     def run(self, t_ns: int) -> None:

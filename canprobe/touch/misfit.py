@@ -27,7 +27,7 @@ from canprobe.touch.nonlinear import robust
 from canprobe.touch.quadric import UNIT, Design, Linearised, gradient_rows, linearise, value_rows
 from canprobe.touch.terms import DEGREE, terms
 
-NONE, USUAL, TAIL = 0.75, 0.22, 0.03
+NONE, USUAL, TAIL = 0.85, 0.12, 0.03
 """Prior weights of: no misfit; a usual one; one that is only believed when seen."""
 CHANGES = (0.05, 0.15, 0.5)
 """A usual change of curvature along a surface: dK/ds over ‖K‖²."""

@@ -29,6 +29,10 @@ _FLAT = BASIS.reshape(9, 16)
 _PICK = np.array([4 * i + j for i, j in _INDEX])
 _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
+_WIDE = np.concatenate([BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
+"""S as the sum of ten matrices, side by side."""
+_ENTRY = np.array([*_INDEX, (2, 3)]).T
+"""Where the parameters stand in S, and c34."""
 
 
 class Rows(NamedTuple):
@@ -224,11 +228,11 @@ def transport(c: Array, T: Array) -> tuple[Array, Array]:
     Returns:
         c' (9,) and M (9, 9).
     """
-    S = T.T @ matrix_of(c) @ T
-    scale = -0.5 / S[2, 3]
-    moved = (T.T @ BASIS @ T).reshape(9, 16)
-    c_new: Array = S.reshape(16)[_PICK] * scale
-    M: Array = scale * (moved[:, _PICK].T + np.outer(2.0 * c_new, moved[:, 11]))
+    moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(4, 10, 4)[_ENTRY[0], :, _ENTRY[1]]
+    entries = moved[:, :9] @ c + moved[:, 9]
+    scale = -0.5 / float(entries[9])
+    c_new = scale * entries[:9]
+    M: Array = scale * (moved[:9, :9] + (2.0 * c_new)[:, None] * moved[9, :9])
     return c_new, M
 
 

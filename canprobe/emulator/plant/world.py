@@ -127,7 +127,7 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
-        self._need_arm().set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
+        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
 
     def motor_counts(self, axis: int) -> float:
         """Motor position now, counts, continuous; 0 without an arm.

@@ -21,7 +21,7 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.change import ChangeTest
-from canprobe.touch.estimators.equations import Touch, equations, joined, squared_innovation, weight_of
+from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
 from canprobe.touch.estimators.filter_answer import filter_estimate
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.start import Start
@@ -29,7 +29,6 @@ from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.noise import Correlation
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric_row import SampleRows
 
 STEP = 0.025
 """Travel between two updates over the memory."""
@@ -51,11 +50,11 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """A contact against what the filter says: its equations, squared innovation and weight."""
+    """Contacts against what the filter says: their equations, squared innovations and weights."""
 
-    rows: SampleRows
-    square: float
-    weight: float
+    equations: Equations
+    squares: list[float]
+    weights: list[float]
 
 
 class RecursiveEstimator:
@@ -144,29 +143,28 @@ class RecursiveEstimator:
 
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
-        compared = [self._compared(p) for p in self._pending] if self._settled else []
+        compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
-        if any([self._change.take(c.square, caution) for c in compared]):
+        if compared and any([self._change.take(square, caution) for square in compared.squares]):
             self._change.alarm()
-            self._drop_agreeing(compared)
+            self._drop_agreeing(compared.squares)
             self._spread.fade(0.0)
             self._start = Start(self._memory, self._prior)
-        if self._start is None:
-            self._absorb(compared, moved)
-        else:
+        if self._start is not None:
             self._begin_with(self._start, moved)
+        elif compared:
+            self._absorb(compared, moved)
 
-    def _compared(self, pending: _Pending) -> _Compared:
-        rows = equations(self._filter.c, self._filter.T, self._memory, pending.touch)
-        square = squared_innovation(rows, self._filter.inverse)
-        return _Compared(rows, square, pending.weight * weight_of(square))
+    def _compared(self) -> _Compared:
+        found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
+        squares = squared_innovations(found, self._filter.inverse)
+        return _Compared(found, squares, [p.weight * weight_of(s) for p, s in zip(self._pending, squares, strict=True)])
 
-    def _absorb(self, compared: Sequence[_Compared], moved: float) -> None:
+    def _absorb(self, compared: _Compared, moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array([c.weight for c in compared])
-        crowd = self._weigh(moved, weight)
-        rows, residuals = joined([c.rows for c in compared])
-        root = np.sqrt(crowd * weight)[:, None]
+        weight = np.array(compared.weights)
+        root = np.sqrt(self._weigh(moved, weight) * weight)[:, None]
+        rows, residuals = compared.equations
         self._filter.take(rows * root[:, :, None], residuals * root, moved)
         if self._last is not None:
             self._filter.follow(self._last.point)
@@ -199,9 +197,9 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self, compared: Sequence[_Compared]) -> None:
+    def _drop_agreeing(self, squares: Sequence[float]) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
         limit = AGREEING * self._change.usual
-        agree = [i for i, c in enumerate(compared[:-1]) if c.square <= limit]
+        agree = [i for i, square in enumerate(squares[:-1]) if square <= limit]
         for _ in range(agree[-1] + 1 if agree else 0):
             self._pending.popleft()
