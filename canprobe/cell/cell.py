@@ -152,8 +152,8 @@ class Cell:
         Args:
             controller: has ``step(measurement) → command``, or is such a function. Where it has ``retreat(reason)`` the
                 cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
-                the contact to it. Where it has ``inspect(q)`` it sees the joint angles (6,), rad, before the drives are
-                enabled, and may say why they must not be.
+                the contact to it; without, the cell takes the probe off the object itself. Where it has ``inspect(q)``
+                it sees the joint angles (6,), rad, before the drives are enabled, and may say why they must not be.
             progress: called after each cycle.
 
         Raises:
