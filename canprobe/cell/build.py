@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,7 +13,6 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.cycle import CycleSettings
 from canprobe.cell.drives import DriveAxis, DriveGroup
-from canprobe.cell.lift_off import LiftOff
 from canprobe.cell.limits import limits_of, patch_from
 from canprobe.cell.measurement import Controller
 from canprobe.cell.observe import Observers
@@ -26,6 +26,9 @@ from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import BringUpSettings, ProbeSettings
 from canprobe.scene_geometry import T_flange_probe
+
+if TYPE_CHECKING:
+    from canprobe.cell.lift_off import LiftOff
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
@@ -81,6 +84,8 @@ def _lift_from(plan: Plan, drives: DriveGroup | None) -> Callable[[Callable[[int
     scene = plan.scene
     if scene.arm is None or scene.sensor is None or drives is None:
         return None
+    from canprobe.cell.lift_off import LiftOff
+
     flange_probe = T_flange_probe(scene.probe or ProbeSettings())
     model, period_s = MODELS[scene.arm.model], plan.sync.period_ns * 1e-9
     return lambda obeys: LiftOff(drives, model, flange_probe, period_s, obeys)

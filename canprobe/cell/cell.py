@@ -11,7 +11,6 @@ from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
-from canprobe.cell.lift_off import LiftOff
 from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.observe import Observers
@@ -24,6 +23,7 @@ from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 
 if TYPE_CHECKING:
+    from canprobe.cell.lift_off import LiftOff
     from canprobe.touch.patch import Patch
 
 WARM_UP_S = 0.1
