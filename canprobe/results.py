@@ -128,7 +128,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
+            scene, getattr(controller, "shape", None), estimates, _truth(session), log["t_s"], map_summary=map_summary
         ),
         "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
@@ -171,6 +171,11 @@ def _traffic(session: Session) -> dict[str, Any]:
         return {}
 
 
+def _truth(session: Session) -> dict[str, Array]:
+    """The plant's truth; empty where nothing was emulated, or nothing happened."""
+    return session.truth if "force" in session.truth else {}
+
+
 def _scan(controller: object) -> tuple[int, int] | None:
     cycles = getattr(controller, "scan_cycles", None)
     return cycles if cycles is not None and cycles[1] > cycles[0] else None
@@ -184,8 +189,8 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     measured: float | None = None
     if scan is not None:
         measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
-        if session.truth:
-            figures = score_contact(session.truth, *scan, task.force_n)
+        if truth := _truth(session):
+            figures = score_contact(truth, *scan, task.force_n)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
