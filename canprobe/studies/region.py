@@ -2,9 +2,9 @@
 
 The cases of `bound`, and more that go to the edges, with seeds of their own. For each limit of the region (path over
 radius, bound over size, κσ_p, cubic terms over the bound, noise over spread) the cases that are inside by all the
-others are sorted into levels of it. A level holds where both estimators have the error, bias and coverage asked for, pooled, and all of K
-observed. The limit is the upper end of the last level before the first that does not hold, and never beyond what
-`MEANT` says, from where on K is not what the bound is about.
+others are sorted into levels of it. A level holds where both estimators have the error, bias and coverage asked for,
+pooled, and all of K observed. The limit is the upper end of the last level before the first that does not hold, and
+never beyond what `MEANT` says, from where on K is not what the bound is about.
 
 What is in use stands in `bound_cases.REGION`; where the pilot chooses another limit, the table says why.
 """
