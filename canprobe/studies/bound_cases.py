@@ -16,9 +16,12 @@ SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
 LEAST_SIZE = 50.0
 """A surface's size of K below which its bound is measured by this, 1/m."""
-REGION: Mapping[str, float] = MappingProxyType({"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0})
+REGION: Mapping[str, float] = MappingProxyType(
+    {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
+)
 """Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
-point, rad), and error of the quadric without noise (its prior, and cubic terms of the surface) over the bound.
+point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
+a point over the spread of the points where that is narrowest: beyond, a path is not well excited.
 
 From what a local quadric can mean; `canprobe study region`, a pilot with seeds of its own, says how far in each holds.
 """
@@ -67,6 +70,7 @@ def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[st
         "bound": math.sqrt(float(np.diag(C).max())) / max(size, LEAST_SIZE),
         "κσ": float(np.abs(np.linalg.eigvalsh(ground.K)).max()) * case.sigma_point,
         "cubic": model_bias,
+        "spread": case.sigma_point / math.sqrt(float(np.linalg.eigvalsh(np.cov(ground.points[:, :2].T))[0])),
     }
 
 

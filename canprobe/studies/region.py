@@ -1,10 +1,10 @@
 """Study `region`: a pilot of `bound` that chooses a region in which a local quadratic bound means something.
 
 The cases of `bound`, and more that go to the edges, with seeds of their own. For each limit of the region (path over
-radius, bound over size, κσ_p, cubic terms over the bound) the cases that are inside by all the others are sorted into
-levels of it. A level holds where both estimators have the error, bias and coverage asked for, pooled, and all of K
-observed. The limit is the upper end of the last level before the first that does not hold, and never beyond what
-`MEANT` says, from where on K is not what the bound is about.
+radius, bound over size, κσ_p, cubic terms over the bound, noise over spread) the cases that are inside by all the
+others are sorted into levels of it. A level holds where both estimators have the error, bias and coverage asked for,
+pooled, and all of K observed. The limit is the upper end of the last level before the first that does not hold, and
+never beyond what `MEANT` says, from where on K is not what the bound is about.
 
 What is in use stands in `bound_cases.REGION`; where the pilot chooses another limit, the table says why.
 """
@@ -27,14 +27,18 @@ from canprobe.studies.sweep import Sweep
 
 FIRST_SEED, SEEDS = 1_000_000, 20
 """`bound` has the seeds from 0 on."""
-MEANT: Mapping[str, float] = MappingProxyType({"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0})
+MEANT: Mapping[str, float] = MappingProxyType(
+    {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
+)
 """Beyond a radius of path no surface is like its quadric; a bound of a fifth of K is hardly a measurement; where a
-point's noise turns the normal by 5 mrad it is no small noise; cubic terms of a third of the bound are a third of it."""
+point's noise turns the normal by 5 mrad it is no small noise; cubic terms of a third of the bound are a third of it;
+where noise is a quarter of what the points are spread by, the rank decision (`rank.SPREAD`) begins to say no."""
 LEVELS: Mapping[str, tuple[float, ...]] = MappingProxyType({
     "path": (0.05, 0.5, 1.0, 1.5, 2.0),
     "bound": (0.005, 0.02, 0.05, 0.2, 0.5),
     "κσ": (1e-4, 1e-3, 5e-3, 1e-2, 2.5e-2),
     "cubic": (0.05, 0.15, 1.0 / 3.0, 0.5, 1.0, 10.0),
+    "spread": (0.01, 0.05, 0.25, 0.5),
 })  # fmt: skip
 COLUMNS = (
     Column("limit", "limit"),

@@ -13,13 +13,19 @@ from canprobe.studies.bound_cases import REGION
 
 INK, FAINT = "#1f2933", "#d9dee4"
 COLOURS = {"ml": "#0f6e84", "recursive": "#c2410c"}
-NAMES = {"path": "path / radius", "bound": "bound / size of K", "κσ": "κσ_p, rad", "cubic": "cubic terms / bound"}
+NAMES = {
+    "path": "path / radius",
+    "bound": "bound / size of K",
+    "κσ": "κσ_p, rad",
+    "cubic": "cubic terms / bound",
+    "spread": "noise / spread of points",
+}
 CLIP = 3.0
 
 
 def draw_region(measured: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Error over bound and coverage of every case against each limit: a column of panels a limit."""
-    figure = Figure(figsize=(14.0, 6.4), dpi=110, layout="constrained")
+    figure = Figure(figsize=(16.0, 6.4), dpi=110, layout="constrained")
     figure.suptitle(
         "How far out the bound means something: each case against each limit (line); grey: asked for",
         x=0.01, ha="left", fontsize=11, color=INK,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import numpy as np
 import pytest
 
 from canprobe.cli import main
@@ -13,7 +14,7 @@ from canprobe.studies.bound_cases import REGION, all_cases, reasons_outside
 
 
 def case_row(method="ml", ratio=1.0, bias=0.0, coverage=0.95, observed=1.0, **at):
-    values = {"path": 0.5, "bound": 0.01, "κσ": 5e-4, "cubic": 0.1} | at
+    values = {"path": 0.5, "bound": 0.01, "κσ": 5e-4, "cubic": 0.1, "spread": 0.02} | at
     scores = {"method": method, "ratio": ratio, "bias": bias, "coverage": coverage, "observed": observed}
     return scores | {AT + name: value for name, value in values.items()}
 
@@ -63,3 +64,13 @@ def test_the_quick_pilot_runs_from_the_command_line(tmp_path, capsys):
     assert {row["limit"] for row in document["rows"]} == set(REGION)
     assert len(document["findings"]) == len(REGION)
     assert (tmp_path / "region.png").stat().st_size > 10_000
+
+
+def test_a_path_that_is_hardly_wider_than_the_noise_is_outside():
+    """5 mm of weave under 0.1 mm of noise: its sides are 0.37 mm from the middle, RMS."""
+    from canprobe.studies.bound_cases import NOISES, Case, criteria
+
+    case = Case("cylinder", "weave", 0.04, 0.005, *NOISES[2])
+    narrow = criteria(case, case.ground, np.zeros((3, 3)), 0.0)
+    assert narrow["spread"] == pytest.approx(0.268, abs=0.002)
+    assert reasons_outside(narrow) == ["spread"]

@@ -71,7 +71,8 @@ def test_every_method_finds_a_cylinder(method, truth):
     assert e.condition_number > 1
 
 
-def test_one_row_is_the_row_of_the_batch(truth):
+@pytest.mark.parametrize("coupling", [0.0, 0.5])
+def test_one_row_is_the_row_of_the_batch(truth, coupling):
     rng = np.random.default_rng(1)
     path = truth.path("ellipsoid")
     p, n = path.noisy(5e-5, 3e-3, 1)
@@ -79,9 +80,9 @@ def test_one_row_is_the_row_of_the_batch(truth):
     S[:3, :3] *= 0.02
     c = 1.1 * quadric.parameters_of(S)
     c[:3] = [0.01, -0.02, 0.001]
-    batch = quadric.rows(c, quadric.design(p / 0.02, n, make_noise(160, 1e-2, 3e-3)))
+    batch = quadric.rows(c, quadric.design(p / 0.02, n, make_noise(160, 1e-2, 3e-3, coupling)))
     for i in rng.choice(160, 20):
-        one = sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), 1e-4, 9e-6)
+        one = sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), (1e-4, 9e-6), coupling)
         J = np.reshape(one.weights, (3, 4)) @ basis(np.array([monomials(*one.place)]))[0, :, :9]
         assert np.allclose(one.residuals, -batch.r[i], rtol=1e-9, atol=1e-9)
         assert np.allclose(J, batch.J[i], rtol=1e-9, atol=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.touch.estimators.information import InformationFilter
-from canprobe.touch.estimators.left_out import LeftOut
+from canprobe.touch.estimators.left_out import Expected, LeftOut
 from canprobe.touch.evidence import curvature_covariance
 from canprobe.touch.fit import fit_surface
 from canprobe.touch.linearised import linearised, with_terms
@@ -150,3 +150,21 @@ def test_where_k_is_its_noise_the_others_hardly_count():
         found = curvature_covariance(c, deviation)
         assert found[0, 0] == pytest.approx(own + share * ((D @ D.T)[0, 0] - own), rel=0.05)
         assert (np.linalg.eigvalsh(found) > 0.0).all()
+
+
+def test_generous_noise_does_not_hide_a_misfit():
+    """Deviations stated three times too large make a misfit ten times less evident; said so, it is found again."""
+    rng = RNG(11)
+    J, E = rng.normal(size=(200, 3, 9)), rng.normal(size=(200, 3, 9))
+    rows, e = np.concatenate([J, E], axis=2), rng.normal(size=600)
+    flat = rows.reshape(-1, 18)
+    H = np.linalg.inv(flat[:, :9].T @ flat[:, :9])
+    a = 0.14 * rng.normal(size=9)
+    residuals = (flat[:, 9:] @ a + e) / 3.0
+    residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))
+    sums = LeftOut(1e-9 * np.eye(9), None)
+    c = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.5, 0.1, 0.3])
+    sums.start(rows, residuals.reshape(-1, 3), 0.01)
+    stated, known = (sums.amend(c, H, np.zeros(3), Expected(noise)) for noise in (1.0, 1.0 / 9.0))
+    assert stated.misfit < 0.5
+    assert known.misfit > 0.99

@@ -581,3 +581,21 @@ def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
     pull = both.covariance.trace() / 10.0**2
     assert 0.0 < pull < 0.03
     assert both.kappa[0] == pytest.approx((1 / 0.036) * (1.0 - pull), abs=0.25)
+
+
+def test_where_the_surface_bends_the_mean_of_the_images_counts_less():
+    """κ1 falls by 0.1 1/m a frame: the mean of the last frames is 3 1/m late, and its regions know of it."""
+    k1 = np.linspace(40.0, 24.0, 161)
+    bending, steady = PatchCurvature(model()), PatchCurvature(model())
+    for k in k1:
+        bending.add(samples(base_tensor(tensor(k, 0.0, 0.3)), NORMAL, FORCE, exact, 1)[0])
+        steady.add(samples(base_tensor(tensor(k1[-1], 0.0, 0.3)), NORMAL, FORCE, exact, 1)[0])
+    T = homogeneous(tangent_rotation(-NORMAL), np.zeros(3))
+    truth = tensor(k1[-1], 0.0, 0.3)
+    q = np.array([truth[0, 0], math.sqrt(2.0) * truth[0, 1], truth[1, 1]])
+    late, right = bending.fuse(T), steady.fuse(T)
+    assert np.linalg.norm(right.q - q) < 0.1
+    off = late.q - q
+    assert np.linalg.norm(off) > 1.5
+    assert off @ late.patch @ off < 2.0  # two of χ² of 3
+    assert off @ right.patch @ off > 2.0 * (off @ late.patch @ off)
