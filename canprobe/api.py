@@ -19,7 +19,7 @@ from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
 from canprobe.link_report import check_links
 from canprobe.planning import Plan, make_plan
-from canprobe.results import RunResult, summarise, write_files
+from canprobe.results import RunResult, log_columns, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 
@@ -85,7 +85,7 @@ def run(
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
-        BusError: an interface or a node failed. The drives are disabled and the files written.
+        BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
     """
     resolved = resolve_scene(
@@ -109,7 +109,7 @@ def run(
                 session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
         except (CanprobeError, KeyboardInterrupt) as error:
             failure = error
-            if not session.opened:
+            if not session.started:
                 raise
         result = _finish(session, controller, failure, bridges)
     if failure is not None:
@@ -158,7 +158,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
     result = RunResult(
         session.plan,
         summary,
-        session.cell.log.arrays(),
+        log_columns(session.cell),
         session.truth,
         estimates,
         getattr(controller, "taxels", None),
@@ -202,8 +202,11 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
 
 
 def _draw(result: RunResult, out: Path) -> None:
-    (out / "report.html").unlink(missing_ok=True)  # of an earlier run
-    if "report.html" in result.plan.outputs and len(result.log["t_s"]):
+    for name in ("report.html", "report.png", "surface.png"):
+        (out / name).unlink(missing_ok=True)  # of an earlier run
+    if not len(result.log["t_s"]):
+        return
+    if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
         page.write_page(recorded.read_run(out), out / "report.html")
     try:
@@ -212,7 +215,6 @@ def _draw(result: RunResult, out: Path) -> None:
     except ImportError:  # the study extra is not installed
         return
     draw_run(result, out / "report.png")
-    (out / "surface.png").unlink(missing_ok=True)  # of an earlier run
     draw_surface(result, out / "surface.png")
 
 

@@ -10,8 +10,9 @@ import subprocess
 import sys
 import tempfile
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
-from typing import IO
+from typing import IO, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ from canprobe.protocol.frames import HEARTBEAT_BASE
 from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
 
-START_TIMEOUT_S = 30.0
+TOLD_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
@@ -93,8 +94,12 @@ class EmulatorChild:
         assert self._process is not None
         return self._process.pid
 
-    def await_boot_ups(self, port: Port) -> None:
-        """Wait for the boot-up of each of its nodes.
+    def await_boot_ups(self, port: Port, say: Callable[[str], None] = lambda _: None) -> None:
+        """Wait for the boot-up of each of its nodes, as long as the scene allows; on a busy machine that takes a while.
+
+        Args:
+            port: of the nodes' bus.
+            say: is told now and then how long it has taken.
 
         Raises:
             BusError: the process ended; with its own last words.
@@ -103,16 +108,29 @@ class EmulatorChild:
         assert self._process is not None
         waiting = set(self._scene.emulated_node_ids)
         clock = port.clock
-        deadline = clock.now_ns() + round(START_TIMEOUT_S * 1e9)
+        start = clock.now_ns()
+        deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
+        tell = start + round(TOLD_EVERY_S * 1e9)
         while waiting:
+            now = clock.now_ns()
             if self._process.poll() is not None:
                 raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
-            if clock.now_ns() > deadline:
-                raise NodeError(min(waiting), f"the emulated node did not boot within {START_TIMEOUT_S:g} s")
-            port.wait(min(deadline, clock.now_ns() + 50_000_000))
+            if now >= deadline:
+                self._raise_late(min(waiting))
+            if now >= tell:
+                say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
+                tell += round(TOLD_EVERY_S * 1e9)
+            port.wait(min(deadline, now + 50_000_000))
             for can_id, data, _ in port.drain():
                 if data == b"\0":
                     waiting.discard(can_id - HEARTBEAT_BASE)
+
+    def _raise_late(self, node_id: int) -> NoReturn:
+        raise NodeError(
+            node_id,
+            f"the emulated node did not boot within {self._scene.bring_up.emulated_s:g} s, and its process still runs:"
+            " a busier machine needs a larger [bring_up] emulated_s",
+        )
 
     def _last_words(self) -> str:
         assert self._errors is not None

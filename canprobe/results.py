@@ -115,8 +115,8 @@ def summarise(
     cycle = cell.cycle
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = cell.log.arrays()
-    return {
+    log = log_columns(cell)
+    summary = {
         "schema": SCHEMA,
         "scene": scene.name,
         "bus": scene.bus.interface,
@@ -128,7 +128,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
+            scene, getattr(controller, "shape", None), estimates, _truth(session), log["t_s"], map_summary=map_summary
         ),
         "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
@@ -139,9 +139,25 @@ def summarise(
         },
         "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
+        "warnings": list(session.plan.warnings),
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
+    return {name: _without_nan(value) for name, value in summary.items()}
+
+
+def log_columns(cell: Cell) -> dict[str, Array]:
+    """The columns of ``log.npz``; a run that was stopped before its first cycle has the time's, without a row."""
+    return {"t_s": np.empty(0), **cell.log.arrays()}
+
+
+def _without_nan(value: Any) -> Any:
+    """The same for JSON: what is not finite does not apply."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def _traffic(session: Session) -> dict[str, Any]:
@@ -153,6 +169,11 @@ def _traffic(session: Session) -> dict[str, Any]:
         return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
     except UsageError:  # it ended before the first SYNC
         return {}
+
+
+def _truth(session: Session) -> dict[str, Array]:
+    """The plant's truth; empty where nothing was emulated, or nothing happened."""
+    return session.truth if "force" in session.truth else {}
 
 
 def _scan(controller: object) -> tuple[int, int] | None:
@@ -167,17 +188,22 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
     if scan is not None:
-        force = log["force_n"][scan[0] : scan[1]]
-        measured = float(np.sqrt(np.mean((force - task.force_n) ** 2)))
-        if session.truth:
-            figures = score_contact(session.truth, *scan, task.force_n)
+        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
+        if truth := _truth(session):
+            figures = score_contact(truth, *scan, task.force_n)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
-            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"]))}
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
         "losses": summarise_losses(getattr(controller, "losses", ()))
     }
+
+
+def _rms_error(values: Array, target: float) -> float | None:
+    """RMS error over the cycles that have a value: one in which the cell held has none."""
+    told = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((told - target) ** 2))) if len(told) else None
 
 
 def summarise_shape(
@@ -262,6 +288,7 @@ def _bound_ratio(
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=0.0 if scene.probe is None else 1e3 / scene.probe.radius_mm,
     )
     return None if bound is None else score.kappa_rms / bound
 
@@ -354,6 +381,8 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     if summary.get("calibration") is not None:
         lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)

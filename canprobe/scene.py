@@ -60,7 +60,7 @@ class BusSettings:
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
     timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
-    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    transmit_queue: TransmitQueue = "priority"  # what a node with several frames sends first; "fifo": the oldest
     bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
     fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
     data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
@@ -217,7 +217,8 @@ class BringUpSettings:
     boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0  # from the reset to the boot-up message
     sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5  # for one answer
     start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0  # from NMT start to the heartbeat that tells it
-    retries: Annotated[int, Range(0, 100)] = 1  # of a reset and of a request without an answer
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0  # for the emulated nodes' process to start
+    retries: Annotated[int, Range(0, 100)] = 2  # of a reset, a request or a start without an answer
     store: bool = False  # 1010h keeps the configuration in the nodes; 1020h tells the next bring-up to leave it out
 
 

@@ -143,8 +143,13 @@ class Session:
         return self._cell
 
     @property
+    def started(self) -> bool:
+        """The buses were opened and the cell was made: there is something to report, if only how bring-up failed."""
+        return self._cell is not None
+
+    @property
     def opened(self) -> bool:
-        """The nodes were brought up; there is something to report."""
+        """The nodes were brought up."""
         return self._cell is not None and self._cell.cycle is not None
 
     def bus_load(self, channel: str) -> float | None:
@@ -156,10 +161,10 @@ class Session:
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
         hush_canopen()
+        for warning in self.plan.warnings:
+            self._say(f"warning: {warning}")
         try:
             port = self._open()
-            self._bus_start_ns = port.clock.now_ns()
-            self._stack.callback(self._stop_watch, port)
             self._cell = make_cell(
                 self.plan,
                 port,
@@ -168,6 +173,10 @@ class Session:
                 observers=self.observers,
                 rows_kept=self._rows_kept,
             )
+            if self.scene.bus.interface != LOCKSTEP:
+                self._get_ready(port)
+            self._bus_start_ns = port.clock.now_ns()
+            self._stack.callback(self._stop_watch, port)
             self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
@@ -241,6 +250,18 @@ class Session:
 
         return both
 
+    def _error_writer(self, channel: str) -> Write:
+        """Error frames go into the log, and beside the plan."""
+        meter = self.meters[channel]
+        write = self._candump.on(channel) if self._candump is not None else None
+
+        def note(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.error_frames += 1
+            if write is not None:
+                write(can_id, data, t_ns)
+
+        return note
+
     def _join(self, ports: dict[str, Port]) -> Port:
         """One port for the cell, whatever the number of buses."""
         return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
@@ -260,6 +281,7 @@ class Session:
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
             bus.recorder = self._writer(channel, 0)
+            bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)
@@ -282,8 +304,6 @@ class Session:
 
     def _open_real(self) -> Port:
         from canprobe.bus.open import open_port
-        from canprobe.child import EmulatorChild
-        from canprobe.rehearsal import rehearse
 
         bus = self.scene.bus
         if bus.interface == "virtual" and self.scene.emulated_node_ids:
@@ -300,7 +320,13 @@ class Session:
             real = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
             self._stack.callback(real.close)
             ports[planned.channel] = RecordingPort(real, Sink(self._writer(planned.channel, t0_ns)))
-        port = self._join(ports)
+        return self._join(ports)
+
+    def _get_ready(self, port: Port) -> None:
+        """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
+        from canprobe.child import EmulatorChild
+        from canprobe.rehearsal import rehearse
+
         child = None
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
@@ -312,10 +338,9 @@ class Session:
         rehearse(self.scene)
         reserve_memory()
         if child is not None:
-            child.await_boot_ups(port)
+            child.await_boot_ups(port, self._say)
         if self.scene.cycle.realtime:
             self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
-        return port
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()

@@ -28,6 +28,9 @@ MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
 LONG_PDOS = 0x2007
 """Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
 LONG_PDOS_NAME = "Long PDOs (CAN FD)"
+FULL_SCALE = 0x2004
+"""Of the tactile array: the pressure of its largest count, Pa."""
+FULL_SCALE_NAME = "Full scale pressure"
 WINDOW_SIZE = 0x2008
 """Manufacturer's object of our arrays: taxels along the window that follows the contact."""
 WINDOW_SIZE_NAME = "Window size"
@@ -70,6 +73,11 @@ def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
 def has_window_size(od: canopen.ObjectDictionary) -> bool:
     """Whether 2008h is that object here; without it the window has 8×8 taxels."""
     return WINDOW_SIZE in od and od[WINDOW_SIZE].name == WINDOW_SIZE_NAME
+
+
+def has_full_scale(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2004h is that object here; without it the device cannot tell the pressure of its largest count."""
+    return FULL_SCALE in od and od[FULL_SCALE].name == FULL_SCALE_NAME
 
 
 def eds_file(source: str | os.PathLike[str]) -> Path:

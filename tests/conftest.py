@@ -26,6 +26,7 @@ from typing import Any
 import hypothesis
 import pytest
 import sharing
+import standstill
 
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import InterfaceError
@@ -82,7 +83,21 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         _require_interface()
 
 
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> bool | None:
+    """Run a vcan test where the vcan is; anything else gives way to those that keep the time of a bus."""
+    if not _is_vcan(item):
+        sharing.give_way(item.config)
+        return None
+    item.ihook.pytest_runtest_logstart(nodeid=item.nodeid, location=item.location)
+    for report in standstill.run_protocol(item, nextitem):
+        item.ihook.pytest_runtest_logreport(report=report)
+    item.ihook.pytest_runtest_logfinish(nodeid=item.nodeid, location=item.location)
+    return True
+
+
 def pytest_terminal_summary(terminalreporter: Any) -> None:
+    for told in standstill.tell(terminalreporter.stats):
+        terminalreporter.write_line(told, yellow=True)
     reasons = [dict(report.user_properties).get(_NOT_RUN) for report in terminalreporter.stats.get("skipped", ())]
     if why := [reason for reason in reasons if reason is not None]:
         terminalreporter.section("vcan", sep="!", red=True, bold=True)

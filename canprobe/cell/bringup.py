@@ -46,6 +46,24 @@ class Write:
 
 
 @dataclass(frozen=True, slots=True)
+class Given:
+    """One entry that the device cannot change and the scene relies on.
+
+    Attributes:
+        index, subindex: the entry.
+        value: that it must hold.
+        key: of the scene that says so.
+        otherwise: what would be wrong.
+    """
+
+    index: int
+    subindex: int
+    value: int
+    key: str
+    otherwise: str
+
+
+@dataclass(frozen=True, slots=True)
 class NodeSetup:
     """What one node must be and become.
 
@@ -56,6 +74,7 @@ class NodeSetup:
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
         writes: its configuration, in order.
+        given: what it must hold by itself.
         lacks: objects that the cell would have set and that this make of device does not have.
     """
 
@@ -65,6 +84,7 @@ class NodeSetup:
     dictionary: ObjectDictionary
     identity: dict[int, int]
     writes: tuple[Write, ...]
+    given: tuple[Given, ...] = ()
     lacks: tuple[int, ...] = ()
 
 
@@ -79,7 +99,7 @@ class BringUpTimes:
         sdo: for one answer.
         start: from NMT start to the first heartbeat that tells it.
         release: for one answer when the nodes are let go.
-        retries: how often a reset or a request without an answer is sent again.
+        retries: how often a reset, a request or a start without an answer is sent again.
         store: let the nodes keep their configuration (1010h), and leave it out where 1020h says that it is there.
     """
 
@@ -89,7 +109,7 @@ class BringUpTimes:
     sdo: float = 0.5
     start: float = 1.0
     release: float = 0.1
-    retries: int = 1
+    retries: int = 2
     store: bool = False
 
 
@@ -238,6 +258,7 @@ class BringUp:
     def _configure(self, setup: NodeSetup, report: NodeReport) -> Generator[bytes | None, bytes, None]:
         try:
             yield from self._identify(setup, report)
+            yield from self._check_given(setup)
             kept = self._times.store and (yield from self._is_kept(setup))
             report.kept = kept
             for write in setup.writes:
@@ -263,6 +284,16 @@ class BringUp:
                 report.software = version.decode("latin-1").rstrip("\0")
             except (SdoAbortedError, SdoCommunicationError):
                 report.software = None
+
+    def _check_given(self, setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
+        for given in setup.given:
+            got = yield from self._read(setup, given.index, given.subindex)
+            if got != given.value:
+                raise NodeError(
+                    setup.node_id,
+                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value}, as the scene's"
+                    f" {given.key} says, got {got}: {given.otherwise}; put right {given.key}",
+                )
 
     def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
         """Whether the node says that it was configured with these very values."""
@@ -307,20 +338,31 @@ class BringUp:
             )
 
     def _start(self) -> None:
-        self._say("start all nodes")
         self._watch.forget()
-        self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in self._setups])
-        ids = [s.node_id for s in self._setups]
-        if not self._network.pump_until(
-            lambda: all(self._watch.states.get(i) is NmtState.OPERATIONAL for i in ids), self._times.start
-        ):
-            slow = next(s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL)
-            state = self._watch.states.get(slow.node_id)
-            raise NodeError(
-                slow.node_id,
-                f"({slow.name}) is not operational {self._times.start:g} s after NMT start:"
-                f" {'no heartbeat' if state is None else state.name}",
-            )
+        waiting = list(self._setups)
+        for _ in range(1 + self._times.retries):
+            all_of_them = len(waiting) == len(self._setups)
+            which = "all nodes" if all_of_them else f"nodes {', '.join(str(s.node_id) for s in waiting)} again"
+            self._say(f"start {which}")
+            self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in waiting])
+            self._network.pump_until(lambda: not self._not_operational(), self._times.start)
+            if not (waiting := self._not_operational()):
+                return
+        self._raise_not_operational(waiting)
+
+    def _not_operational(self) -> list[NodeSetup]:
+        return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
+
+    def _raise_not_operational(self, waiting: Sequence[NodeSetup]) -> None:
+        slow, *others = waiting
+        state = self._watch.states.get(slow.node_id)
+        tries = f", {1 + self._times.retries} times" if self._times.retries else ""
+        raise NodeError(
+            slow.node_id,
+            f"({slow.name}) is not operational {self._times.start:g} s after NMT start{tries}:"
+            f" {'no heartbeat' if state is None else state.name}"
+            + (f"; nor are {', '.join(f'{s.node_id} ({s.name})' for s in others)}" if others else ""),
+        )
 
     def release(self) -> None:
         """Take the nodes out of operation: pre-operational, heartbeat consumers off. Every node is tried."""

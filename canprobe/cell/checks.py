@@ -35,7 +35,20 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
         return None
     i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{seen.watch.last_words(node_id)}")
+    words = seen.watch.last_words(node_id)
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{words}{_held_up(seen)}")
+
+
+def _held_up(seen: Seen) -> str:
+    """Why the drives stopped by themselves, where that is known: the master was kept from its cycle for too long."""
+    patience_ns = seen.limits.missed_cycles * seen.limits.period_ns
+    if seen.gap_ns <= patience_ns:
+        return ""
+    return (
+        f"; the last SYNC was sent {seen.gap_ns * 1e-6:.0f} ms after the one before, and the drives stop by themselves"
+        f" {patience_ns * 1e-6:g} ms after one (arm.missed_syncs = {seen.limits.missed_cycles}): the machine held the"
+        " master up; leave it more of the processor, or see --realtime"
+    )
 
 
 def device_emcy(seen: Seen) -> NodeError | None:

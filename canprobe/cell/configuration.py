@@ -7,11 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.bringup import NodeSetup, Write
+from canprobe.cell.bringup import Given, NodeSetup, Write
 from canprobe.eds import (
+    FULL_SCALE,
     LONG_PDOS,
     MISSED_SYNCS,
     WINDOW_SIZE,
+    has_full_scale,
     has_long_pdos,
     has_missed_syncs,
     has_window_size,
@@ -62,6 +64,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         dictionary=dictionary,
         identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},
         writes=(*_pdo_writes(plan, node, dictionary), *(w for w in wanted if w.index in dictionary)),
+        given=_sensor_given(plan, dictionary) if node.kind == "tactile" else (),
         lacks=tuple(sorted({w.index for w in wanted if w.index not in dictionary})),
     )
 
@@ -158,3 +161,13 @@ def _sensor_writes(plan: Plan, dictionary: Any) -> list[Write]:
     if plan.scene.task.kind in ("scan", "press", "calibrate"):
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes
+
+
+def _sensor_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
+    """An array of another full scale would have its force read wrong by the ratio of the two."""
+    sensor = plan.scene.sensor
+    assert sensor is not None
+    if not has_full_scale(dictionary):
+        return ()
+    pascals = round(sensor.full_scale_kpa * 1e3)
+    return (Given(FULL_SCALE, 0, pascals, "sensor.full_scale_kpa", "force would be read wrong by their ratio"),)

@@ -31,6 +31,7 @@ class Reaction(Enum):
     HOLD = "hold"
     SEARCH = "search"
     RETREAT = "retreat"
+    LIFT = "lift off, quick stop"
     STOP = "quick stop"
 
 
@@ -78,6 +79,11 @@ class Limits:
     workspace: Vector | None = None
     tip_of: Callable[[Vector], Vector] | None = None
 
+    @property
+    def cycles_to_feel(self) -> int:
+        """From a motion to the cycle that has taken in a tactile sample of it."""
+        return 2 * self.tactile_cycles + 2
+
 
 @dataclass(slots=True)
 class Seen:
@@ -91,6 +97,7 @@ class Seen:
         controller_state: of the CAN controller.
         measurement: of this cycle.
         sync_ns: when its SYNC went out, on the port's clock.
+        gap_ns: from the SYNC before to it; 0 for the first.
         overruns: cycles late so far.
         late_share: share of the last second's cycles that were late.
         passive_ns: how long the controller has been error-passive.
@@ -108,6 +115,7 @@ class Seen:
     controller_state: ControllerState = ControllerState.ACTIVE
     measurement: Measurement = field(default_factory=lambda: Measurement(0, 0))
     sync_ns: int = 0
+    gap_ns: int = 0
     overruns: int = 0
     late_share: float = 0.0
     passive_ns: int = 0

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from canprobe.eds import load_eds
+from canprobe.eds import FULL_SCALE, has_full_scale, load_eds
 from canprobe.emulator.drive import make_drive_node
 from canprobe.emulator.lss import set_serial_number
 from canprobe.emulator.node import SlaveNode
@@ -79,7 +79,10 @@ def _node(scene: Scene, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
         axis = scene.arm.node_ids.index(planned.node_id)
         node = make_drive_node(dictionary, node_id, axis, plant, od_of)
     else:
+        assert scene.sensor is not None
         node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)
+        if has_full_scale(dictionary):
+            node.dictionary.set_default(FULL_SCALE, 0, round(scene.sensor.full_scale_kpa * 1e3))
     serial = planned.identity.serial_number
     set_serial_number(node, planned.node_id if serial is None else serial)
     if node.lss is not None:

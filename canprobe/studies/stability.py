@@ -20,23 +20,30 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from canprobe.studies.stability_loop import spectral_radius
-from canprobe.studies.stability_runs import HUNTING, Case, carry_out, loop_of
+from canprobe.studies.stability_runs import HUNTING, Case, carry_out, loop_of, touch_in_posture
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
 
-STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 1e5, 1e6, 1e7)
+STIFFNESSES = (1e2, 1e3, 1e4, 2e4, 4e4, 6e4, 1e5, 1e6, 1e7)
 GAINS_HZ = (2.0, 8.0, 25.0)
-BUSES = ((400.0, 0.0), (400.0, 6.0), (200.0, 0.0), (100.0, 0.0), (1000.0, 0.0))
+BUSES = ((400.0, 0.0), (400.0, 6.0), (400.0, 20.0), (200.0, 0.0), (100.0, 0.0), (1000.0, 0.0))
 """Servo rate (Hz) and delay (ms)."""
 DRIVES_HZ = (3.0, 10.0, 30.0, 100.0, 300.0)
 FIDELITIES = ("ideal", "dynamic")
 REACHES_MM = (120.0, 128.0, 135.0, 171.5, 300.0, 350.0, 358.0, 400.0)
 """Distance of the touch from the first joint's axis: at 127 mm the shoulder is singular, at 360 mm the elbow."""
+WRISTS_DEG = (0.0, 3.0, 10.0)
+"""Joint 5 at the touch: at 0 the wrist is singular, and a scan passes through that place."""
 RADII_MM = (1.0, 5.0, 40.0, 10_000.0)
 SPEEDS_MM_S = (25.0, 50.0, 100.0, 250.0)
+SCAN_S = 1.5
+"""Of a scan: in the second half of it the curvature is known."""
 _AT = (-120.0, -122.5, 374.0)
+WIDE_PERCENT = 20.0
 ENDS = ("stable", "stopped", "refused")
 MODEL = ("bus", "cell", "emulator", "planning", "robot", "touch", "studies/stability_runs.py",
          "studies/late_node.py")  # fmt: skip
@@ -62,8 +69,9 @@ def cases(quick: bool) -> list[Case]:
     if quick:
         return _quick_cases()
     found = [_at(reach, speed) for reach, speed in product(REACHES_MM, (0.0, 25.0))]
+    found += [_bent(wrist, speed) for wrist, speed in product(WRISTS_DEG, (0.0, 25.0))]
     found += [_round(probe, radius) for probe, radius in product(RADII_MM, RADII_MM)]
-    found += [Case("speed", k, speed_mm_s=v) for v, k in product(SPEEDS_MM_S, (1e4, 4e4))]
+    found += [Case("speed", k, speed_mm_s=v, hold_s=SCAN_S) for v, k in product(SPEEDS_MM_S, (1e4, 4e4))]
     found += [Case("drives", k, bandwidth_hz=b, fidelity=f) for b, f, k in product(DRIVES_HZ, FIDELITIES, (1e4, 1e6))]
     grid = product(BUSES, GAINS_HZ, STIFFNESSES, (True, False))
     return found + [
@@ -89,7 +97,17 @@ def _quick_cases() -> list[Case]:
 def _at(reach_mm: float, speed_mm_s: float) -> Case:
     """A touch that far from the first joint's axis, in the default direction."""
     share = reach_mm / math.hypot(*_AT[:2])
-    return Case("pose", 1e4, at_mm=(_AT[0] * share, _AT[1] * share, _AT[2]), speed_mm_s=speed_mm_s)
+    at_mm = (_AT[0] * share, _AT[1] * share, _AT[2])
+    return Case("pose", 1e4, at_mm=at_mm, speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4)
+
+
+def _bent(wrist_deg: float, speed_mm_s: float) -> Case:
+    """A touch of a gently curved object in front of the arm, with the wrist bent by so much."""
+    at_mm, normal, posture_deg = touch_in_posture((90.0, 65.0, 15.0, -360.0, wrist_deg, 0.0))
+    return Case(
+        "pose", 1e4, at_mm=at_mm, normal=normal, posture_deg=posture_deg, kind="sphere", radius_mm=300.0,
+        speed_mm_s=speed_mm_s, hold_s=SCAN_S if speed_mm_s else 0.4,
+    )  # fmt: skip
 
 
 def _round(probe_mm: float, radius_mm: float) -> Case:
@@ -98,9 +116,14 @@ def _round(probe_mm: float, radius_mm: float) -> Case:
 
 def what_of(case: Case) -> str:
     """What is special about a case, in words."""
+    scan = " scan" if case.speed_mm_s else ""
+    pose = f"{math.hypot(*case.at_mm[:2]):.0f} mm from axis 1" + scan
+    if case.normal[2] != 1.0:
+        wrist = min(WRISTS_DEG, key=lambda angle: abs(angle - case.posture_deg[4]))  # that is 1 deg above the touch
+        pose = f"joint 5 at {wrist:g} deg{scan}"
     return {
         "drives": f"{case.bandwidth_hz:g} Hz {case.fidelity}",
-        "pose": f"{math.hypot(*case.at_mm[:2]):.0f} mm from axis 1" + (" scan" if case.speed_mm_s else ""),
+        "pose": pose,
         "radii": f"probe {case.probe_mm:g} mm, object {case.radius_mm:g} mm",
         "speed": f"{case.speed_mm_s:g} mm/s",
     }.get(case.view, "")
@@ -123,7 +146,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 def row_of(case: Case, answer: dict[str, Any]) -> dict[str, Any]:
     """The row of a cell: case, prediction, answer."""
     known = asdict(case)
-    del known["at_mm"], known["posture_deg"]
+    del known["at_mm"], known["normal"], known["posture_deg"]
     return {"what": what_of(case), **known, "eigenvalue": spectral_radius(loop_of(case)), **answer}
 
 
@@ -159,6 +182,13 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
         stable = [r["contact_n_m"] for r in group if r["ended"] == "stable"]
         if stable:
             said.append(f"The servo that {name} is stable from {min(stable):.0e} to {max(stable):.0e} N/m at best.")
+    kept = [r["error_percent"] for r in rows if r["ended"] == "stable" and r["error_percent"] is not None]
+    if kept:
+        wide = sum(error > WIDE_PERCENT for error in kept)
+        said.append(
+            f"Stable touches err by {np.median(kept):.0f} % of the wanted force (median, RMS); {wide} of {len(kept)} "
+            f"by more than {WIDE_PERCENT:.0f} %: stable says that the force settles within its limit, no more."
+        )
     longest = max((r for r in rows if r["above_ms"] is not None), key=lambda r: r["above_ms"], default=None)
     if longest is not None:
         said.append(

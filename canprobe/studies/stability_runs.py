@@ -22,8 +22,10 @@ from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.emulator.plant.arm import natural_frequency
 from canprobe.errors import CanprobeError, PlanError, SafetyStop
+from canprobe.robot.inverse import inverse_near
+from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import ObjectSettings, PlantSettings, Scene, ServoSettings
+from canprobe.scene import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
 from canprobe.scene_geometry import T_flange_probe, true_object
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
@@ -57,6 +59,7 @@ class Case:
         kind, radius_mm: of the object.
         speed_mm_s: of a scan; 0 presses.
         at_mm: where the object is touched, base frame.
+        normal: outward normal there.
         posture_deg: selects the branch of the inverse kinematics.
         force_n: target.
         hold_s: of the press or scan.
@@ -76,6 +79,7 @@ class Case:
     radius_mm: float = 36.0
     speed_mm_s: float = 0.0
     at_mm: tuple[float, float, float] = (-120.0, -122.5, 374.0)
+    normal: tuple[float, float, float] = (0.0, 0.0, 1.0)
     posture_deg: tuple[float, ...] = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
     force_n: float = 2.0
     hold_s: float = 0.4
@@ -101,7 +105,43 @@ def _kappa(case: Case) -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def _object(case: Case) -> ObjectSettings:
     radius = None if case.kind == "plane" else case.radius_mm
-    return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=(0.0, 0.0, 20.0))  # type: ignore[arg-type]
+    return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
+
+
+def touch_in_posture(
+    posture_deg: tuple[float, ...], above_mm: float = 10.0
+) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
+    """A touch with the pole of the default probe and these joint angles, deg.
+
+    Returns:
+        Where it is, mm; the outward normal there; joint angles (6,) so far above it, deg.
+    """
+    model, probe = MODELS["upenn"], ProbeSettings()
+    q = np.radians(posture_deg)
+    T_flange_centre = T_flange_probe(probe)
+    T = forward(model, q) @ T_flange_centre
+    pole = T[:3, 2]
+    above = T.copy()
+    above[:3, 3] -= above_mm * 1e-3 * pole
+    away = np.degrees(inverse_near(model, above @ np.linalg.inv(T_flange_centre), q))
+    at = 1e3 * T[:3, 3] + probe.radius_mm * pole
+    x, y, z = (float(value) for value in at)
+    nx, ny, nz = (-float(value) for value in pole)
+    return (x, y, z), (nx, ny, nz), tuple(float(angle) for angle in away)
+
+
+def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[float, float, float]:
+    """Roll, pitch and yaw, deg, of an object whose z is a unit normal."""
+    yaw = math.radians(yaw_deg)
+    x = math.cos(yaw) * normal[0] + math.sin(yaw) * normal[1]
+    y = math.cos(yaw) * normal[1] - math.sin(yaw) * normal[0]
+    return math.degrees(-math.asin(y)), math.degrees(math.atan2(x, normal[2])), yaw_deg
+
+
+def full_scale_kpa(case: Case, stiffness: float) -> float:
+    """Of the array, kPa: the larger one where the wanted force would saturate the usual one, as in scene `steel`."""
+    peak_pa = stiffness * 2.0 * case.force_n / case.contact_n_m
+    return 100.0 if peak_pa < 80e3 else 300.0
 
 
 def scene_of(case: Case) -> Scene:
@@ -109,16 +149,21 @@ def scene_of(case: Case) -> Scene:
     scene = resolve_scene(load_scene("press" if case.speed_mm_s == 0.0 else "cylinder"), duration_s=case.hold_s)
     assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
     stiffness = layer_stiffness(case)
-    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm)
+    task = replace(scene.task, clearance_mm=0.5, force_n=case.force_n, start_mm=case.at_mm, approach_normal=case.normal)
     if case.speed_mm_s > 0.0:
-        task = replace(task, speed_mm_s=case.speed_mm_s, strategy="straight", turn_max_deg=0.0, regain_mm=0.0)
+        task = replace(task, speed_mm_s=case.speed_mm_s, regain_mm=0.0)
     return replace(
         scene,
         bus=replace(scene.bus, timed=False),
         cycle=replace(scene.cycle, rate_hz=case.rate_hz),
         limits=replace(scene.limits, joint_margin_deg=0.5),
         arm=replace(scene.arm, start_deg=case.posture_deg),  # type: ignore[arg-type]
-        sensor=replace(scene.sensor, rate_hz=min(SENSOR_HZ, case.rate_hz), mode="features"),
+        sensor=replace(
+            scene.sensor,
+            rate_hz=min(SENSOR_HZ, case.rate_hz),
+            mode="features",
+            full_scale_kpa=full_scale_kpa(case, stiffness),
+        ),
         probe=replace(
             scene.probe,
             radius_mm=case.probe_mm,

@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import LogFormatter, StrMethodFormatter
 
-from canprobe.studies.workprec_cell import FIDELITIES, default_of, good
+from canprobe.studies.workprec_cell import CLASSICAL, FASTER, FD, FIDELITIES, default_of, good
 
 INK, FAINT = "#1f2933", "#d9dee4"
 COLOURS = {"chen1996": "#ca8a04", "chord": "#64748b", "ml": "#c2410c", "recursive": "#0f6e84"}
 MARKS = {"features": "^", "window": "o", "image": "s"}
-SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0}
+SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
 PANELS = (
     ("curvature_percent", "curvature error, %"),
     ("normal_deg", "normal error, deg"),
@@ -54,7 +54,7 @@ def _left_out(rows: Sequence[Row]) -> str:
 def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
     mine = [r for r in rows if r["fidelity"] == fidelity and r.get(key) is not None]
     for r in mine:
-        filled = COLOURS[r["method"]] if r["bus"] == "classical" else "none"
+        filled = {CLASSICAL: COLOURS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
         axes.scatter(
             r["cost_ms_per_s"], r[key], s=SIZES.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
             facecolor=filled, edgecolor=COLOURS[r["method"]], linewidth=1.2,
@@ -91,6 +91,8 @@ def _keys(rows: Sequence[Row]) -> list[Line2D]:
     found += [dot(m, INK, mark, 7.0) for m, mark in MARKS.items() if any(r["mode"] == m for r in done)]
     rates = sorted({r["rate_hz"] for r in done})
     found += [dot(f"{rate:.0f} Hz", INK, "o", SIZES.get(rate, 110.0) ** 0.5) for rate in rates]
-    if any(r["bus"] == "FD" for r in done):
+    if any(r["bus"] == FD for r in done):
         found.append(dot("CAN FD", INK, "o", 7.0, "white"))
+    if any(r["bus"] == FASTER for r in done):
+        found.append(dot("8 Mbit/s, no CAN", INK, "o", 7.0, FAINT))
     return found

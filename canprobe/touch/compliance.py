@@ -57,6 +57,11 @@ class PushFit:
         return self._joint / self._spread if self._determined else math.nan
 
     @property
+    def start(self) -> float:
+        """Push at which the line has no force any more, m: where the touch began; NaN where there is no slope yet."""
+        return self._push - self._root / self.slope if self._determined else math.nan
+
+    @property
     def sigma(self) -> float:
         """Its standard deviation, √N per m; infinite where there is no slope."""
         return SIGMA_ROOT / math.sqrt(self._spread) if self._determined else math.inf

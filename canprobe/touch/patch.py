@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, positive, read_only
 from canprobe.touch.contact import Doubt
+from canprobe.touch.patch_beyond import WORTH_COMPLETING, completed
 from canprobe.touch.patch_mending import mended
 
 SIDE = 16
@@ -60,7 +61,8 @@ class Patch(NamedTuple):
         n_active: taxels at or above the threshold; −1 where only features were sent.
         peak_pa: highest taxel pressure, Pa.
         saturated: a taxel is at its largest count.
-        cut_by_window: the patch reaches an edge of the window inside the pad.
+        cut_by_window: the patch reaches an edge of the window inside the pad; what is beyond it is carried on
+            (`patch_beyond`) in force, centroid and moments.
         cut_by_pad: the patch reaches the pad's edge.
         too_few: fewer than four active taxels: no moments to speak of.
         dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`patch_mending`).
@@ -169,19 +171,21 @@ def compute_patch(
         raise UsageError(f"taxels: expected (16, 16) uint8, got {taxels.shape} {taxels.dtype}")
     taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
+    n_active = int(np.count_nonzero(pressure))
+    counts = taxels.tobytes()
+    peak = max(counts)
+    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
+    if window is not None and at_window > WORTH_COMPLETING * peak_pa:
+        pressure = completed(pressure, window, calibration.weights, float(calibration.pascals[calibration.counts_max]))
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
-    active = pressure > 0.0
-    n_active = int(np.count_nonzero(active))
-    peak = int(taxels.max())
-    cut_by_pad, cut_by_window = _cuts(active, window) if n_active else (False, False)
     return _patch(
         moments,
         calibration,
         n_active=n_active,
-        peak_pa=float(calibration.pascals[peak]),
+        peak_pa=peak_pa,
         saturated=peak >= calibration.counts_max,
-        cut_by_window=cut_by_window,
-        cut_by_pad=cut_by_pad,
+        cut_by_window=at_window > 0.0,
+        cut_by_pad=at_pad > 0.0,
         dead=dead,
     )
 
@@ -221,18 +225,16 @@ def _patch(
     )
 
 
-def _cuts(active: NDArray[np.bool_], window: Sequence[int] | None) -> tuple[bool, bool]:
-    """Whether active taxels touch the pad's edge, and an edge of the window inside the pad."""
-    rows = np.logical_or.reduce(active, axis=1).tolist()
-    cols = np.logical_or.reduce(active, axis=0).tolist()
-    cut_by_pad = rows[0] or rows[-1] or cols[0] or cols[-1]
+def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
+    """Highest count at the pad's edge, and at an edge of the window inside the pad."""
+    at_pad = max(counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE])
     if window is None:
-        return cut_by_pad, False
+        return at_pad, 0
     r0, c0, n_rows, n_cols = window
-    r1, c1 = r0 + n_rows - 1, c0 + n_cols - 1
-    return cut_by_pad, (
-        (r0 > 0 and rows[r0]) or (r1 < SIDE - 1 and rows[r1]) or (c0 > 0 and cols[c0]) or (c1 < SIDE - 1 and cols[c1])
-    )
+    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < SIDE - 1]
+    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < SIDE - 1]
+    inside = [counts[SIDE * r : SIDE * (r + 1)] for r in rows] + [counts[c::SIDE] for c in cols]
+    return at_pad, max(b"".join(inside), default=0)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:

@@ -207,10 +207,13 @@ class TactileServo:
         (f0, f1, f2), (n0, n1, n2), (o0, o1, o2) = foot, normal, self._origin
         offset = f0 - o0, f1 - o1, f2 - o2
         steep = max(_dot(normal, self._up), STEEPEST)
-        along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), distance * steep)
+        slope_along, slope_across = _dot(normal, self._heading) / steep, _dot(normal, self._across) / steep
+        along, across = follower.heading
+        in_plane = distance / math.hypot(1.0, slope_along * along + slope_across * across)
+        along, across = follower.step(_dot(self._heading, offset), _dot(self._across, offset), in_plane)
         x, y, z = along * h0 + across * c0, along * h1 + across * c1, along * h2 + across * c2
-        rise = (n0 * x + n1 * y + n2 * z) / steep
-        x, y, z = x - rise * u0, y - rise * u1, z - rise * u2
+        fall = slope_along * along + slope_across * across
+        x, y, z = x - fall * u0, y - fall * u1, z - fall * u2
         out = n0 * x + n1 * y + n2 * z
         x, y, z = _unit((x - out * n0, y - out * n1, z - out * n2))
         return self.surface.foot_of((f0 + distance * x, f1 + distance * y, f2 + distance * z))

@@ -107,6 +107,13 @@ class PathFollower:
         self._gain = cross_track_per_m
         self._phase = 0.0
 
+    @property
+    def heading(self) -> tuple[float, float]:
+        """Unit tangent of the curve (along, across) where the follower is."""
+        tx, ty = self._strategy.tangent(self._phase)
+        norm = max(math.hypot(tx, ty), 1e-9)
+        return tx / norm, ty / norm
+
     def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
         """Unit heading in the scan plane for the next step.
 

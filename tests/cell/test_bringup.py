@@ -77,7 +77,7 @@ def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
         open_session(tmp_path, faults=[replace(mute, incoming=True)]).__enter__()
     assert failed.value.node_id == 3
     times = [t for t, i, d in frames(tmp_path) if i == 0x603 and d[0] == 0x40]
-    assert [b - a for a, b in pairwise(times)] == [pytest.approx(500 * MS, rel=0.01)], "one retry"
+    assert [b - a for a, b in pairwise(times)] == [pytest.approx(500 * MS, rel=0.01)] * 2, "two retries"
     others = [t for t, i, _ in frames(tmp_path) if i == 0x601]
     assert len([t for t in others if t < times[1]]) > 20, "the others did not wait for node 3"
 
@@ -147,6 +147,38 @@ def test_a_node_that_boots_late_is_reset_again(tmp_path):
         assert all(report.failure is None for report in session.cell.bring_up_reports)
     resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
     assert [d[1] for d in resets].count(2) >= 2 and [d[1] for d in resets].count(1) == 1
+
+
+def deaf_to_starts(number):
+    """For `change`: node 3 does not hear its first NMT starts."""
+
+    def deafen(node):
+        if node.node_id != 3:
+            return
+        hear, left = node.receive, [number]
+
+        def receive(can_id, data, t_ns):
+            if can_id == 0 and data == b"\x01\x03" and left[0]:
+                left[0] -= 1
+                return []
+            return hear(can_id, data, t_ns)
+
+        node.receive = receive
+
+    return deafen
+
+
+def test_a_lost_start_is_sent_again(tmp_path):
+    with open_session(tmp_path, change=deaf_to_starts(2)):
+        pass
+    starts = [d[1] for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x01]
+    assert starts == [1, 2, 3, 4, 5, 6, 3, 3]
+
+
+def test_a_node_that_does_not_start_is_named(tmp_path):
+    told = r"node 3: \(joint 3\) is not operational 1 s after NMT start, 3 times: PRE_OPERATIONAL$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=deaf_to_starts(9)).__enter__()
 
 
 def other_make(tmp_path):

@@ -11,6 +11,7 @@ from canprobe.cell import checks
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.supervision import Contact, Limits, Seen
 from canprobe.cell.watch import NodeWatch
+from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import HEARTBEAT_BASE, NmtState
 
 LIMITS = Limits(
@@ -79,3 +80,14 @@ def test_a_heartbeat_is_lost_after_its_time_and_not_in_it():
     found.watch.push(HEARTBEAT_BASE + 1, bytes((NmtState.OPERATIONAL,)), 251_000_000)
     found.sync_ns += 1
     assert "node 2: lost: no heartbeat" in str(checks.heartbeat_lost(found))
+
+
+@pytest.mark.parametrize(("gap_ms", "told"), [(12.5, False), (42.0, True)])
+def test_a_drive_that_stopped_because_the_master_was_held_up_says_so(gap_ms, told):
+    found = seen(measurement=Measurement(100, 0, enabled=False), gap_ns=round(gap_ms * 1e6))
+    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=4)], states=(DriveState.QUICK_STOP_ACTIVE,))
+    text = str(checks.drive_not_enabled(found))
+    assert text.startswith("node 4: (joint 1) left operation enabled: QUICK_STOP_ACTIVE")
+    cause = "; the last SYNC was sent 42 ms after the one before, and the drives stop by themselves 12.5 ms after one"
+    assert (cause in text) is told
+    assert told or text.endswith("QUICK_STOP_ACTIVE")

@@ -40,7 +40,9 @@ def test_quick_has_scans_and_the_plans_refusals(quick):
     refused = [r for r in quick.rows if r["ended"] == "refused"]
     assert [(r["rate_hz"], r["bus"]) for r in refused] == [(500.0, "classical"), (500.0, "FD")]
     assert all("can0" in r["reason"] for r in refused)
-    assert len(done) + len(refused) + sum(r["ended"] == "stopped" for r in quick.rows) == len(quick.rows) == 4
+    assert len(done) + len(refused) + sum(r["ended"] == "stopped" for r in quick.rows) == len(quick.rows) == 6
+    assert {(r["rate_hz"], r["bus"]) for r in done} == {(200.0, "classical"), (500.0, "8 Mbit/s")}
+    assert {(r["rate_hz"], r["stiff"]) for r in done} == {(200.0, "stopped"), (500.0, "holds")}
     for bus in ("classical", "FD"):
         assert f"Refused by the plan, bus {bus}: 500 Hz window." in quick.findings
 
@@ -62,7 +64,7 @@ def test_a_scan_that_is_stopped_is_a_row_with_its_reason(monkeypatch):
         raise workprec_cell.SafetyStop("measured force 9 N above the limit of 5 N")
 
     monkeypatch.setattr(workprec_cell, "run_scene", stopped)
-    answer = measure(Case(Setting(100.0, "features", False), "chord", "ideal", 1.0, 1))
+    answer = measure(Case(Setting(100.0, "features", "classical"), "chord", "ideal", 1.0, 1))
     assert answer == {"ended": "stopped", "reason": "measured force 9 N above the limit of 5 N"}
 
 
@@ -82,13 +84,20 @@ def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
     clock = iter(range(100))
     monkeypatch.setattr(workprec_cell, "run_scene", run)
     monkeypatch.setattr(workprec_cell, "process_time", lambda: float(next(clock)))
-    answer = measure(Case(Setting(100.0, "features", False), "recursive", "ideal", 1.0, 1))
+    answer = measure(Case(Setting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
     assert answer["cost_ms_per_s"] == pytest.approx(1e3 * 5.0 / 0.05)
     assert answer["force_percent"] == pytest.approx(5.0)
 
 
 def row(method, cost, errors, *, rate=400.0, mode="window", fidelity="ideal"):
-    named = {"rate_hz": rate, "mode": mode, "bus": "classical", "method": method, "fidelity": fidelity}
+    named = {
+        "rate_hz": rate,
+        "mode": mode,
+        "bus": "classical",
+        "method": method,
+        "fidelity": fidelity,
+        "stiff": "holds",
+    }
     return named | {"cost_ms_per_s": cost, "ended": "done", "reason": "", **dict(zip(MEASURES, errors, strict=True))}
 
 
@@ -96,10 +105,13 @@ def test_the_knee_is_the_cheapest_whose_errors_are_all_small_enough():
     best, knee = row("ml", 900.0, (1.0, 0.1, 2.0)), row("recursive", 300.0, (1.9, 0.19, 5.9))
     rows = [best, knee, row("chord", 100.0, (1.2, 0.1, 6.1)), row("chord", 50.0, (None, None, 2.0))]
     rows.append(row("chord", 10.0, (0.1, 0.01, 0.2), fidelity="dynamic"))
+    rows.append(row("chord", 20.0, (1.0, 0.1, 2.0), rate=200.0) | {"stiff": "stopped"})
+    rows.append(row("chord", 20.0, (1.0, 0.1, 2.0), rate=1000.0) | {"bus": "8 Mbit/s"})
     assert good(rows, "ideal") == [knee, best]
     assert default_of(rows, "ideal") is knee
     said = "\n".join(findings(rows))
-    assert "of curvature, normal and force, is 400 Hz, window, classical, recursive: 300 ms a second for 1.9 %" in said
+    assert "40 kN/m, is 400 Hz, window, classical, recursive: 300 ms a second for 1.9 %" in said
+    assert "400 Hz 300 ms a second, force 5.9 %, curvature 1.9 %, 40 kN/m: holds" in said
     assert "It is the default." in said
     other = "\n".join(findings([*rows, row("chen1996", 20.0, (1.0, 0.1, 2.0), rate=200.0)]))
     assert "is 200 Hz, window, classical, chen1996" in other

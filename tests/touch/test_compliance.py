@@ -33,6 +33,7 @@ def test_the_stiffness_that_made_the_force_is_found_whatever_the_zero(stiffness,
     fit = pushed(stiffness, kappa, np.linspace(0.3, 1.0, 40) * deepest, zero=-0.2)
     assert fit.certain(0.1)
     assert fit.slope == pytest.approx(math.sqrt(2.0) / deepest, rel=1e-9)
+    assert fit.start == pytest.approx(-0.2, abs=1e-9 * deepest)
     assert stiffness_from_slope(fit.slope, RADIUS, kappa) == pytest.approx(stiffness, rel=1e-8)
 
 

@@ -173,6 +173,43 @@ def test_a_straight_path_over_a_slope_turns_where_it_turns_in_the_scan_plane(slo
     assert np.linalg.norm(np.diff(contacts, axis=0), axis=1) == pytest.approx(step, rel=1e-9)
 
 
+def off_curve(contacts, strategy):
+    """Greatest distance (m) of contacts from a strategy's curve in the scan plane."""
+    curve = np.array([strategy.point(phase) for phase in np.linspace(0, 2 * np.pi, 4000)])
+    seen = np.stack([contacts @ AXES[0], contacts @ AXES[1]], axis=1)
+    return max(np.linalg.norm(curve - one, axis=1).min() for one in seen[::7])
+
+
+@pytest.mark.parametrize("name", ["weave", "circle", "straight"])
+@pytest.mark.parametrize(
+    "n", [(0, -0.717, 0.697), (0.717, 0, 0.697), (0.5, 0.5, 0.707)], ids=["along", "across", "both"]
+)
+def test_a_path_over_a_slope_is_the_one_in_the_scan_plane(name, n):
+    """A step is shorter in the plane by what it climbs itself: 46 degrees uphill, nothing along the slope."""
+    n = np.array(n) / np.linalg.norm(n)
+    strategy = make_strategy(name, 0.03, 0.008)
+    servo = TactileServo(
+        LocalSurface(np.zeros(3), n, SurfaceGains()),
+        PathFollower(strategy),
+        axes=AXES,
+        origin=np.zeros(3),
+        probe_radius=RADIUS_P,
+        rolling_share=0.0,
+    )
+    contacts = np.array([servo.step(0.025, 0.0, DT).centre - RADIUS_P * n for _ in range(3000)])
+    assert off_curve(contacts, strategy) < 0.15e-3
+    assert np.linalg.norm(np.diff(contacts, axis=0), axis=1) == pytest.approx(0.025 * DT, rel=1e-9)
+
+
+@pytest.mark.parametrize("surface", [Cylinder(0.036), Sphere(0.025)])
+def test_the_contact_keeps_to_the_curve_over_a_steep_crown(surface):
+    """Of the true contacts: up to 26 degrees steep on the cylinder, 38 on the sphere."""
+    _, points = follow(surface, seconds=8.0)
+    across = points @ AXES[1]
+    assert (across.max(), across.min()) == pytest.approx((0.004, -0.004), abs=0.15e-3)
+    assert off_curve(points, make_strategy("weave", 0.03, 0.008)) < 0.15e-3
+
+
 def test_raising_the_model_moves_it_outward_and_leaves_its_normal():
     n = np.array((0.6, 0.0, 0.8))
     surface = LocalSurface(np.array((0.01, 0.02, 0.03)), n, SurfaceGains())

@@ -15,7 +15,7 @@ import canprobe
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)
 ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
-ATTEMPTS = 2
+ATTEMPTS = 3
 PATIENCE_S = 180.0
 """For 20 s of scan, the start before and the files after it, on a machine that has others to serve."""
 
@@ -46,23 +46,28 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
 
 
 def full_scan(bench: Any) -> Any:
-    """The results of a scan that the machine did not interrupt; a second attempt is allowed.
+    """The results of a scan that the machine did not interrupt; a few attempts are allowed.
 
     What rate was held is recorded and never asserted: the guest's one processor carries master, six drives and sensor,
     with no say on its host. Cycles it could not keep are counted, and the path's time goes on. A drive that hears no
-    SYNC for its time stops by itself, as it must, and the run has to end safely all the same.
+    SYNC for its time stops by itself, as it must, and the run has to end safely all the same. Where a node did not
+    answer in time at bring-up, nothing has moved, and there is no cycle to report.
     """
+    told = []
     for attempt in range(ATTEMPTS):
         name = f"results-{attempt}"
         command = bench.start("run", "cylinder", *ON_VCAN0, "--out", name)
         status = command.wait(PATIENCE_S)
-        results = bench.results(name)
         if status == 0:
-            return results
-        assert status in (1, 3), command.err
+            return bench.results(name)
+        told.append(f"ended with {status}: {command.err}")
+        assert status in (1, 3), told
+        assert "Traceback" not in command.err, told
+        results = bench.results(name)
         assert results.summary["completed"] is False
-        bench.assert_left_safe(results.last, *NODES)
-    return pytest.fail(command.err)
+        if results.summary["cycle"]["cycles"]:
+            bench.assert_left_safe(results.last, *NODES)
+    return pytest.fail("\n\n".join(told))
 
 
 @pytest.mark.timeout(ATTEMPTS * PATIENCE_S + 60.0)

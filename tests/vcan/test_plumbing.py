@@ -137,3 +137,40 @@ def test_without_a_vcan_they_are_skipped_loudly_or_fail(
     assert (status, counts(output)) == (1 if required else 0, expected)
     assert "apt-get install -y something" in output
     assert ("9 tests were NOT RUN" in output) == (not required)
+
+
+STANDSTILL = """
+import pytest
+
+pytestmark = pytest.mark.vcan
+tries = []
+
+@pytest.fixture(scope="module")
+def shared():
+    tries.append("set up")
+
+def test_in_which_the_machine_stood_still(vcan0, shared):
+    if len(tries) == 1:
+        sum(range(20_000_000))  # in C from end to end: no other thread runs meanwhile
+        pytest.fail("a time-out")
+    assert tries == ["set up"] * 2, "made anew"
+
+def test_that_fails_by_itself(vcan0, shared):
+    tries.append("failed")
+    print("tries:", *tries)
+    assert False
+
+def test_that_fails_at_every_standstill(vcan0, shared):
+    sum(range(20_000_000))
+    pytest.fail("a time-out")
+"""
+
+
+def test_a_failure_in_a_standstill_is_tried_again_and_told(project: Path) -> None:
+    (project / "test_still.py").write_text(STANDSTILL)
+    status, output = run(project, "test_still.py", STAND_IN="runs")
+    assert (status, counts(output)) == (1, {"passed": 1, "failed": 2})
+    assert len(re.findall(r"stood_still: repeated after a standstill of the machine of \d+\.\d\d s", output)) == 1
+    assert "tries: set up set up failed\n" in output, "once only"
+    assert output.count("::test_that_fails_at_every_standstill: repeated") == 1
+    assert "by_itself: repeated" not in output

