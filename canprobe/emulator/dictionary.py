@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Container, Iterable
 from dataclasses import replace
 from functools import partial
+from math import inf
 
 from canopen.objectdictionary import ObjectDictionary
 
@@ -99,10 +100,11 @@ class Dictionary:
         checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
         if entry.low is None and entry.high is None and not checks and not hooks:
             return partial(self.values.__setitem__, key)
-        values, limited = self.values, entry.low is not None or entry.high is not None
+        values = self.values
+        low, high = -inf if entry.low is None else entry.low, inf if entry.high is None else entry.high
 
         def store(value: Value) -> None:
-            if limited:
+            if not isinstance(value, bytes) and not low <= value <= high:
                 entry.check_limits(value)
             for check in checks:
                 check(subindex, value)

@@ -119,7 +119,8 @@ class DriveParameters:
 
     def clamp(self, target: int) -> int:
         """The target within the software limits."""
-        return min(max(target, self.low), self.high) if self.low < self.high else target
+        low, high = self.low, self.high
+        return target if low <= target <= high or low >= high else min(max(target, low), high)
 
 
 def _check_among(allowed: frozenset[int]) -> Callable[[int, Value], None]:

@@ -42,7 +42,9 @@ def correct_finely(
 
 
 def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
-    counts = raw.astype(np.float64) if tare is None else raw - tare
+    counts = raw.astype(np.float64)
+    if tare is not None:
+        counts -= tare
     if gain_permille != GAIN_ONE:
         counts *= gain_permille / GAIN_ONE
     return counts

@@ -90,7 +90,7 @@ def counts_to_joints(model: PumaModel, counts: npt.ArrayLike) -> Array:
     Returns:
         (6,) joint angles, rad.
     """
-    q: Array = model.joints_per_count @ np.asarray(counts, dtype=float)
+    q: Array = model.joints_per_count.dot(np.asarray(counts, dtype=float))
     return q
 
 

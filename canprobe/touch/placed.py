@@ -126,7 +126,7 @@ class PlacedShape:
             bx * x0 + by * x1 + bz * x2, bx * y0 + by * y1 + bz * y2, bx * z0 + by * z1 + bz * z2
         )
         second = (ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx)
-        rows = np.array(((px, py, pz), (nx, ny, nz), (dx, dy, dz), second)) @ self._rotation_t
+        rows = np.array(((px, py, pz), (nx, ny, nz), (dx, dy, dz), second)).dot(self._rotation_t)
         rows[0] += self._origin
         return ClosestPoint(rows[0], rows[1], distance, np.array((k1, k2)), rows[2:])
 

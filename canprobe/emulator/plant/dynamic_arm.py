@@ -76,7 +76,7 @@ class DynamicArm:
         self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns
-        self._now = self._torques = None
+        self._torques = None  # the state now is what it is, whatever the reference does from now on
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -107,7 +107,8 @@ class DynamicArm:
         Args:
             axis: 0 to 5.
         """
-        return float(self._state()[axis] * self._scale[axis])
+        position: float = self._state().item(axis)
+        return position * self._scales[axis]
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
@@ -135,7 +136,7 @@ class DynamicArm:
         self.equations.loops.set_loop(
             axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
         )
-        self._now = self._torques = None
+        self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.

@@ -313,7 +313,7 @@ def _turned(axes: Axes, R: Array) -> Axes:
 
 def _in_pad(foot: ClosestPoint, probe: _Probe, d: Vec) -> Array:
     """(2, 2) principal directions in the transported pad basis at the contact direction."""
-    rows: Array = foot.directions @ np.array(probe.axes).T @ np.array(pad_basis(d)).T
+    rows: Array = foot.directions.dot(np.array(probe.axes).T).dot(np.array(pad_basis(d)).T)
     return rows
 
 
