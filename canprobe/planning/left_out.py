@@ -37,7 +37,7 @@ def _by_window(scene: Scene) -> str:
     if side >= across:
         return f"{name} holds the patch"
     needed = math.ceil(taxels_needed(scene.task.force_n, scene.probe))
-    return f"{name} is sent, which cuts a patch of {across:.1f} taxels: the force reads low; {needed} taxels hold it"
+    return f"{name} is sent, which cuts a patch of {across:.1f} taxels: its rim is reckoned; {needed} taxels hold it"
 
 
 def _no_window(scene: Scene) -> str | None:

@@ -86,7 +86,7 @@ def _quick_cases() -> list[Case]:
     return [
         Case("told", 1e4, rate_hz=200.0, feels=False, hold_s=0.1),
         Case("told", 1e7, feels=False),
-        Case("felt", 6e4),
+        Case("drives", 1e6, bandwidth_hz=3.0, fidelity="dynamic"),
         Case("felt", 1e4, late_ms=20.0),
         Case("felt", 1e4, rate_hz=1000.0),
         _round(10_000.0, 1.0),
