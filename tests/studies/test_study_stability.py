@@ -185,7 +185,7 @@ def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
     said = "\n".join(stability.findings([good, bad]))
     assert "told, 1e+06 N/m" in said
     assert "failed, hang" in said
-    assert "of 1 outside 1 are not" in said
+    assert "of 1 outside 1 are not stable" in said
     assert good["eigenvalue"] < 1.0 < bad["eigenvalue"]
 
 
