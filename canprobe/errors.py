@@ -53,12 +53,15 @@ class PlanError(UsageError):
     """A valid scene that cannot be carried out.
 
     Attributes:
-        problems: every reason with its numbers and the ways out, one line each.
+        problems: every reason with its numbers, one line each.
+        ways_out: changes of the scene each of which makes it fit, with the numbers that it leaves.
     """
 
-    def __init__(self, problems: Sequence[str]) -> None:
+    def __init__(self, problems: Sequence[str], ways_out: Sequence[str] = ()) -> None:
         self.problems = tuple(problems)
-        super().__init__("\n".join(self.problems))
+        self.ways_out = tuple(ways_out)
+        lines = ["ways out, each by itself:", *(f"  {way}" for way in self.ways_out)] if self.ways_out else []
+        super().__init__("\n".join((*self.problems, *lines)))
 
 
 class EdsError(UsageError):

@@ -128,7 +128,7 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, session.truth, log["t_s"], map_summary=map_summary
+            scene, getattr(controller, "shape", None), estimates, _truth(session), log["t_s"], map_summary=map_summary
         ),
         "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
@@ -139,6 +139,7 @@ def summarise(
         },
         "traffic": _traffic(session),
         "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
+        "warnings": list(session.plan.warnings),
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
     }
@@ -170,6 +171,11 @@ def _traffic(session: Session) -> dict[str, Any]:
         return {}
 
 
+def _truth(session: Session) -> dict[str, Array]:
+    """The plant's truth; empty where nothing was emulated, or nothing happened."""
+    return session.truth if "force" in session.truth else {}
+
+
 def _scan(controller: object) -> tuple[int, int] | None:
     cycles = getattr(controller, "scan_cycles", None)
     return cycles if cycles is not None and cycles[1] > cycles[0] else None
@@ -183,8 +189,8 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
     measured: float | None = None
     if scan is not None:
         measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
-        if session.truth:
-            figures = score_contact(session.truth, *scan, task.force_n)
+        if truth := _truth(session):
+            figures = score_contact(truth, *scan, task.force_n)
             if task.kind != "scan":
                 figures["speed_mean_m_s"] = None
         else:
@@ -282,6 +288,7 @@ def _bound_ratio(
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=0.0 if scene.probe is None else 1e3 / scene.probe.radius_mm,
     )
     return None if bound is None else score.kappa_rms / bound
 
@@ -374,6 +381,8 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
     if summary.get("calibration") is not None:
         lines += calibration_lines(summary["calibration"])
     lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
     if out is not None:
         lines.append(f"  files      {out}")
     return "\n".join(lines)

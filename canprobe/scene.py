@@ -60,7 +60,7 @@ class BusSettings:
     channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
     timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
-    transmit_queue: TransmitQueue = "priority"  # timed lockstep: what a node with several frames sends first
+    transmit_queue: TransmitQueue = "priority"  # what a node with several frames sends first; "fifo": the oldest
     bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
     fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
     data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames

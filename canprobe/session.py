@@ -161,6 +161,8 @@ class Session:
     def __enter__(self) -> Session:
         self.started_ns = elapsed_ns()
         hush_canopen()
+        for warning in self.plan.warnings:
+            self._say(f"warning: {warning}")
         try:
             port = self._open()
             self._cell = make_cell(
@@ -248,6 +250,18 @@ class Session:
 
         return both
 
+    def _error_writer(self, channel: str) -> Write:
+        """Error frames go into the log, and beside the plan."""
+        meter = self.meters[channel]
+        write = self._candump.on(channel) if self._candump is not None else None
+
+        def note(can_id: int, data: bytes, t_ns: int) -> None:
+            meter.error_frames += 1
+            if write is not None:
+                write(can_id, data, t_ns)
+
+        return note
+
     def _join(self, ports: dict[str, Port]) -> Port:
         """One port for the cell, whatever the number of buses."""
         return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
@@ -267,6 +281,7 @@ class Session:
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
             bus.recorder = self._writer(channel, 0)
+            bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
         self._stack.callback(self._keep_truth)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -24,13 +25,21 @@ MOST_POINTS = 600
 """Points of a curve in a plot."""
 
 
-def serve_run(run: RecordedRun, *, port: int, host: str, ready: Callable[[str], None]) -> None:
+def serve_run(
+    run: RecordedRun,
+    *,
+    port: int,
+    host: str,
+    ready: Callable[[str], None],
+    whole: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> None:
     """Show a run until it is interrupted.
 
     Args:
         run: from `read_run`.
         port, host: see `open_server`.
         ready: called with the address.
+        whole: what is done within it is not to be interrupted; pictures are made by libraries that take it ill.
     """
     with open_server(port, host) as server:
         player = Player(server, run)
@@ -38,7 +47,8 @@ def serve_run(run: RecordedRun, *, port: int, host: str, ready: Callable[[str], 
         clock = MonotonicClock()
         next_ns = clock.now_ns()
         while True:
-            player.step(FRAME_S)
+            with whole():
+                player.step(FRAME_S)
             next_ns = max(next_ns + round(FRAME_S * 1e9), clock.now_ns())
             clock.sleep_until_ns(next_ns)
 

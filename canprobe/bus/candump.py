@@ -27,8 +27,13 @@ _LINE = re.compile(
 
 CLASSIC_BYTES = 8
 _BIT_RATE_SWITCH = 1
+_FRAMES = 32
+"""Frames that are kept as they are before they become lines, which is quicker for many at once."""
 _LINES = 256
 """Lines that are joined before they go to the file."""
+
+
+_Format = Callable[[int, bytes, int], str]
 
 
 class CandumpWriter:
@@ -52,15 +57,30 @@ class CandumpWriter:
         self._path = path
         self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
         self._size = 0
+        self._frames: list[tuple[_Format, int, bytes, int]] = []
         self._lines: list[str] = []
         self.write = self.on(channel)
 
     def on(self, channel: str) -> Callable[[int, bytes, int], None]:
         """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file."""
-        return _ChannelWriter(self._lines, self.flush, channel, self._t0_ns).write
+        frames, form = self._frames, _ChannelLines(channel, self._t0_ns).line
+
+        def write(can_id: int, data: bytes, t_ns: int) -> None:
+            frames.append((form, can_id, data, t_ns))
+            if len(frames) >= _FRAMES:
+                self._form_lines()
+                if len(self._lines) >= _LINES:
+                    self.flush()
+
+        return write
+
+    def _form_lines(self) -> None:
+        self._lines += [form(can_id, data, t_ns) for form, can_id, data, t_ns in self._frames]
+        self._frames.clear()
 
     def flush(self) -> None:
         """Hand what was written to the file."""
+        self._form_lines()
         data = "".join(self._lines).encode("ascii")
         self._lines.clear()
         if self.failure is not None:
@@ -88,40 +108,38 @@ class CandumpWriter:
         self.close()
 
 
-class _ChannelWriter:
+class _ChannelLines:
     """Lines of one channel."""
 
-    __slots__ = ("_channel", "_flush", "_lines", "_names", "_prefix", "_t0_ns", "_t_ns")
+    __slots__ = ("_channel", "_names", "_prefix", "_second", "_t0_ns")
 
-    def __init__(self, lines: list[str], flush: Callable[[], None], channel: str, t0_ns: int) -> None:
-        self._lines, self._flush, self._channel, self._t0_ns = lines, flush, channel, t0_ns
-        self._t_ns: int | None = None
+    def __init__(self, channel: str, t0_ns: int) -> None:
+        self._channel, self._t0_ns = channel, t0_ns
+        self._second = -1
         self._prefix = ""
         self._names: dict[int, str] = {}
 
-    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Add one frame that was on the bus at `t_ns`; the same line as `format_line`, for a fifth of its time."""
-        if t_ns != self._t_ns:
-            self._t_ns = t_ns
-            self._prefix = _format_prefix(self._channel, t_ns - self._t0_ns)
+    def line(self, can_id: int, data: bytes, t_ns: int) -> str:
+        """The same as `format_line`, counted from the log's first instant, in a fraction of its time."""
+        second, us = divmod((t_ns - self._t0_ns) // 1000, 1_000_000)
+        if second != self._second:
+            self._second, self._prefix = second, _format_second(second)
         name = self._names.get(can_id)
         if name is None:
-            name = self._names[can_id] = _format_id(can_id) + "#"
-        lines = self._lines
-        plain = not can_id & RTR_FLAG and len(data) <= CLASSIC_BYTES
-        lines.append(f"{self._prefix}{name}{data.hex().upper() if plain else _format_payload(can_id, data)}\n")
-        if len(lines) >= _LINES:
-            self._flush()
+            name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
+        plain = len(data) <= CLASSIC_BYTES and not can_id & RTR_FLAG
+        payload = data.hex().upper() if plain else _format_payload(can_id, data)
+        return f"{self._prefix}{us:06d}{name}{payload}\n"
 
 
 def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:
     """Return the line of one frame, newline included; ns below the microsecond are cut off."""
-    return f"{_format_prefix(channel, t_ns)}{_format_id(can_id)}#{_format_payload(can_id, data)}\n"
+    second, us = divmod(t_ns // 1000, 1_000_000)
+    return f"{_format_second(second)}{us:06d}) {channel} {_format_id(can_id)}#{_format_payload(can_id, data)}\n"
 
 
-def _format_prefix(channel: str, t_ns: int) -> str:
-    seconds, us = divmod(t_ns // 1000, 1_000_000)
-    return f"({seconds:010d}.{us:06d}) {channel} "
+def _format_second(second: int) -> str:
+    return f"({second:010d}."
 
 
 def _format_payload(can_id: int, data: bytes) -> str:

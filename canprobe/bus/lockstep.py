@@ -88,6 +88,7 @@ class LockstepBus:
         self.clock = clock
         self.channel = channel
         self.recorder: Recorder | None = None
+        self.error_recorder: Recorder | None = None  # told each error frame, where bits can fail
         self._max_frames = max_frames
         self._count = 0
         self._nodes: list[BusNode] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,7 +24,11 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import BringUpSettings
+from canprobe.scene import BringUpSettings, ProbeSettings
+from canprobe.scene_geometry import T_flange_probe
+
+if TYPE_CHECKING:
+    from canprobe.cell.lift_off import LiftOff
 
 TACTILE_DEADLINE_CYCLES = 2
 COMMAND_REPEAT_NS = 100_000_000
@@ -57,20 +62,33 @@ def make_cell(
         master_id=MASTER_NODE_ID,
         looks_ns=plan.traffic.budget.looks_ns,
     )
+    drives = make_drives(plan)
     return Cell(
         port,
         make_setups(plan),
         settings,
-        drives=make_drives(plan),
+        drives=drives,
         tactile=make_tactile(plan),
         limits=limits_of(plan),
         patch_from=patch_from(plan.scene) if plan.scene.arm is not None else None,
+        lift_from=_lift_from(plan, drives),
         say=say,
         times=times or _times(plan.scene.bring_up),
         log_failure=log_failure,
         observers=observers,
         rows_kept=rows_kept,
     )
+
+
+def _lift_from(plan: Plan, drives: DriveGroup | None) -> Callable[[Callable[[int], bool]], LiftOff] | None:
+    scene = plan.scene
+    if scene.arm is None or scene.sensor is None or drives is None:
+        return None
+    from canprobe.cell.lift_off import LiftOff
+
+    flange_probe = T_flange_probe(scene.probe or ProbeSettings())
+    model, period_s = MODELS[scene.arm.model], plan.sync.period_ns * 1e-9
+    return lambda obeys: LiftOff(drives, model, flange_probe, period_s, obeys)
 
 
 def _times(settings: BringUpSettings) -> BringUpTimes:

@@ -20,15 +20,18 @@ from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
 
 if TYPE_CHECKING:
+    from canprobe.cell.lift_off import LiftOff
     from canprobe.touch.patch import Patch
 
 WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
+TOUCHING_N = 0.15
+"""Measured force from which the probe is on an object."""
 FAULTS_KEPT = 100
 """Faults that are told; a node that says the same for ever must not fill the memory."""
 
@@ -44,6 +47,7 @@ class Cell:
         tactile: the sensor, or None.
         limits: what the supervision must not let pass.
         patch_from: the patch of a tactile sample; None where nothing can press.
+        lift_from: makes the way off an object, of a function that tells whether a node obeys; None without a touch.
         say: called with each step of bring-up and stop.
         times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
@@ -66,6 +70,7 @@ class Cell:
         tactile: TactileReceiver | None,
         limits: Limits,
         patch_from: Callable[[TactileSample], Patch] | None = None,
+        lift_from: Callable[[Callable[[int], bool]], LiftOff] | None = None,
         say: Callable[[str], None] = lambda _: None,
         times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
@@ -84,6 +89,7 @@ class Cell:
         self._say = say
         self._log_failure = log_failure
         self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), patch_from)
+        self._lift_from = lift_from
         self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, say)
@@ -146,8 +152,8 @@ class Cell:
         Args:
             controller: has ``step(measurement) → command``, or is such a function. Where it has ``retreat(reason)`` the
                 cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
-                the contact to it. Where it has ``inspect(q)`` it sees the joint angles (6,), rad, before the drives are
-                enabled, and may say why they must not be.
+                the contact to it; without, the cell takes the probe off the object itself. Where it has ``inspect(q)``
+                it sees the joint angles (6,), rad, before the drives are enabled, and may say why they must not be.
             progress: called after each cycle.
 
         Raises:
@@ -267,9 +273,54 @@ class Cell:
         return command
 
     def _react(self, finding: Finding, retreat: Callable[[str], None] | None) -> None:
-        if finding.condition.reaction is not Reaction.RETREAT or retreat is None:
-            raise finding.error
-        retreat(str(finding.error))
+        reaction = finding.condition.reaction
+        if reaction is Reaction.RETREAT and retreat is not None:
+            retreat(str(finding.error))
+            return
+        if reaction in (Reaction.RETREAT, Reaction.LIFT):
+            self._lift_off(finding.error)
+        raise finding.error
+
+    def _lift_off(self, error: CanprobeError) -> None:
+        """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
+        supervisor = self.supervisor
+        if self._lift_from is None or supervisor.felt() < TOUCHING_N or supervisor.must_stop():
+            return
+        lift = self._lift_from(lambda node_id: self._obeys(node_id, error))
+        if not lift.possible:
+            self.faults.append(f"{error}: the probe stays where it is, as a drive may be moving or none obeys")
+            return
+        self._say("lift off with the drives that obey")
+        self.faults.append(f"cycle {supervisor.seen.measurement.cycle}: {error}: lift off")
+        lift.begin()
+        try:
+            self._lift(lift)
+        except CanprobeError as failure:
+            self.faults.append(f"while lifting off: {failure}")
+
+    def _lift(self, lift: LiftOff) -> None:
+        assert self.cycle is not None
+        supervisor, first = self.supervisor, self.cycle.number
+        known = first + supervisor.seen.limits.cycles_to_feel  # from then on the force is one of the way back
+        highest = 0.0
+        while (q := lift.step(supervisor.seen.measurement)) is not None:
+            command, finding = supervisor.guard_target(Command(q))
+            force = supervisor.felt()
+            if self.cycle.number < known:
+                highest = max(highest, force)
+            if finding is not None or supervisor.must_stop() or force > highest:
+                return
+            self.cycle.end(command)
+            self._record(supervisor.seen.measurement, command)
+            self._look(self.cycle.begin())
+
+    def _obeys(self, node_id: int, error: CanprobeError) -> bool:
+        """As far as NMT and EMCY tell, and not the node that the cell is stopped for."""
+        if isinstance(error, NodeError) and error.node_id == node_id:
+            return False
+        alarm = self.watch.device_alarm
+        operational = self.watch.states.get(node_id) is NmtState.OPERATIONAL
+        return operational and (alarm is None or alarm.node_id != node_id)
 
     def _note_alarms(self) -> None:
         for event in self.watch.news():

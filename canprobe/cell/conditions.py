@@ -24,7 +24,7 @@ def _after(name: str, cycles: int = 1) -> Callable[[Limits], int]:
 
 def _sample(limits: Limits) -> int:
     """From an instant to the reaction on the tactile sample that shows it: sampled, sent one frame later, taken in."""
-    return (2 * limits.tactile_cycles + 2) * limits.period_ns
+    return limits.cycles_to_feel * limits.period_ns
 
 
 def _lost(limits: Limits) -> int:
@@ -37,7 +37,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "heartbeat",
         "heartbeat of a node lost",
         "none for 250 ms",
-        Reaction.STOP,
+        Reaction.LIFT,
         _after("heartbeat_timeout_ns"),
         AGAIN,
         check=checks.heartbeat_lost,
@@ -47,7 +47,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "nmt_state",
         "node not operational, or booted again",
         "its heartbeat, every 100 ms and at a change",
-        Reaction.STOP,
+        Reaction.LIFT,
         _after("heartbeat_produced_ns"),
         AGAIN,
         check=checks.not_operational,
@@ -57,7 +57,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "drive_fault",
         "drive leaves operation enabled (fault, quick stop)",
         "statusword in each TPDO",
-        Reaction.STOP,
+        Reaction.LIFT,
         _cycles(2),
         "bring-up resets the fault; run again",
         check=checks.drive_not_enabled,
@@ -66,7 +66,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "emcy",
         "EMCY of a device error",
         "every frame",
-        Reaction.STOP,
+        Reaction.LIFT,
         _cycles(2),
         "mend what it names; run again",
         check=checks.device_emcy,
@@ -117,7 +117,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "drive_silent",
         "drive silent",
         "no usable TPDO for more than `arm.missed_syncs` (5) cycles",
-        Reaction.STOP,
+        Reaction.LIFT,
         lambda limits: (limits.missed_cycles + 2) * limits.period_ns,
         AGAIN,
         check=checks.drive_silent,

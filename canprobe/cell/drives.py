@@ -81,6 +81,7 @@ class DriveGroup:
     Attributes:
         late, missed, malformed: TPDOs that were not used, or not there.
         answer_ns: from the SYNC to the last TPDO that was used.
+        stopped: node ids of drives that are told to stop while the others go on.
     """
 
     def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
@@ -93,6 +94,7 @@ class DriveGroup:
         self.malformed = 0
         self.answer_ns = 0
         self.implausible = 0
+        self.stopped: frozenset[int] = frozenset()
         self._model = model
         self._axis_of = {axis.feedback.cob_id: i for i, axis in enumerate(axes)}
         self._tracks = tuple(PositionTrack() for _ in axes)
@@ -198,6 +200,15 @@ class DriveGroup:
             return True  # as in every cycle of operation
         return self.all_in(DriveState.OPERATION_ENABLED)
 
+    def enabled_ones(self) -> tuple[bool, ...]:
+        """Whether each drive told operation enabled last."""
+        return tuple([word & _STATE_BITS == _ENABLED for word in self.statuswords])
+
+    @property
+    def disbelieved(self) -> bool:
+        """A drive was heard last with a position that it cannot have reached."""
+        return any(heard > track.cycle for heard, track in zip(self._heard, self._tracks, strict=True))
+
     def all_in(self, *states: DriveState) -> bool:
         """Every drive is in one of ``states``."""
         return all(state in states for state in self.states)
@@ -206,6 +217,11 @@ class DriveGroup:
         """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
         if q is not None:
             self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
+
+    def targets(self) -> Vector:
+        """Where the motors were sent last (6,), counts; where they are, before they were sent anywhere."""
+        targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
+        return np.array(targets, dtype=float)
 
     def aim(self, targets: Sequence[int]) -> None:
         """The drives are told ``targets`` (counts) in this cycle: what they may do next follows from it."""
@@ -218,9 +234,10 @@ class DriveGroup:
         """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         self.aim(targets)
-        key = (self.goal, *self.statuswords)
+        key = (self.goal, self.stopped, *self.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
-            words = [controlword_toward(s, self.goal, w) for s, w in zip(self.states, self._words, strict=True)]
+            goals = [self._goal_of(axis.node_id) for axis in self.axes]
+            words = list(map(controlword_toward, self.states, goals, self._words))
             self._steady = key if words == self._words else None
             self._words = words
         values = list(zip(self._words, targets, strict=True))
@@ -233,6 +250,10 @@ class DriveGroup:
             if frame.every_cycle or self._due(frame.cob_id, data):
                 frames.append((frame.cob_id, data))
         return frames
+
+    def _goal_of(self, node_id: int) -> DriveState:
+        held_back = node_id in self.stopped and self.goal is DriveState.OPERATION_ENABLED
+        return DriveState.QUICK_STOP_ACTIVE if held_back else self.goal
 
     def _due(self, cob_id: int, data: bytes) -> bool:
         """An event-driven frame goes on a change, and again before its receiver's event timer runs out."""

@@ -117,6 +117,7 @@ def bound_of_scan(
     memory_m: float,
     sigma_point: float,
     sigma_normal: float,
+    coupling: float = 0.0,
 ) -> float | None:
     """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
 
@@ -129,6 +130,7 @@ def bound_of_scan(
         sync_times: time of each SYNC on the master's clock (n,), s.
         memory_m: path that counts, m.
         sigma_point, sigma_normal: effective noise, m and rad.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
     """
     from canprobe.touch.bound import cramer_rao
     from canprobe.touch.surface import SurfaceMatrix
@@ -150,7 +152,7 @@ def bound_of_scan(
         surface = SurfaceMatrix.from_curvature(np.diag(truth["kappa"][row])).transformed(np.linalg.inv(T))
         C = cramer_rao(
             points[first : last + 1], normals[first : last + 1], surface,
-            sigma_point=sigma_point, sigma_normal=sigma_normal,
+            sigma_point=sigma_point, sigma_normal=sigma_normal, coupling=coupling,
         )  # fmt: skip
         squares.append(C[0, 0] + 2 * C[1, 1] + C[2, 2])
     mean = float(np.mean(squares))

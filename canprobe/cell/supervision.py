@@ -31,6 +31,7 @@ class Reaction(Enum):
     HOLD = "hold"
     SEARCH = "search"
     RETREAT = "retreat"
+    LIFT = "lift off, quick stop"
     STOP = "quick stop"
 
 
@@ -77,6 +78,11 @@ class Limits:
     count: Vector | None = None
     workspace: Vector | None = None
     tip_of: Callable[[Vector], Vector] | None = None
+
+    @property
+    def cycles_to_feel(self) -> int:
+        """From a motion to the cycle that has taken in a tactile sample of it."""
+        return 2 * self.tactile_cycles + 2
 
 
 @dataclass(slots=True)

@@ -48,6 +48,7 @@ class Supervisor:
         self.first: dict[str, int] = {}
         self._patch_from = patch_from
         self._force = 0.0
+        self._sample: TactileSample | None = None
         self._hidden = HiddenForce()
         self._joints = JointGuard(seen.limits)
         window = max(1, round(1e9 / seen.limits.period_ns))
@@ -82,6 +83,7 @@ class Supervisor:
         seen.passive_ns = measurement.t_ns - self._active_ns
         seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._joints.measure(measurement)
+        self._sample = measurement.tactile or self._sample
         counts = [count(seen) for count in self._counters]
         if counts != self._counted:
             self._note(counts, measurement.cycle)
@@ -105,6 +107,16 @@ class Supervisor:
                 return Finding(condition, error)
             hold = hold or Finding(condition, error)
         return hold
+
+    def must_stop(self) -> bool:
+        """Something holds for which nothing may move any more."""
+        return any(c.reaction is Reaction.STOP and c.check(self.seen) is not None for c in CYCLE_CHECKS)  # type: ignore[misc]
+
+    def felt(self) -> float:
+        """The force of the last tactile sample, N; 0 where nothing can press."""
+        if self._sample is None or self._patch_from is None:
+            return 0.0
+        return self._patch_from(self._sample).force
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """What must not go on in a touch, whatever the controller thinks of it."""

@@ -1,4 +1,4 @@
-"""SIGTERM as an interrupt: both ways of being told to stop take the same safe way out."""
+"""SIGTERM as an interrupt, so that both ways of being told to stop take the same safe way out; and when to take it."""
 
 from __future__ import annotations
 
@@ -28,3 +28,18 @@ def termination_interrupts() -> Iterator[None]:
 
 def _raise(_number: int, _frame: FrameType | None) -> None:
     raise Terminated
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only."""
+    came: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda n, _: came.append(n)) for number in numbers]
+    try:
+        yield
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])

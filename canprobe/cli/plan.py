@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
-from canprobe.errors import UsageError
+from canprobe.errors import PlanError, UsageError
 
 if TYPE_CHECKING:
     from canprobe.planning import Plan
@@ -65,11 +65,17 @@ def _draw(plan: Plan, path: Path) -> Path:
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
     from canprobe.planning import make_plan, plan_text
+    from canprobe.planning.export import refused_dict
     from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
     scene = load_scene(args.scene)
-    plan = make_plan(opened(scene) if args.auto else scene)
+    try:
+        plan = make_plan(opened(scene) if args.auto else scene)
+    except PlanError as error:
+        if args.json:
+            print_json(refused_dict(scene, error.problems, error.ways_out))
+        raise
     if args.measured is not None:
         return _compare(plan, args.measured, args.json)
     files = [] if args.figure is None else [_draw(plan, args.figure)]
@@ -95,5 +101,5 @@ def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     if as_json:
         print_json({channel: one.as_dict() for channel, one in measured.items()})
     else:
-        print("\n".join(one.text() for one in measured.values()), end="")
+        print("\n".join(f"bus {channel}, {one.text()}" for channel, one in measured.items()), end="")
     return 0 if all(one.as_planned for one in measured.values()) else 3

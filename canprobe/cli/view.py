@@ -9,7 +9,7 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.interrupts import interrupts_held, termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
 from canprobe.cli.target import target_of
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
             write_page(recorded, args.html)
             print(args.html)
         else:
-            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show)
+            serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, whole=interrupts_held)
     return 0
 
 

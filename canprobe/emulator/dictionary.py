@@ -6,8 +6,9 @@ brings a live value up to date before it is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import replace
+from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
 
@@ -24,7 +25,8 @@ class Dictionary:
     Attributes:
         entries: by key (index << 8 | subindex).
         values: present values by key; cyclic code reads and writes here directly.
-        written: called with the key after a value was stored over SDO, or over an RPDO that needs checks or hooks.
+        written: called with the key after a value was stored over SDO, or over an RPDO where `watched` says so.
+        watched: keys of which `written` has to be told when an RPDO brings them.
         configured: called with the index after a value was stored over SDO.
     """
 
@@ -37,6 +39,7 @@ class Dictionary:
         self._hooks: dict[int, list[Hook]] = {}
         self._refreshers: dict[int, Callable[[int], None]] = {}
         self.written: Callable[[int], None] = _nothing
+        self.watched: Container[int] = ()
         self.configured: Callable[[int], None] = _nothing
         self.restore(self.entries)
 
@@ -87,15 +90,15 @@ class Dictionary:
         """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
         self._refreshers[index] = refresh
 
-    def storer(self, key: int) -> Callable[[Value], None] | None:
-        """What stores a value of a cyclic RPDO, or None where the assignment is all there is to it.
+    def storer(self, key: int) -> Callable[[Value], None]:
+        """What stores a value of a cyclic RPDO.
 
         The same as `write_value`, with the look-ups done once. Hooks and checks hung in later are not seen.
         """
         entry, index, subindex = self.entries[key], key >> 8, key & 0xFF
         checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
         if entry.low is None and entry.high is None and not checks and not hooks:
-            return None
+            return partial(self.values.__setitem__, key)
         values, limited = self.values, entry.low is not None or entry.high is not None
 
         def store(value: Value) -> None:
@@ -106,7 +109,8 @@ class Dictionary:
             values[key] = value
             for hook in hooks:
                 hook(subindex, value)
-            self.written(key)
+            if key in self.watched:
+                self.written(key)
 
         return store
 

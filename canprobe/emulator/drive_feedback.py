@@ -16,11 +16,6 @@ from canprobe.emulator.node import SlaveNode
 _I16, _I32 = 1 << 15, 1 << 31
 
 
-def _within(value: float, limit: int) -> int:
-    number = round(value)
-    return number if -limit <= number < limit else min(max(number, -limit), limit - 1)
-
-
 class DriveFeedback:
     """Actual values of one axis.
 
@@ -37,19 +32,20 @@ class DriveFeedback:
         self._t_ns: int | None = None
         self.plant_torque = partial(plant.torque_permille, axis)
         self.torque: Callable[[], float] = self.plant_torque
-        sources: dict[int, Callable[[], int]] = {
-            0x6062: lambda: _within(units.position(motion.demand(self._t_ns or 0)), _I32),
-            0x6064: lambda: _within((self.counts - units.origin) / units.scale, _I32),
-            0x606B: lambda: _within(motion.speed(self._t_ns or 0) / units.speed_scale, _I32),
-            0x606C: lambda: _within(self._velocity / units.speed_scale, _I32),
-            0x6074: lambda: _within(self.torque(), _I16),
-            0x6077: lambda: _within(self.torque(), _I16),
-            0x60F4: lambda: _within((motion.demand(self._t_ns or 0) - self.counts) / units.scale, _I32),
+        sources: dict[int, tuple[int, Callable[[], float]]] = {
+            0x6062: (_I32, lambda: units.position(motion.demand(self._t_ns or 0))),
+            0x6064: (_I32, lambda: (self.counts - units.origin) / units.scale),
+            0x606B: (_I32, lambda: motion.speed(self._t_ns or 0) / units.speed_scale),
+            0x606C: (_I32, lambda: self._velocity / units.speed_scale),
+            0x6074: (_I16, self._torque),
+            0x6077: (_I16, self._torque),
+            0x60F4: (_I32, lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale),
         }
-        for index, source in sources.items():
+        for index, (limit, source) in sources.items():
             if node.dictionary.has_index(index):
-                node.pdos.on_trigger(index, self._sampler(index, source))
-                node.dictionary.on_read(index, self._reader(index, source))
+                sample = self._sampler(index, limit, source)
+                node.pdos.on_trigger(index, sample)
+                node.dictionary.on_read(index, self._reader(sample))
 
     def reset(self, t_ns: int) -> None:
         """Velocity starts anew."""
@@ -67,16 +63,20 @@ class DriveFeedback:
             self.counts, self._t_ns = counts, t_ns
         return self.counts
 
-    def _sampler(self, index: int, source: Callable[[], int]) -> Callable[[int], None]:
+    def _torque(self) -> float:
+        return self.torque()  # whoever tells it now
+
+    def _sampler(self, index: int, limit: int, source: Callable[[], float]) -> Callable[[int], None]:
+        """What puts a value into the dictionary, as a whole number of so many bits."""
         values, key = self._core.dictionary.values, index << 8
 
         def sample(t_ns: int) -> None:
             if t_ns != self._t_ns:
                 self.measure(t_ns)
-            values[key] = source()
+            number = round(source())
+            values[key] = number if -limit <= number < limit else min(max(number, -limit), limit - 1)
 
         return sample
 
-    def _reader(self, index: int, source: Callable[[], int]) -> Callable[[int], None]:
-        sample = self._sampler(index, source)
+    def _reader(self, sample: Callable[[int], None]) -> Callable[[int], None]:
         return lambda _subindex: sample(self._core.now_ns)

@@ -27,11 +27,15 @@ class DriveLoop:
     def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, values: dict[int, Value]) -> None:
         self._axis, self._plant, self._parameters, self._values = axis, plant, parameters, values
         self._told: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
+        self._seen: tuple[Value, Value, int] | None = None
 
     def feed_forward(self) -> None:
         """Take limit and offsets as they are now: every cycle of a position mode."""
-        get = self._values.get
-        self._tell(float(get(_SPEED, 0)) * self._parameters.units.speed_scale, float(get(_TORQUE, 0)))
+        get, parameters = self._values.get, self._parameters
+        seen = get(_SPEED, 0), get(_TORQUE, 0), parameters.max_torque
+        if seen != self._seen:
+            self._tell(float(seen[0]) * parameters.units.speed_scale, float(seen[1]))
+            self._seen = seen
 
     def feed_torque(self) -> None:
         """Take limit and torque offset: every cycle of a velocity mode."""
@@ -46,6 +50,7 @@ class DriveLoop:
         self._tell(0.0, 0.0)
 
     def _tell(self, speed: float, torque: float) -> None:
+        self._seen = None
         wanted = (self._parameters.max_torque, speed, torque)
         if wanted != self._told:
             self._told = wanted

@@ -41,21 +41,23 @@ class CyclicPosition(DriveMode):
 
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the following error and the master, latch the target received since the last SYNC."""
-        if self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
+        demand = self._motion.demand(t_ns)
+        if self._supervision.following_error(demand - counts, t_ns):
             self.parts.fault(FOLLOWING_ERROR, t_ns)
             return
         fresh, self._fresh = self._fresh, False
         self._supervision.sync(fresh, t_ns)
         if fresh and not self.halted:
-            self._latch(t_ns)
+            self._latch(t_ns, demand)
 
-    def _latch(self, t_ns: int) -> None:
+    def _latch(self, t_ns: int, demand: float) -> None:
+        """Follow the target from where the reference is, `demand`."""
         values, parameters, units = self._values, self._parameters, self._units
         target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
         allowed = parameters.clamp(target)
         counts = allowed * units.scale + units.origin
         passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
-        if abs(counts - self._motion.demand(t_ns)) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
+        if abs(counts - demand) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
             self.parts.fault(REFERENCE_LIMIT, t_ns)
             return
         self._latched_ns = t_ns

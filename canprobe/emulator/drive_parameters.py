@@ -36,10 +36,10 @@ class DriveParameters:
     Attributes:
         units: the factor group.
         interpolation_ns: 60C2h, time to reach a latched target.
-        cycle_ns: SYNC period, 1006h or else 60C2h.
         following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
         position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
         misses: 2000h, SYNCs missed before the master is taken for dead.
+        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half.
         low, high: 607Dh, position units; low >= high means no limits.
         abort_connection, quick_stop, shutdown, disable, halt, fault_reaction: option codes.
         acceleration, deceleration, quick_deceleration, homing_acceleration: 6083h–6085h, 609Ah, counts/s².
@@ -64,10 +64,11 @@ class DriveParameters:
         number = self._dictionary.number
         self.units.read(self._dictionary)
         self.interpolation_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
-        self.cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
         self.position_window, self.position_time_ns = self._window(0x6067), number(0x6068) * 1_000_000
         self.misses = number(MISSED_SYNCS, 0, DEFAULT_MISSES) if self._has_misses else DEFAULT_MISSES
+        cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
+        self.patience_ns = self.misses * cycle_ns + cycle_ns // 2
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
         self._read_options()
         self._read_dynamics()

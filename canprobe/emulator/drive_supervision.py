@@ -30,7 +30,7 @@ class Supervision:
         self._timer.cancel()
         if target is not None:
             self._by_rpdo = self._node.pdos.receives(target)
-            self._await_sync(t_ns)
+            self._timer.arm(t_ns + self._parameters.patience_ns)
 
     def stop(self) -> None:
         """Operation is no longer enabled."""
@@ -43,7 +43,7 @@ class Supervision:
 
     def sync(self, fresh: bool, t_ns: int) -> None:
         """A SYNC came, with a target since the last one (fresh) or without."""
-        self._await_sync(t_ns)
+        self._timer.arm(t_ns + self._parameters.patience_ns)
         self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
         if self._misses >= self._parameters.misses:
             self._node.emcy.report(RPDO_TIMEOUT)
@@ -58,10 +58,6 @@ class Supervision:
         if self._outside_ns is None:
             self._outside_ns = t_ns
         return t_ns - self._outside_ns >= self._parameters.following_timeout_ns
-
-    def _await_sync(self, t_ns: int) -> None:
-        cycle = self._parameters.cycle_ns
-        self._timer.arm(t_ns + self._parameters.misses * cycle + cycle // 2)
 
     def _sync_missing(self, due_ns: int) -> None:
         self._node.emcy.report(SYNC_LOST)

@@ -174,6 +174,7 @@ class PdoEngine:
         active = [tpdo for tpdo in self._tpdos if tpdo.active]
         self._on_event = [tpdo for tpdo in active if tpdo.type == 0 or tpdo.by_event]
         self._buffered = [tpdo for tpdo in active if tpdo.type == BUFFERED]
+        dictionary.watched = frozenset(key for tpdo in self._on_event for key in tpdo.keys)
         counted = bool(dictionary.number(0x1019))
         groups: dict[tuple[int, int], _Group] = {}
         for tpdo in active:

@@ -21,6 +21,7 @@ class Rpdo:
 
     Attributes:
         cob_id: identifier, or None while the PDO is not valid.
+        keys: mapped dictionary keys, dummies left out.
         synchronous: applied at the next SYNC (types 0–240).
         pending: data waiting for that SYNC.
     """
@@ -30,10 +31,11 @@ class Rpdo:
         "_emcy",
         "_event_ns",
         "_layout",
-        "_plan",
         "_rules",
+        "_stores",
         "_timer",
         "cob_id",
+        "keys",
         "pending",
         "synchronous",
     )
@@ -42,7 +44,8 @@ class Rpdo:
         self._core, self._emcy, self._rules = core, emcy, rules
         self._timer = core.timers.new(self._timed_out)
         self._layout = PdoLayout(0, ())
-        self._plan: tuple[tuple[int, Callable[[Value], None] | None], ...] = ()
+        self._stores: tuple[Callable[[Value], None], ...] = ()
+        self.keys: tuple[int, ...] = ()
         self._event_ns = 0
         self.cob_id: int | None = None
         self.synchronous = False
@@ -60,8 +63,8 @@ class Rpdo:
             self._forgive()  # what was wrong with the old parameters
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, entries)
-        keys = [key_of(signal.index, signal.subindex) for signal in self._layout.signals]
-        self._plan = tuple((key, dictionary.storer(key)) for key in keys)
+        self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
+        self._stores = tuple(dictionary.storer(key) for key in self.keys)
         self.synchronous = dictionary.number(index, TYPE) <= 240
         self._event_ns = dictionary.number(index, EVENT) * 1_000_000
 
@@ -69,11 +72,6 @@ class Rpdo:
     def patient(self) -> bool:
         """Nothing has to be done about a frame before the next SYNC."""
         return self.synchronous and not self._event_ns
-
-    @property
-    def keys(self) -> tuple[int, ...]:
-        """Mapped dictionary keys, dummies left out."""
-        return tuple(key for key, _ in self._plan)
 
     def stop(self) -> None:
         """Forget what waits; the event timer starts again at the next reception."""
@@ -101,11 +99,7 @@ class Rpdo:
     def apply(self, data: bytes) -> None:
         """Store the values; one that the dictionary refuses is dropped."""
         self.pending = None
-        values = self._core.dictionary.values
-        for value, (key, store) in zip(self._layout.unpack(data), self._plan, strict=True):
-            if store is None:
-                values[key] = value
-                continue
+        for value, store in zip(self._layout.unpack(data), self._stores, strict=True):
             try:
                 store(value)
             except SdoAbort:

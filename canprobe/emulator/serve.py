@@ -119,7 +119,7 @@ class Exchange:
         Of several SYNCs only the last is answered: nodes that are behind miss SYNCs, as busy devices do, instead of
         answering old ones ever later. Witnesses hear them all.
         """
-        syncs = sum(can_id == SYNC_ID for can_id, _, _ in frames)
+        syncs = [can_id for can_id, _, _ in frames].count(SYNC_ID)
         for can_id, data, received_ns in frames:
             heard_ns = min(received_ns, t_ns)
             if can_id == SYNC_ID:
@@ -149,38 +149,23 @@ class Exchange:
             for seat in kind:
                 if SYNC_ID in seat.ears:
                     seat.hear(SYNC_ID, data, t_ns)
-            if said := self._said():
+            if said := _said(kind):
                 spoken += said
                 yield [frame for _, frame in said]
         for sender, frame in spoken:
-            self._overhear(sender, frame, t_ns)
+            if self._audience(frame[0]):
+                self._overhear(sender, frame, t_ns)
 
     def _settle(self, t_ns: int) -> list[Frame]:
         """Empty the queues, lowest identifier first, each in its own order; let the other nodes hear every frame."""
         sent: list[Frame] = []
-        while (sender := self._next_sender()) is not None:
+        while (sender := _next_of(self._seats)) is not None:
             frame = sender.queue.popleft()
             sent.append(frame)
             if len(sent) > _MOST_FRAMES:
                 raise BusError(f"the emulated nodes answer each other without an end, last {frame[0]:03X}")
             self._overhear(sender, frame, t_ns)
         return sent
-
-    def _said(self) -> list[tuple[_Seat, Frame]]:
-        """Empty the queues, lowest identifier first, each in its own order."""
-        talking = [seat for seat in self._seats if seat.queue]
-        said: list[tuple[_Seat, Frame]] = []
-        if len(talking) == 1 or all(len(seat.queue) == 1 for seat in talking):  # as after nearly every SYNC
-            for seat in sorted(talking, key=_head):
-                said += [(seat, frame) for frame in seat.queue]
-                seat.queue.clear()
-            return said
-        while (sender := self._next_sender()) is not None:
-            said.append((sender, sender.queue.popleft()))
-        return said
-
-    def _next_sender(self) -> _Seat | None:
-        return min((seat for seat in self._seats if seat.queue), key=_head, default=None)
 
     def _overhear(self, sender: _Seat, frame: Frame, t_ns: int) -> None:
         for seat in self._audience(frame[0]):
@@ -190,6 +175,26 @@ class Exchange:
 
 def _head(seat: _Seat) -> int:
     return seat.queue[0][0]
+
+
+def _next_of(seats: Sequence[_Seat]) -> _Seat | None:
+    """Who has the frame of the lowest identifier, if anybody has one."""
+    talking = [seat for seat in seats if seat.queue]
+    return min(talking, key=_head) if talking else None
+
+
+def _said(seats: Sequence[_Seat]) -> list[tuple[_Seat, Frame]]:
+    """Empty the queues, lowest identifier first, each in its own order."""
+    talking = [seat for seat in seats if seat.queue]
+    said: list[tuple[_Seat, Frame]] = []
+    if len(talking) == 1 or all(len(seat.queue) == 1 for seat in talking):  # as after nearly every SYNC
+        for seat in sorted(talking, key=_head):
+            said += [(seat, frame) for frame in seat.queue]
+            seat.queue.clear()
+        return said
+    while (sender := _next_of(talking)) is not None:
+        said.append((sender, sender.queue.popleft()))
+    return said
 
 
 def _kind(seat: _Seat) -> type:

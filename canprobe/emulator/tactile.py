@@ -7,7 +7,9 @@ Source: objects 2000h–2130h of `tactile_array.eds`; wire form in `protocol.tac
 
 from __future__ import annotations
 
+import struct
 from collections import deque
+from itertools import count, takewhile
 from typing import Protocol
 
 import numpy as np
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 from canprobe.eds import WINDOW_SIZE, WINDOW_SIZE_NAME
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.application import Application
+from canprobe.emulator.dictionary import Dictionary
 from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.node import OdOf, SlaveNode
 from canprobe.emulator.tactile_image import (
@@ -31,12 +34,12 @@ from canprobe.emulator.tactile_image import (
 )
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
-from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_frame
+from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_whole
 
 TARE = int.from_bytes(b"tare", "little")
 MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
 IMAGE_ROWS, WINDOW_ROWS, HEADER, FEATURES = 0x2100, 0x2110, 0x2120, 0x2130
-_CONTENT = {TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
+_CONTENT = {TactileMode.FEATURES: FEATURES, TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
 _MAX_AGE_US = 0xFFFF
 _TARE_BYTES = SIDE * SIDE * 8
 
@@ -79,6 +82,7 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
+        self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
         entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
         self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
         if self._sized:
@@ -154,15 +158,12 @@ class TactileApplication(Application):
         if mode is TactileMode.FEATURES:
             seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
             content = compute_features(seen, number(FULL_SCALE_PA, 0, 100_000))
-        words = [int.from_bytes(payload, "little") for payload in pack_frame(header, content)]
+        whole = pack_whole(header, content)
+        words = struct.unpack(f"<{len(whole) // 8}Q", whole)
         dictionary.put(OVERLOAD, 0, int(overload))
         dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
-        if mode is TactileMode.FEATURES:
-            dictionary.put(FEATURES, 1, words[0])
-            dictionary.put(FEATURES, 2, words[1])
-        else:
-            for subindex, word in enumerate(words[1:], start=1):
-                dictionary.put(_CONTENT[mode], subindex, word)
+        content_words = words if mode is TactileMode.FEATURES else words[1:]
+        dictionary.values.update(zip(self._content[mode], content_words, strict=False))
         dictionary.put(HEADER, 0, words[0])
 
     def _window(self) -> int:
@@ -180,6 +181,11 @@ class TactileApplication(Application):
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []
+
+
+def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
+    """Keys of sub-index 1, 2, … of an object, as many as there are."""
+    return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
 
 
 def make_tactile_node(

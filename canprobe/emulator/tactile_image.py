@@ -14,12 +14,14 @@ FULL_SCALE = 255
 GAIN_ONE = 1000
 _HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
 _INDEX = np.arange(SIDE, dtype=np.float64)
-_SUMS = np.stack((np.ones(SIDE), _INDEX), axis=1)
+_SUMS = np.stack((np.ones(SIDE * SIDE), np.repeat(_INDEX, SIDE), np.tile(_INDEX, SIDE)))  # of 1, row, column
 TAXEL_AREA_M2 = 1.5875e-3**2
 
 
 def is_overloaded(raw: Raw) -> bool:
     """Whether a taxel has reached full scale."""
+    if raw.dtype == np.uint8:
+        return FULL_SCALE in raw.tobytes()
     return bool(raw.max() == FULL_SCALE)
 
 
@@ -40,9 +42,7 @@ def correct_finely(
 
 
 def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
-    counts = raw.astype(np.float64)
-    if tare is not None:
-        counts -= tare
+    counts = raw.astype(np.float64) if tare is None else raw - tare
     if gain_permille != GAIN_ONE:
         counts *= gain_permille / GAIN_ONE
     return counts
@@ -56,7 +56,7 @@ def _limited(counts: NDArray[np.float64], threshold: int) -> NDArray[np.float64]
 
 def _moments(image: Raw) -> tuple[float, float, float]:
     """Sum, centroid row, centroid column; the centre of the pad without a contact."""
-    (total, columns), (rows, _) = (_SUMS.T @ image @ _SUMS).tolist()
+    total, rows, columns = _SUMS.dot(image.reshape(-1)).tolist()
     if total == 0.0:
         return 0.0, (SIDE - 1) / 2, (SIDE - 1) / 2
     return total, rows / total, columns / total

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from heapq import heapify, heappop, heappush
+from heapq import heapify, heappop, heappush, heapreplace
 
 _ROOM = 64
 
 
 class Timer:
-    """One deadline. Re-arming to a later time costs an assignment; the heap is put right when the old time comes.
+    """One deadline. Re-arming to a later time costs an assignment; the heap is put right when it becomes the first.
 
     Attributes:
         due_ns: when it fires, or None while it is not armed.
@@ -30,6 +30,8 @@ class Timer:
         if queued is None or due_ns < queued:
             self._queued_ns = due_ns
             self._owner.queue(due_ns, self)
+        elif queued == self._owner.next_ns:
+            self._owner.tidy()
 
     def arm_next(self, due_ns: int, period_ns: int) -> None:
         """Fire one period after `due_ns`; periods already missed are skipped, the phase is kept."""
@@ -39,6 +41,8 @@ class Timer:
     def cancel(self) -> None:
         """Do not fire."""
         self.due_ns = None
+        if self._queued_ns is not None:
+            self._owner.tidy()
 
     def holds(self, queued_ns: int) -> bool:
         """Whether the entry of `queued_ns` is still needed; if it is not, it counts as taken off the heap."""
@@ -47,6 +51,12 @@ class Timer:
         if self.due_ns is None:
             self._queued_ns = None
         return self.due_ns is not None
+
+    def moved(self) -> int:
+        """The entry on the heap goes to where the deadline is now, which is returned."""
+        assert self.due_ns is not None
+        self._queued_ns = self.due_ns
+        return self.due_ns
 
     def surfaced(self, queued_ns: int) -> bool:
         """Take the entry of `queued_ns` off the heap; queue again when it was re-armed. True when it is due then."""
@@ -70,15 +80,17 @@ class Timers:
 
     Attributes:
         now_ns: the time up to which `run` was last called.
+        next_ns: the earliest deadline, or None.
     """
 
-    __slots__ = ("_count", "_heap", "_most", "now_ns")
+    __slots__ = ("_count", "_heap", "_most", "next_ns", "now_ns")
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
         self._count = 0
         self._most = _ROOM
         self.now_ns = 0
+        self.next_ns: int | None = None
 
     def new(self, callback: Callable[[int], None]) -> Timer:
         """A timer that calls `callback(due_ns)`; not armed."""
@@ -88,8 +100,25 @@ class Timers:
         """Put an entry on the heap (for `Timer`)."""
         self._count += 1
         heappush(self._heap, (due_ns, self._count, timer))
+        if self.next_ns is None or due_ns < self.next_ns:
+            self.next_ns = due_ns
         if len(self._heap) > self._most:
             self._compact()
+
+    def tidy(self) -> None:
+        """Take entries of deadlines that were moved or cancelled from the top of the heap (for `Timer`)."""
+        heap = self._heap
+        while heap:
+            due, _, timer = heap[0]
+            if timer.due_ns == due:
+                self.next_ns = due
+                return
+            if timer.holds(due):
+                self._count += 1
+                heapreplace(heap, (timer.moved(), self._count, timer))
+            else:
+                heappop(heap)
+        self.next_ns = None
 
     def _compact(self) -> None:
         """Drop the entries of deadlines that were moved or cancelled, which else stay until their time."""
@@ -97,18 +126,6 @@ class Timers:
         heap[:] = {timer: (due, count, timer) for due, count, timer in heap if timer.holds(due)}.values()
         heapify(heap)
         self._most = 2 * len(heap) + _ROOM
-
-    @property
-    def next_ns(self) -> int | None:
-        """The earliest deadline, or None."""
-        heap = self._heap
-        while heap:
-            due, _, timer = heap[0]
-            if timer.due_ns == due:
-                return due
-            heappop(heap)
-            timer.surfaced(due)
-        return None
 
     def run(self, t_ns: int) -> None:
         """Fire everything due up to and at `t_ns`, in order of time, then of arming."""
@@ -118,3 +135,4 @@ class Timers:
             due, _, timer = heappop(heap)
             if timer.surfaced(due):
                 timer.fire(due)
+        self.tidy()

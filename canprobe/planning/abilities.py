@@ -46,6 +46,11 @@ class Abilities:
         """Whether it can send PDOs of up to 64 bytes."""
         return has_long_pdos(self.od)
 
+    @property
+    def bitrates(self) -> tuple[int, ...]:
+        """Bit rates that it has, bit/s; empty where its EDS tells none."""
+        return tuple(sorted(self.od.device_information.allowed_baudrates))
+
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object exists."""
         return self._variable(index, subindex) is not None

@@ -4,15 +4,19 @@ A node queues its TPDOs when it has received the SYNC. The cell looks for them a
 the time by which the last one must be in; the controller starts at the first look that can find them all, takes at most
 the scene's `cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those
 on the SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
+
+Where nodes send their oldest frame first, what has to wait behind its own node's heartbeat hangs on no phase: the bound
+for FIFO queues, which knows no offsets, takes the place of the one for priority queues.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 from canprobe.planning.model import CycleBudget
+from canprobe.protocol.fifo_queues import worst_case_response_fifo
 from canprobe.protocol.timing import BusAnalysis, Message, worst_case_response
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
@@ -32,6 +36,7 @@ class CycleMessages:
         strangers: what keeps its own time.
         best_sync_ns: shortest time of a SYNC on the wire.
         best_feedback_ns: shortest time of the feedback.
+        fifo_nodes: name of every message that goes through a FIFO transmit queue → the node; empty: priority queues.
     """
 
     sync: Message
@@ -41,6 +46,7 @@ class CycleMessages:
     strangers: tuple[Message, ...]
     best_sync_ns: int
     best_feedback_ns: int
+    fifo_nodes: Mapping[str, int] = field(default_factory=dict)
 
 
 def analyse_cycle(messages: CycleMessages, compute_ns: int, bitrate: int) -> tuple[BusAnalysis, CycleBudget]:
@@ -58,7 +64,8 @@ def analyse_cycle(messages: CycleMessages, compute_ns: int, bitrate: int) -> tup
     sync_ns, feedback_ns = messages.best_sync_ns, max(messages.best_sync_ns, messages.best_feedback_ns)
     for _ in range(_ROUNDS):
         looks = look_times(period, feedback_ns)
-        analysis = worst_case_response(_placed(messages, sync_ns, looks, feedback_ns, compute_ns), bitrate)
+        placed = _placed(messages, sync_ns, looks, feedback_ns, compute_ns)
+        analysis = _analyse(placed, messages.fifo_nodes, bitrate)
         late_sync = _last(analysis, (messages.sync,))
         late_feedback = _last(analysis, messages.feedback) if messages.feedback else late_sync
         if (
@@ -69,7 +76,22 @@ def analyse_cycle(messages: CycleMessages, compute_ns: int, bitrate: int) -> tup
         ):
             break
         sync_ns, feedback_ns = late_sync, late_feedback
+    else:
+        analysis = _without_bound(analysis)
     return analysis, _budget(messages, analysis, looks, feedback_ns, compute_ns)
+
+
+def _analyse(placed: Sequence[Message], fifo_nodes: Mapping[str, int], bitrate: int) -> BusAnalysis:
+    if fifo_nodes:
+        return worst_case_response_fifo(placed, fifo_nodes, bitrate)
+    return worst_case_response(placed, bitrate)
+
+
+def _without_bound(analysis: BusAnalysis) -> BusAnalysis:
+    """What is left where the rounds do not come to an end."""
+    return dataclasses.replace(
+        analysis, responses=tuple(dataclasses.replace(one, response_ns=None) for one in analysis.responses)
+    )
 
 
 def look_times(period_ns: int, feedback_ns: int | None) -> tuple[int, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -17,6 +18,7 @@ from canprobe.planning.model import (
     PlannedPdo,
 )
 from canprobe.planning.timeline import Slot, timeline
+from canprobe.scene import Scene
 
 SCHEMA = 1
 
@@ -27,11 +29,13 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
+        "fits": True,
         "title": plan.scene.title,
         "bus": {
             "interface": bus.interface,
             "channel": bus.channel,
             "bitrate": bus.bitrate,
+            "transmit_queue": bus.transmit_queue,
             "fd": bus.fd,
             "data_bitrate": bus.data_bitrate if bus.fd else None,
         },
@@ -55,6 +59,18 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
+        "warnings": list(plan.warnings),
+    }
+
+
+def refused_dict(scene: Scene, problems: Sequence[str], ways_out: Sequence[str]) -> dict[str, Any]:
+    """What is said of a scene that does not fit."""
+    return {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "fits": False,
+        "problems": list(problems),
+        "ways_out": list(ways_out),
     }
 
 

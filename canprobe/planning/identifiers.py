@@ -1,7 +1,7 @@
 """Identifiers of PDOs in the order of their deadlines, and what is wrong with a set of them.
 
 The bus gives way to the lower identifier. With priorities in the order of the deadlines a message that can wait never
-stands before one that cannot. Source: Davis et al. 2007, section 5; restricted identifiers: CiA 301.
+stands before one that cannot. Source: Davis et al. 2007 (priority assignment); restricted identifiers: CiA 301.
 """
 
 from __future__ import annotations

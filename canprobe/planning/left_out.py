@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
-import math
 from collections.abc import Callable
 
 from canprobe.planning.bridges import bridge_outputs
-from canprobe.planning.contact_window import PRESSING, patch_across_taxels, taxels_needed
+from canprobe.planning.contact_window import PRESSING, patch_across_taxels
+from canprobe.planning.cut_patch import measured_share
 from canprobe.scene import Scene
 
 _Reason = Callable[[Scene], str | None]
@@ -33,11 +33,10 @@ def _by_window(scene: Scene) -> str:
     name = f"the {side}×{side} window round the contact"
     if scene.probe is None or scene.task.kind not in PRESSING or isinstance(side, str):
         return f"{name} is sent"
-    across = patch_across_taxels(scene.task.force_n, scene.probe)
-    if side >= across:
+    if side >= patch_across_taxels(scene.task.force_n, scene.probe):
         return f"{name} holds the patch"
-    needed = math.ceil(taxels_needed(scene.task.force_n, scene.probe))
-    return f"{name} is sent, which cuts a patch of {across:.1f} taxels: its rim is reckoned; {needed} taxels hold it"
+    outside = 1.0 - measured_share(scene.task.force_n, scene.probe, side)
+    return f"{name} is sent, with up to {100 * outside:.0f} % of the force outside"
 
 
 def _no_window(scene: Scene) -> str | None:

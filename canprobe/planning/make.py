@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from canprobe.errors import EdsError, PlanError
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.bridges import unavailable_bridges
+from canprobe.planning.cut_patch import cut_patch
 from canprobe.planning.cycle import plan_ratio, plan_sync
 from canprobe.planning.identifiers import identifier_problems, order_by_deadline
 from canprobe.planning.left_out import left_out, outputs
@@ -22,11 +23,12 @@ from canprobe.planning.model import (
     SyncPlan,
     Traffic,
 )
-from canprobe.planning.needs import missing_objects
+from canprobe.planning.needs import missing_bitrate, missing_objects
 from canprobe.planning.open_keys import candidates
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_traffic
 from canprobe.planning.turning import plan_motion
+from canprobe.planning.warnings import plan_warnings
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
 
@@ -47,13 +49,19 @@ def make_plan(scene: Scene) -> Plan:
     """
     devices, problems = _devices(scene)
     found = _choose(scene, devices) if not problems else None
+    ways: list[str] = []
     if found is not None:
         problems += found.reasons()
+        ways += found.ways_out()
         scene = found.scene
     scene, joint_speeds, unreachable, turn = plan_motion(scene)
+    cut = cut_patch(scene) if found is not None else None
+    if cut is not None and cut.true_n is None:
+        problems.append(cut.text)
+        ways += cut.ways if not ways else ()
     problems += unreachable
     if problems or found is None:
-        raise PlanError(problems)
+        raise PlanError(problems, ways)
     bus = found.bus
     return Plan(
         scene=scene,
@@ -70,6 +78,7 @@ def make_plan(scene: Scene) -> Plan:
         outputs=outputs(scene),
         left_out=left_out(scene),
         not_available=(*bus.not_available, *unavailable_bridges(scene)),
+        warnings=plan_warnings(scene, bus.pdos),
     )
 
 
@@ -104,15 +113,18 @@ class _Found:
 
     def reasons(self) -> list[str]:
         """Why it does not fit; empty where it does."""
-        problems = list(self.bus.problems)
-        if self.bus.overload:
-            known = frozenset(self.bus.problems)
-            ways = ways_out(self.scene, lambda changed: _fits(changed, known))
-            problems += [*self.bus.overload[:-1], f"{self.bus.overload[-1]}; ways out: {ways}"]
+        problems = [*self.bus.problems, *self.bus.overload]
         if problems and self.tried > 1:
             chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in self.choices)
             problems.insert(0, f"none of {self.tried} ways to fill what is left open fits; the nearest: {chosen}")
         return problems
+
+    def ways_out(self) -> list[str]:
+        """What would make it fit its bus; empty where it does."""
+        if not self.bus.overload:
+            return []
+        known = frozenset(self.bus.problems)
+        return ways_out(self.scene, lambda changed: _fits(changed, known))
 
 
 def _choose(scene: Scene, devices: Mapping[int, Abilities]) -> _Found:
@@ -195,7 +207,7 @@ def _devices(scene: Scene) -> tuple[dict[int, Abilities], list[str]]:
         except EdsError as error:
             problems.append(str(error))
             continue
-        problems += missing_objects(device, kind, scene)
+        problems += missing_objects(device, kind, scene) + missing_bitrate(device, kind, scene)
         devices.update(dict.fromkeys(node_ids, device))
     return devices, problems
 

@@ -118,7 +118,7 @@ class MeasuredTraffic:
         return "\n".join(self._lines()) + "\n"
 
     def _lines(self) -> Iterator[str]:
-        yield f"measured in {self.duration_s:.2f} s, from the first SYNC to the last:"
+        yield f"measured in {self.duration_s:.2f} s, from its first SYNC to its last:"
         yield f"  load {100 * self.load:.1f} %, planned at most {100 * self.planned_worst:.1f} %"
         yield f"  {'':<12} {'frames':>8} {'planned':>9} {'load %':>7} {'at most':>8}  latest of its worst case"
         for one in self.classes:

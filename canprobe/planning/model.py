@@ -261,6 +261,7 @@ class Plan:
         outputs: files that a run writes.
         left_out: what this scene does not bring up, and why.
         not_available: what the EDS files could not give.
+        warnings: what is carried out all the same, but not as the numbers say.
     """
 
     scene: Scene
@@ -277,6 +278,7 @@ class Plan:
     outputs: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
+    warnings: tuple[str, ...]
 
     @property
     def traffic(self) -> Traffic:

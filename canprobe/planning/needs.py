@@ -1,4 +1,4 @@
-"""Objects without which a device cannot take its part, and what they are needed for."""
+"""What a device cannot take its part without: objects, with what they are needed for, and the bus's bit rate."""
 
 from __future__ import annotations
 
@@ -37,3 +37,12 @@ def missing_objects(device: Abilities, kind: NodeKind, scene: Scene) -> list[str
         for index, what in needed.items()
         if index not in device.od
     ]
+
+
+def missing_bitrate(device: Abilities, kind: NodeKind, scene: Scene) -> list[str]:
+    """That the device does not have the bus's bit rate, where its EDS tells which it has."""
+    if not device.bitrates or scene.bus.bitrate in device.bitrates:
+        return []
+    section = "arm" if kind == "drive" else "sensor"
+    has = ", ".join(map(str, device.bitrates))
+    return [f"bus.bitrate = {scene.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]

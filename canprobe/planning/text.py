@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 
 from canprobe.planning.bridges import BRIDGES
@@ -33,25 +34,30 @@ def _lines(plan: Plan) -> Iterator[str]:
     yield f"bus {channels} ({bus.interface}), {bus.bitrate} bit/s"
     if bus.fd:
         yield (
-            f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s, everything else classical; every "
-            "controller on the bus must tolerate CAN FD, which no EDS tells"
+            f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s and counted in bits of "
+            f"{bus.bitrate} bit/s; everything else classical; every controller on the bus must tolerate CAN FD, which "
+            "no EDS tells"
         )
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "
         f"heartbeat every {HEARTBEAT_PRODUCED_MS} ms, lost after {HEARTBEAT_CONSUMED_MS} ms"
     )
+    if bus.transmit_queue == "fifo":
+        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat holds up what follows it'
+    yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan.nodes))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
     for one in plan.buses:
         yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
-    yield from _titled(f"one cycle of {_us(sync.period_ns)} µs, worst case", list(_budget_rows(plan.traffic.budget)))
+    title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
+    yield from _titled(title, list(_budget_rows(plan.traffic.budget)))
     yield from _titled(_timeline_title(plan), timeline_rows(plan, TIMELINE_WIDTH))
     if plan.choices:
         rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
         yield from _titled("chosen by the plan", rows)
     if plan.joint_speeds is not None:
-        rows = [["joint", "needed", "allowed (deg/s)"]]
+        rows = [["joint", "needed deg/s", "allowed deg/s"]]
         speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
         rows += [[str(i), f"{needed:.1f}", f"{limit:g}"] for i, (needed, limit) in enumerate(speeds, start=1)]
         yield from _titled("joint speeds", rows)
@@ -72,8 +78,18 @@ def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
     yield ""
     yield f"{title}:"
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    right = [_is_numeric(column[1:]) for column in zip(*rows, strict=True)]
     for row in rows:
-        yield "  " + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
+        cells = (
+            cell.rjust(width) if numeric else cell.ljust(width)
+            for cell, width, numeric in zip(row, widths, right, strict=True)
+        )
+        yield "  " + "  ".join(cells).rstrip()
+
+
+def _is_numeric(cells: Sequence[str]) -> bool:
+    """Numbers belong to the right; a time without a bound is among them."""
+    return bool(cells) and all(re.fullmatch(r"-?[\d.]+( %)?|unbounded", cell) for cell in cells)
 
 
 def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
@@ -89,10 +105,13 @@ def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
 
 
 def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
-    rows = [["COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", "response", "deadline", "slack µs", "content"]]
+    several = len({pdo.channel for pdo in pdos}) > 1
+    times = ["response µs", "deadline µs", "slack µs"]
+    rows = [[*(["bus"] * several), "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]]
     for pdo in pdos:
         rows.append(
             [
+                *([pdo.channel] * several),
                 f"{pdo.cob_id:03X}h",
                 str(pdo.node_id),
                 f"{pdo.direction.upper()}{pdo.number}",
@@ -145,8 +164,9 @@ def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
     if budget.commands_ns is not None:
         yield ["last RPDO through", _us(budget.commands_ns), ""]
     if budget.tactile_ns is not None:
-        yield ["tactile frame in", _us(budget.tactile_ns), "after the SYNC that triggered it"]
-    yield ["left before the next SYNC", _us(budget.slack_ns), f"bus {_us(budget.bus_ns)} µs"]
+        yield ["tactile frame in", _us(budget.tactile_ns), "of the SYNC that triggered it"]
+    whole = f"{_us(budget.period_ns)}, less bus {_us(budget.bus_ns)} and controller {_us(budget.compute_ns)}"
+    yield ["left before the next SYNC", _us(budget.slack_ns), whole]
 
 
 def _use_rows(plan: Plan) -> Iterator[list[str]]:

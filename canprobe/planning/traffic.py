@@ -43,7 +43,7 @@ def plan_traffic(
         compute_ns: what the controller takes of a cycle at most.
     """
     wire = on_the_wire(pdos)
-    analysis, budget = analyse_cycle(_messages(wire, sync, node_ids, bus.bitrate), compute_ns, bus.bitrate)
+    analysis, budget = analyse_cycle(_messages(wire, sync, node_ids, bus), compute_ns, bus.bitrate)
     responses = {response.message.cob_id: response for response in analysis.responses}
     traffic = Traffic(
         load=analysis.load,
@@ -57,12 +57,13 @@ def plan_traffic(
     return traffic, timed, _problems(traffic, analysis.responses, bus)
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int) -> CycleMessages:
+def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings) -> CycleMessages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
+    bitrate = bus.bitrate
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
     feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.kind == "drive"]
     heartbeats = [
-        Message(f"heartbeat of node {node}", HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
+        Message(_heartbeat(node), HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
         for node in (*node_ids, MASTER_NODE_ID)
     ]
     best_sync = best_case_bits(_SYNC_BYTES)
@@ -76,13 +77,28 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
         best_feedback_ns=(best_sync + sum(best_case_bits(pdo.layout.length) for pdo in feedback))
         * 1_000_000_000
         // bitrate,
+        fifo_nodes=_senders(wire, node_ids) if bus.transmit_queue == "fifo" else {},
     )
 
 
+def _senders(wire: Sequence[PlannedPdo], node_ids: Sequence[int]) -> dict[str, int]:
+    """Name of every message → the node in whose transmit queue it waits."""
+    pdos = {_name(pdo): pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID for pdo in wire}
+    heartbeats = {_heartbeat(node): node for node in (*node_ids, MASTER_NODE_ID)}
+    return {"SYNC": MASTER_NODE_ID, **pdos, **heartbeats}
+
+
+def _name(pdo: PlannedPdo) -> str:
+    return f"{pdo.direction.upper()} {pdo.cob_id:03X}h"
+
+
+def _heartbeat(node_id: int) -> str:
+    return f"heartbeat of node {node_id}"
+
+
 def _message(pdo: PlannedPdo, sync: SyncPlan, bitrate: int) -> Message:
-    name = f"{pdo.direction.upper()} {pdo.cob_id:03X}h"
     frame_ns, period_ns = _ns(pdo.bits_worst, bitrate), _period_ns(pdo, sync)
-    return Message(name, pdo.cob_id, pdo.layout.length, period_ns, deadline_ns=pdo.deadline_ns, frame_ns=frame_ns)
+    return Message(_name(pdo), pdo.cob_id, pdo.layout.length, period_ns, deadline_ns=pdo.deadline_ns, frame_ns=frame_ns)
 
 
 def _period_ns(pdo: PlannedPdo, sync: SyncPlan) -> int:
@@ -124,6 +140,8 @@ def _ns(bits: int, bitrate: int) -> int:
 
 def _problems(traffic: Traffic, responses: Sequence[Response], bus: BusSettings) -> list[str]:
     where = f"bus {bus.channel} at {bus.bitrate} bit/s"
+    if bus.transmit_queue == "fifo":
+        where += ", every node's oldest frame first"
     problems = []
     if traffic.load > 1:
         parts = ", ".join(f"{what} {100 * share:.0f} %" for what, share in traffic.parts)

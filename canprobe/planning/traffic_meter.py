@@ -13,6 +13,9 @@ from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
 from canprobe.protocol.frame_bits import FD_LENGTHS, best_case_bits, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
+_AT_ONCE = 512
+"""Frames that are counted together, which is quicker than cycle by cycle."""
+
 
 @dataclass(frozen=True, slots=True)
 class Expected:
@@ -86,6 +89,7 @@ class TrafficMeter:
     _expected: dict[int, Expected] = field(init=False)
     _counts: dict[int, _Count] = field(init=False, default_factory=dict)
     _before: dict[int, _Count] = field(init=False, default_factory=dict)
+    _taken: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
     _cycle: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
     _first_ns: int | None = field(init=False, default=None)
     _sync_ns: int = field(init=False, default=0)
@@ -102,15 +106,26 @@ class TrafficMeter:
         self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one frame; it is counted with the next SYNC."""
-        if can_id == SYNC_ID:
+        """Take one frame; it is counted with the next SYNC, or after."""
+        self._taken.append((can_id, data, t_ns))
+        if len(self._taken) >= _AT_ONCE:
             self._count()
-            self._sync_ns = t_ns
-            if self._first_ns is None:
-                self._first_ns = t_ns
-                self._before, self._counts = self._counts, {}
-            self._by_counter[data[0] if data else 0] = t_ns
-        self._cycle.append((can_id, data, t_ns))
+
+    def _count(self) -> None:
+        """Count what was taken, cycle by cycle; the frames since the last SYNC wait."""
+        taken, self._taken = self._taken, []
+        for frame in taken:
+            if frame[0] == SYNC_ID:
+                self._count_cycle()
+                self._begin_cycle(frame)
+            self._cycle.append(frame)
+
+    def _begin_cycle(self, sync: tuple[int, bytes, int]) -> None:
+        _, data, self._sync_ns = sync
+        if self._first_ns is None:
+            self._first_ns = self._sync_ns
+            self._before, self._counts = self._counts, {}
+        self._by_counter[data[0] if data else 0] = self._sync_ns
 
     @property
     def frames(self) -> int:
@@ -123,12 +138,14 @@ class TrafficMeter:
         return sum(one.bits for one in self._all_counts())
 
     def _all_counts(self) -> list[_Count]:
+        self._count()
         waiting: dict[int, _Count] = {}
         self._tally(waiting)
         return [*self._before.values(), *self._counts.values(), *waiting.values()]
 
     def report(self) -> MeasuredTraffic:
         """What was counted so far, beside the plan."""
+        self._count()
         counts = self._counts if self._first_ns is not None else {}
         ns = 0 if self._first_ns is None else self._sync_ns - self._first_ns
         seen = Counter(can_id for can_id, _, _ in self._cycle)
@@ -147,7 +164,7 @@ class TrafficMeter:
             planned_worst=self._bus.traffic.load,
         )
 
-    def _count(self) -> None:
+    def _count_cycle(self) -> None:
         """Count the frames since the last SYNC, and how far behind it they were."""
         counts, expectations = self._counts, self._expected
         self._tally(counts)

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.model import Traffic
 from canprobe.planning.open_keys import candidates, opened, second_channel, written_value
-from canprobe.protocol.tactile import WINDOWS
+from canprobe.protocol.tactile import WINDOW, WINDOWS
 from canprobe.scene import Scene, TactileModeName
 
 FD_ARRAY = "tactile_array_fd.eds"
@@ -16,21 +16,24 @@ Fit = Callable[[Scene], Traffic | None]
 """Traffic of a changed scene, or None where that does not fit either."""
 
 
-def ways_out(scene: Scene, fit: Fit) -> str:
-    """Changes that make the scene fit, with the load that they leave, in one line."""
+def ways_out(scene: Scene, fit: Fit) -> list[str]:
+    """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
     found = []
     for text, changed in (*_changes(scene), *_together(scene, fit), *_slower(scene, fit)):
         traffic = fit(changed)
         if traffic is not None:
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
-            numbers = f"{100 * traffic.load:.0f} %, {peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
-            found.append(f"{text} ({numbers})")
-    return "; or ".join(found) if found else "fewer nodes or a faster bus"
+            share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
+            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}")
+    return found or ["fewer nodes or a faster bus"]
 
 
 def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
     if scene.bus.bitrate < 1_000_000:
         yield "bus.bitrate = 1000000", dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, bitrate=1_000_000))
+    if scene.bus.transmit_queue == "fifo":
+        text = 'controllers that send their most urgent frame first (bus.transmit_queue = "priority")'
+        yield text, dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, transmit_queue="priority"))
     if scene.arm is not None and not scene.arm.grouped_rpdo:
         yield (
             "arm.grouped_rpdo = true",
@@ -47,7 +50,10 @@ def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
             sensor = dataclasses.replace(scene.sensor, window=side)
             yield f"sensor.window = {side}", dataclasses.replace(scene, sensor=sensor)
     for mode in smaller.get(scene.sensor.mode, ()):
-        yield f'sensor.mode = "{mode}"', dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode=mode))
+        kept = scene.sensor.window if mode == "window" else WINDOW  # only a window may have another size
+        text = f'sensor.mode = "{mode}"' + " without sensor.window" * (kept != scene.sensor.window)
+        sensor = dataclasses.replace(scene.sensor, mode=mode, window=kept)
+        yield text, dataclasses.replace(scene, sensor=sensor)
     if scene.arm is not None:
         own = second_channel(scene.bus.channel)
         if scene.sensor.channel in (None, scene.bus.channel):

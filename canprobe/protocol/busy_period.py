@@ -70,7 +70,7 @@ class Level:
         return count * self.error_cost
 
     def busy(self) -> int:
-        """Length of the busy period. Source: Davis et al., (6), (7)."""
+        """Length of the busy period. Source: Davis et al. 2007."""
         length = 1
         level = (self.own, *self.above)
         while True:
@@ -89,7 +89,7 @@ class Level:
         return found
 
     def _started(self, delay: int, own: int) -> int:
-        """Smallest w at which nothing is before the message, searched upward. Source: Davis et al., (9)."""
+        """Smallest w at which nothing is before the message, searched upward. Source: Davis et al. 2007."""
         while True:
             longer = self.blocking + own + self.lost(delay + self.own.cost) + _demand(self.above, delay + self.bit)
             if longer <= delay:

@@ -1,8 +1,8 @@
 """How late a message can be where nodes send their oldest frame first, as SocketCAN's queue and many controllers do.
 
 A frame then waits for everything that its own node has queued before it, and each of those competes with its own
-identifier: the one of lowest priority holds up all behind it. Messages are independent of each other; offsets between
-them are not used. It stops being a bound where a message's response time exceeds its period: its own last frame could
+identifier: the one of lowest priority holds up all behind it. Messages are independent of each other; an offset counts
+as jitter. It stops being a bound where a message's response time exceeds its period: its own last frame could
 then still be in the queue. Such messages have no response time here, nor have those that they could disturb.
 
 Source: Davis, Kollmann, Pollex, Slomka, "Controller Area Network (CAN) schedulability analysis with FIFO queues",
@@ -12,7 +12,7 @@ ECRTS 2011.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.timing import BusAnalysis, Message, Response, frame_time_ns
@@ -35,7 +35,7 @@ def worst_case_response_fifo(
     """Worst-case response time of every message on a bus on which some nodes have FIFO queues.
 
     Args:
-        messages: everything that is sent on this bus; identifiers are unique, offsets are ignored.
+        messages: everything that is sent on this bus; identifiers are unique.
         fifo_nodes: of every message that goes through a FIFO queue: its name → whose queue; the others' nodes send
             their message of highest priority first.
         bitrate: bit/s.
@@ -48,13 +48,21 @@ def worst_case_response_fifo(
         raise ProtocolError("two messages use the same COB-ID")
     if unknown := set(fifo_nodes) - {message.name for message in ordered}:
         raise ProtocolError(f"no message is called {min(unknown)}")
-    sent = [_Sent(m, m.frame_ns or frame_time_ns(m.n_data, bitrate), _queue(ordered, m, fifo_nodes)) for m in ordered]
+    sent = [
+        _Sent(_from_the_event(m), m.frame_ns or frame_time_ns(m.n_data, bitrate), _queue(ordered, m, fifo_nodes))
+        for m in ordered
+    ]
     found = _settled(sent, -(-_NS // bitrate))
     responses = tuple(
-        Response(one.message, one.frame_ns, total, 0 if total is None else 1)
-        for one, total in zip(sent, found, strict=True)
+        Response(message, one.frame_ns, total, 0 if total is None else 1)
+        for message, one, total in zip(ordered, sent, found, strict=True)
     )
     return BusAnalysis(responses, sum(one.frame_ns / one.message.period_ns for one in sent))
+
+
+def _from_the_event(message: Message) -> Message:
+    """Queued at any time from the event to the latest that its offset and jitter allow."""
+    return replace(message, jitter_ns=message.jitter_ns + (message.offset_ns or 0), offset_ns=None)
 
 
 def _queue(ordered: Sequence[Message], message: Message, fifo_nodes: Mapping[str, object]) -> tuple[int, ...]:

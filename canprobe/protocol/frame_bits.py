@@ -5,7 +5,7 @@ bit follows five equal bits, stuff bits included; in a classical frame up to the
 up to the end of the data field, whose CRC field has stuff bits at fixed places instead.
 
 Source: ISO 11898-1:2015 (frame formats, bit stuffing, CRC field, error frame, interframe space); worst cases as in
-Davis, Burns, Bril, Lukkien 2007, equation (1), and, for FD, Bordoloi and Samii, "The frame packing problem for CAN-FD",
+Davis, Burns, Bril, Lukkien 2007, and, for FD, Bordoloi and Samii, "The frame packing problem for CAN-FD",
 RTSS 2014, whose formula lacks the stuff count that ISO added in 2015 (4 bits and a fixed stuff bit).
 """
 
@@ -91,7 +91,7 @@ def worst_case_bits(n_data: int, *, extended: bool = False) -> int:
     Raises:
         ProtocolError: not 0..8 data bytes.
 
-    Source: Davis et al. 2007, equation (1).
+    Source: Davis et al. 2007 (maximum number of stuff bits).
     """
     stuffed = _stuffed_part(n_data, extended)
     return stuffed + (stuffed - 1) // 4 + _TAIL

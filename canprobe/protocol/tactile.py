@@ -14,6 +14,7 @@ from canprobe.protocol.tactile_wire import (
     TactileMode,
     crc16_ccitt,
     pack_frame,
+    pack_whole,
     pdo_count,
     window_words,
 )
@@ -30,6 +31,7 @@ __all__ = [
     "TactileMode",
     "crc16_ccitt",
     "pack_frame",
+    "pack_whole",
     "pdo_count",
     "window_words",
 ]

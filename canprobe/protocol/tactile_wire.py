@@ -119,13 +119,24 @@ class TactileHeader:
         Raises:
             ProtocolError: a field that does not fit.
         """
+        return self._packed(self.crc)
+
+    def start(self) -> bytes:
+        """The 6 bytes before the CRC, which stand in front of what it is computed over.
+
+        Raises:
+            ProtocolError: a field that does not fit.
+        """
+        return self._packed(0)[:6]
+
+    def _packed(self, crc: int) -> bytes:
         if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
             raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
         size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != WINDOW else 0
         flags = self.mode | (_OVERLOAD if self.overload else 0) | size
-        fields = (self.frame_counter, self.sync_counter, self.peak, flags, self.sample_age_us, self.crc)
+        peak = self.origin_row << 4 | self.origin_col
         try:
-            return _FORM.pack(*fields)
+            return _FORM.pack(self.frame_counter, self.sync_counter, peak, flags, self.sample_age_us, crc)
         except struct.error as error:
             raise ProtocolError(f"tactile header: {error} in {self}") from None
 
@@ -155,13 +166,14 @@ _FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload i
 """What byte 3 can be: mode and taxels along the window."""
 
 
+_LAST_ORIGIN = {TactileMode.FEATURES: SIDE - 1, TactileMode.IMAGE: 0}
+
+
 def _check_origin(header: TactileHeader) -> None:
     if header.window not in WINDOWS:
         raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
-    limit = {TactileMode.FEATURES: SIDE - 1, TactileMode.WINDOW: SIDE - header.window, TactileMode.IMAGE: 0}[
-        header.mode
-    ]
-    if max(header.origin_row, header.origin_col) > limit:
+    limit = SIDE - header.window if header.mode is TactileMode.WINDOW else _LAST_ORIGIN[header.mode]
+    if header.origin_row > limit or header.origin_col > limit:
         origin = (header.origin_row, header.origin_col)
         raise ProtocolError(f"tactile header: {header.mode.name.lower()} cannot begin at taxel {origin}")
 
@@ -237,8 +249,8 @@ def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features)
     return data + bytes(-len(data) % 8)
 
 
-def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
-    """Pack a whole tactile frame into payloads of 8 bytes, in PDO order, with the CRC set.
+def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
+    """Pack a whole tactile frame into one string: its payloads of 8 bytes, in PDO order, with the CRC set.
 
     Args:
         header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
@@ -253,7 +265,12 @@ def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> 
             raise ProtocolError(f"features: peak {content.peak} is not 0..255")
         header = replace(header, origin_row=content.peak >> 4, origin_col=content.peak & 0x0F)
     _check_origin(header)
-    body = _payload_bytes(header, content)
-    start = replace(header, crc=0).pack()[:6]
+    body, start = _payload_bytes(header, content), header.start()
     crc = crc16_ccitt(body, crc16_ccitt(start))
-    return [start + crc.to_bytes(2, "little"), *(body[i : i + 8] for i in range(0, len(body), 8))]
+    return start + crc.to_bytes(2, "little") + body
+
+
+def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
+    """As `pack_whole`, payload by payload."""
+    whole = pack_whole(header, content)
+    return [whole[i : i + 8] for i in range(0, len(whole), 8)]

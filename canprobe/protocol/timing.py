@@ -4,7 +4,7 @@ Holds for a bus whose nodes send their highest-priority message first. Messages 
 of one transaction: released at fixed offsets after an event that they share, such as SYNC. Errors may be allowed for.
 
 Source: Davis, Burns, Bril, Lukkien, "Controller Area Network (CAN) schedulability analysis: refuted, revisited and
-revised", Real-Time Systems 35 (2007): equation numbers are theirs. Offsets: Palencia and González Harbour, RTSS 1998.
+revised", Real-Time Systems 35 (2007). Offsets: Palencia and González Harbour, RTSS 1998.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Errors:
         interval_ns: between further errors; None: there are none.
         overhead_bits: of one error besides the frame that has to be sent again.
 
-    Source: Tindell and Burns 1994; Davis et al. 2007, section 6.
+    Source: Tindell and Burns 1994; Davis et al. 2007.
     """
 
     burst: int = 0

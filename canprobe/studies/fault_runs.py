@@ -24,7 +24,7 @@ from canprobe.session import Session
 from canprobe.studies import fault_cases
 from canprobe.studies.fault_cases import PHASES, FaultCase, Windows
 from canprobe.studies.fault_scenes import seeded_plan
-from canprobe.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest
+from canprobe.studies.fault_scores import Peak, peak_of, score_force, score_log, score_rest, score_summary
 from canprobe.studies.fault_witness import HangError, Silent, Witness
 
 AFTER_S = 0.3
@@ -152,7 +152,7 @@ class _Run:
         clock = session.lockstep.clock
         end_ns = clock.now_ns()
         session.lockstep.recorder = None  # the log is closed
-        self.failures += score_log(session, self.steps)
+        self.failures += score_log(session, self.steps) + score_summary(session, self.task, reason)
         moved = self._rest(clock, end_ns) if outcome != "hang" else 0.0
         force_max, above_ns, failures = score_force(self.witness.rows, self.limits, bound_n)
         self.failures += failures

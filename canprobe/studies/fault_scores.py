@@ -1,7 +1,11 @@
 """What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
 
-The peak of the force. Two criteria hold at once: the force may not stay above the limit for longer than reaction and
-retreat take, and it may never exceed what a probe can reach that nobody controls for the time until the cell reacts.
+The force is judged where the cell presses, as it truly is in the plant and against the limit of the run's own scene
+(`limits.force_max_n`, 3 N here, 5 N by default). Two criteria hold at once, whatever the fault: it may not stay above
+the limit for longer than the reaction to a measured force and the way back take (`force` in the table of conditions,
+and `RELEASE_NS`); and it may never exceed what a probe can reach that nobody controls until the cell reacts.
+
+The peak of the force.
 Between a fault and the reaction the probe is driven on in one of two ways:
 
 - blind: without tactile frames the approach goes on, at `approach_speed`, until `sensor_stale` lets the probe retreat;
@@ -22,6 +26,7 @@ Source: Hunt and Crossley 1975 for the damping; `canprobe.touch.contact.indentat
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -38,6 +43,7 @@ from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.emulator.node import SlaveNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
+from canprobe.results import summarise
 from canprobe.robot.kinematics import forward_jacobian
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene import ServoSettings
@@ -163,6 +169,17 @@ def score_rest(moved_rad: float, nodes: Sequence[SlaveNode]) -> list[str]:
         if (state := state_of(node.dictionary.number(0x6041))) in POWERED_STATES:
             failures.append(f"{node.name} is {state.name} after the stop")
     return failures
+
+
+def score_summary(session: Session, task: object, reason: str) -> list[str]:
+    """What came of the run can be summed up and written down, whatever happened in it."""
+    if not session.started:
+        return []
+    try:
+        json.dumps(summarise(session, task, {}, reason or None), allow_nan=False)
+    except Exception as error:  # whatever it is, a user would have lost the run's summary by it
+        return [f"summary: {type(error).__name__}: {error}"]
+    return []
 
 
 def score_log(session: Session, steps: int) -> list[str]:

@@ -73,27 +73,35 @@ def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     phases = Counter(one["phase"] for one in runs)
+    pressing = pressing_runs(runs)
     outcomes = Counter(one["outcome"] for one in runs)
     return {
         "fault": name,
         "runs": len(runs),
         **{phase: phases[phase] for phase in PHASES},
         **{outcome: outcomes[outcome] for outcome in OUTCOMES},
-        "force_max_n": max((one["force_max_n"] for one in runs), default=0.0),
-        "above_ms": max((one["above_ms"] for one in runs), default=0.0),
+        "force_max_n": max((one["force_max_n"] for one in pressing), default=0.0),
+        "above_ms": max((one["above_ms"] for one in pressing), default=0.0),
         "failures": sum(bool(one["failures"]) for one in runs),
     }
+
+
+def pressing_runs(runs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Those in which the cell presses, and its force is judged: in `listen` it is somebody else's."""
+    return [one for one in runs if one["force_bound_n"] is not None]
 
 
 def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """What the campaign says, and every failure with the command that shows it again."""
     failed = [one for one in runs if one["failures"]]
     hit = sum(one["hits"] > 0 for one in runs)
-    above = sum(one["above_ms"] > 0 for one in runs)
+    pressing = pressing_runs(runs)
+    above = [one["above_ms"] for one in pressing if one["above_ms"] > 0]
     lines = [
         f"{len(runs)} runs, {hit} of them with at least one frame or node hit; {len(failed)} failed.",
-        f"True force above the limit of {FORCE_MAX_N:g} N in {above} runs,"
-        f" highest {max(one['force_max_n'] for one in runs):.2f} N.",
+        f"The cell presses in {len(pressing)} runs: true force above the scene's limit of {FORCE_MAX_N:g} N in"
+        f" {len(above)}, for {max(above, default=0):.0f} ms at most, highest"
+        f" {max((one['force_max_n'] for one in pressing), default=0.0):.2f} N.",
     ]
     lines += [
         f"seed {one['seed']}: {'; '.join(one['failures'])} (canprobe study faults --seed {one['seed']})"

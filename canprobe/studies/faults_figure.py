@@ -35,10 +35,10 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
     left.invert_yaxis()
     left.set(xlabel="share of the runs with this fault", xlim=(0, 1))
     left.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2, frameon=False)
-    forces = [one["force_max_n"] for one in runs]
+    forces = [one["force_max_n"] for one in runs if one["force_bound_n"] is not None]
     right.hist(forces, bins=60, color="#4a7ebb")
     right.axvline(FORCE_MAX_N, color="#c03030", label=f"limit {FORCE_MAX_N:g} N")
-    right.set(xlabel="highest true force of a run, N", ylabel="runs", yscale="log")
+    right.set(xlabel="highest true force of a run that presses, N", ylabel="runs", yscale="log")
     failed = sum(bool(one["failures"]) for one in runs)
     right.set_title(f"{len(runs)} runs, {failed} failed")
     right.legend(frameon=False)

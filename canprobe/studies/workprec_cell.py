@@ -146,7 +146,7 @@ def refusal(setting: Setting) -> str | None:
     try:
         make_plan(scene_of(setting))
     except PlanError as error:
-        return str(error).splitlines()[0].partition("; ways out")[0]
+        return str(error).splitlines()[0]
     return None
 
 

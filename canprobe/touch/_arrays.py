@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev
+from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev, dtrtri
 
 from canprobe.errors import UsageError
 
@@ -45,6 +45,19 @@ def inverted(A: Array) -> Array:
         numpy.linalg.LinAlgError: where A is singular.
     """
     return solved(A, np.eye(len(A)))
+
+
+def inverted_upper(R: Array) -> Array:
+    """R⁻¹ of an upper triangular R.
+
+    Raises:
+        numpy.linalg.LinAlgError: where R is singular.
+    """
+    result, info = dtrtri(R)
+    if info > 0:
+        raise np.linalg.LinAlgError("singular matrix")
+    found: Array = result
+    return found
 
 
 def eigen(A: Array) -> tuple[Array, Array]:

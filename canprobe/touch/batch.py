@@ -12,7 +12,7 @@ from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, solved
 from canprobe.touch.anchor import anchor, solution
 from canprobe.touch.estimate import SurfaceEstimate, build_estimate
-from canprobe.touch.evidence import evidence_of
+from canprobe.touch.evidence import curvature_covariance, evidence_of
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.misfit import CERTAIN, correct, misfit_notes
 from canprobe.touch.noise import Correlation, Noise
@@ -106,7 +106,7 @@ def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> S
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
     result = fit(d, stated.rows(length), touches.whitener())
-    singular = np.linalg.svd(result.root, compute_uv=False)
+    problem_root = result.root
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
     if result.decision.rank == 3 and not quadric:
         corrected = correct(result.c, result.root, d, touches.whitener())
@@ -121,20 +121,21 @@ def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> S
     a = anchor(result.c, T, np.zeros(3), length)
     free = anchor(result.free, T, np.zeros(3), length)
     spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
+    deviation = solved(result.free_root.T, free.M.T).T
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
         solution(a, result.root, result.decision, has_prior),
         length=length,
         T_frame_contact=a.T_frame_contact,
-        condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf,
+        problem_root=problem_root,
         innovation=result.innovation,
         distance=touches.distance,
         samples=float(len(touches.points)),
         method="ml",
         prior=stated.name,
         notes=notes,
-        evidence=evidence_of(free.c, solved(result.free_root.T, free.M.T).T, spread, length),
+        evidence=evidence_of(free.c, curvature_covariance(free.c, deviation), spread, length),
     )
 
 

@@ -25,6 +25,7 @@ def cramer_rao(
     sigma_normal: ArrayLike,
     prior: Prior | None = None,
     correlation: Correlation | None = None,
+    coupling: float = 0.0,
 ) -> Array:
     """Least covariance that an unbiased estimate of local curvature can have.
 
@@ -38,6 +39,7 @@ def cramer_rao(
         sigma_point, sigma_normal: noise as for `fit_surface`.
         prior: the same prior as the estimator's; None for the same default.
         correlation: of the noise along the path; None for independent samples.
+        coupling: of the errors of point and normal, as for `fit_surface`.
 
     Returns:
         (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,
@@ -49,7 +51,7 @@ def cramer_rao(
     Source: Kay, "Fundamentals of statistical signal processing: estimation theory", ch. 3.
     """
     p, n = checked_arrays(points, normals, 1)
-    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal), correlation)
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
     surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(np.asarray(S, dtype=np.float64))
     origin = surface.project(p[-1])
     T = surface.contact_frame(origin)

@@ -106,8 +106,11 @@ def contact_on_object(T_base_probe: Array, direction: Array, radius: float, dept
     Returns:
         `p = centre + (R_p - δ) n_f` and `n_o = -n_f`, (3,) each.
     """
-    n_f = T_base_probe[:3, :3] @ direction
-    return T_base_probe[:3, 3] + (radius - depth) * n_f, -n_f
+    u, v, w = direction.tolist()
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = T_base_probe.tolist()
+    nx, ny, nz = a * u + b * v + c * w, d * u + e * v + f * w, g * u + h * v + i * w
+    reach = radius - depth
+    return np.array([x + reach * nx, y + reach * ny, z + reach * nz]), np.array([-nx, -ny, -nz])
 
 
 def contact_sample(

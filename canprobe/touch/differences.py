@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.touch._arrays import Array
+from canprobe.touch._arrays import Array, upper_root
 from canprobe.touch.batch import Touches, working_frame
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.rank import decide
@@ -101,12 +101,11 @@ def estimate_from(touches: Touches, data: Pairs, inverse: Array, method: str) ->
     k = variance * _propagated(data, inverse)[np.ix_([0, 1, 3], [0, 1, 3])]  # of 2 c11, 2 c12, 2 c22: of K itself
     flat = data.points[:, :2]
     decision = decide(_root_of(k * _K_TO_Q), flat.T @ flat / (len(flat) * 2.0 * vp), size)
-    singular = np.linalg.svd(A, compute_uv=False)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),
         length=length,
         T_frame_contact=working_frame(touches),
-        condition_number=float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf,
+        problem_root=upper_root(A),
         innovation=float(residual @ residual) / max(len(residual) - 6, 1) / (2.0 * variance),
         distance=touches.distance,
         samples=float(len(touches.points)),

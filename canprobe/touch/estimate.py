@@ -48,14 +48,14 @@ class SurfaceEstimate:
         combinations: (rank, 3) rows: the observed ones as weights of (K11, √2 K12, K22).
         information: (3, 3) information of the data about (K11, √2 K12, K22), m²; finite also where nothing is observed.
         umbilic: κ1 and κ2 cannot be told apart at 95 %: the directions mean nothing.
-        condition_number: of the whitened dimensionless least-squares problem.
         innovation: mean squared whitened residual per degree of freedom; about 1 when the model and the σ's are right.
         distance: path that the estimate rests on, m.
         samples: number of samples it rests on (effective, with forgetting).
         method: name of the estimator.
         prior: name of what was assumed.
         notes: what a reader should know.
-        model_root: (9, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
+        problem_root: root of the information (`rootᵀ root`) of the whitened dimensionless least-squares problem.
+        model_root: (n, 9) root of the information (`rootᵀ root`, prior included) about the entries of `S` in the
             contact frame, in the order c14, c24, c44, c13, c23, c33, c11, c12, c22; SI units. It holds also what is
             known of place and normal. None from the methods of differences, which do not know it.
         evidence: what the data (and a prior on curvature) say about K before the rank decision, to be fused with
@@ -73,12 +73,12 @@ class SurfaceEstimate:
     combinations: Array
     information: Array
     umbilic: bool
-    condition_number: float
     innovation: float
     distance: float
     samples: float
     method: str
     prior: str
+    problem_root: Array
     notes: tuple[str, ...] = ()
     model_root: Array | None = None
     evidence: CurvatureInformation | None = None
@@ -88,6 +88,12 @@ class SurfaceEstimate:
             getattr(self, name).flags.writeable = False
         if self.model_root is not None:
             self.model_root.flags.writeable = False
+
+    @property
+    def condition_number(self) -> float:
+        """Of the whitened dimensionless least-squares problem; infinite where it is singular."""
+        singular = np.linalg.svd(self.problem_root, compute_uv=False)
+        return float(singular[0] / singular[-1]) if singular[-1] > 0.0 else math.inf
 
     @property
     def T_base_contact(self) -> Array:
@@ -157,7 +163,7 @@ def build_estimate(
     *,
     length: float,
     T_frame_contact: Array,
-    condition_number: float,
+    problem_root: Array,
     innovation: float,
     distance: float,
     samples: float,
@@ -193,7 +199,7 @@ def build_estimate(
         combinations=V[:, decision.passed].T.copy(),
         information=(V * decision.information) @ V.T * length**2,
         umbilic=umbilic,
-        condition_number=condition_number,
+        problem_root=problem_root,
         innovation=innovation,
         distance=distance,
         samples=samples,
@@ -212,7 +218,7 @@ def _units(length: float) -> Array:
 
 def _principal(K: Array) -> tuple[Array, Array]:
     """κ1 ≥ κ2 and their directions as rows (2, 2)."""
-    a, b, d = float(K[0, 0]), float(K[0, 1]), float(K[1, 1])
+    (a, b), (_, d) = K.tolist()
     mean, half = 0.5 * (a + d), 0.5 * (a - d)
     radius = math.hypot(half, b)
     angle = 0.5 * math.atan2(b, half)
@@ -222,12 +228,12 @@ def _principal(K: Array) -> tuple[Array, Array]:
 
 def _is_umbilic(K: Array, covariance: Array) -> bool:
     """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
-    pick = np.array([[1.0, 0.0, -1.0], [0.0, 2.0, 0.0]])
-    x, y = float(K[0, 0] - K[1, 1]), 2.0 * float(K[0, 1])
-    C = pick @ covariance @ pick.T
-    a, b, d = float(C[0, 0]), float(C[0, 1]), float(C[1, 1])
+    (k11, k12), (_, k22) = K.tolist()
+    (c11, c12, c13), (_, c22, c23), (_, _, c33) = covariance.tolist()
+    x, y = k11 - k22, 2.0 * k12
+    a, b, d = c11 - 2.0 * c13 + c33, 2.0 * (c12 - c23), 4.0 * c22
     determinant = a * d - b * b
-    return determinant > 0.0 and (d * x * x - 2.0 * b * x * y + a * y * y) < _UMBILIC_CHI2 * determinant
+    return bool(determinant > 0.0 and (d * x * x - 2.0 * b * x * y + a * y * y) < _UMBILIC_CHI2 * determinant)
 
 
 def _partly(

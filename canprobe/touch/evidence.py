@@ -13,6 +13,9 @@ from canprobe.touch.rank import spread_share
 
 TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 """K11, K12, K22 to q."""
+_TO_Q2 = np.outer(TO_Q, TO_Q)
+REFUTED = 11.34
+"""χ² of 3 from which a surface is no plane: its 99 % point."""
 
 
 class CurvatureInformation(NamedTuple):
@@ -27,17 +30,17 @@ class CurvatureInformation(NamedTuple):
     information: Array
 
 
-def evidence_of(c: Array, deviation: Array, spread: Array | None, length: float) -> CurvatureInformation:
+def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
     """The evidence of a solution with all its parameters free.
 
     Args:
         c: (9,) parameters in the contact frame, in units of `length`.
-        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
         spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
             not spread for is weighed down (`rank.spread_share`). None where that has been seen to.
         length: m.
     """
-    information = inverted(np.outer(TO_Q, TO_Q) * curvature_covariance(c, deviation))
+    information = inverted(_TO_Q2 * covariance)
     if spread is not None:
         share = spread_share(spread)
         information = share @ information @ share
@@ -52,19 +55,20 @@ def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
 def curvature_covariance(c: Array, deviation: Array) -> Array:
     """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
 
-    What c13, c23, c33 put K off by is proportional to K. Where the K found is mostly its own noise so is that part: its
-    square is too large by the noise's, which on a plane is all of it. It counts by the share of |K|² that is not noise,
-    1 − 3/χ², χ² that of K = 0 with c13, c23, c33 known.
+    What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is
+    largest where the noise is: a region round a plane would grow with its own error and hold K = 0 always. So it
+    counts only where K = 0 is refuted, by 1 − (q/χ²)², χ² that of K = 0 with c13, c23, c33 known, q its 99 % point.
 
     Args:
         c: (9,) parameters in the contact frame.
         deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
 
-    Source: James and Stein, "Estimation with quadratic loss", 1961 (positive part).
+    Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
     """
     D, others = curvature_jacobian(c) @ deviation, deviation[3:6]
     cross = D @ others.T
     by_others = cross @ solved(others @ others.T, cross.T)
     own = D @ D.T - by_others
     chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
-    return np.asarray(own + max(0.0, 1.0 - 3.0 / max(chi2, 3.0)) * by_others, dtype=np.float64)
+    refuted = 1.0 - (REFUTED / max(chi2, REFUTED)) ** 2
+    return np.asarray(own + refuted * by_others, dtype=np.float64)

@@ -30,6 +30,7 @@ def fit_surface(
     prior: Prior | None = None,
     lag: int = 10,
     correlation: Correlation | None = None,
+    coupling: float = 0.0,
     quadric: bool = False,
 ) -> SurfaceEstimate:
     """Local shape at the last of a series of contact points.
@@ -48,6 +49,8 @@ def fit_surface(
         lag: for "chen1996".
         correlation: of the noise along the path, for "ml", which weighs the samples by it, and "recursive", whose
             covariance grows by it; None for independent samples.
+        coupling: for "ml" and "recursive": 1/R_p where point and normal come from one centroid on a spherical probe, so
+            that their errors are one (`Noise`); 0 for independent ones.
         quadric: for "ml" and "recursive": the surface is known to be one. Otherwise its cubic and quartic terms are
             corrected for where they show and allowed for in the covariance where they could hide (`misfit`).
 
@@ -68,7 +71,7 @@ def fit_surface(
         [20.0, 20.0]
     """
     p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
-    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal), correlation)
+    touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
     if method == "ml":
         return fit_ml(touches, prior, quadric=quadric)
     if method == "recursive":
@@ -94,6 +97,7 @@ def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> Surface
         window=len(point),
         prior=prior,
         correlation=touches.correlation,
+        coupling=touches.noise.coupling,
         quadric=quadric,
     )
     for sample in _samples(touches, point, normal):

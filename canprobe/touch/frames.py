@@ -50,12 +50,15 @@ def transported_rotation(R: Array, z_axis: Array) -> Array:
     Returns:
         (3, 3).
     """
-    x = R[:, 0] - z_axis * float(R[:, 0] @ z_axis)
-    size = math.sqrt(float(x @ x))
+    x, y, z = R[:, 0].tolist()
+    u, v, w = z_axis.tolist()
+    along = x * u + y * v + z * w
+    x, y, z = x - along * u, y - along * v, z - along * w
+    size = math.sqrt(x * x + y * y + z * z)
     if size < 1e-6:
         return tangent_rotation(z_axis)
-    x = x / size
-    return np.column_stack([x, cross(z_axis, x), z_axis])
+    x, y, z = x / size, y / size, z / size
+    return np.array([[x, v * z - w * y, u], [y, w * x - u * z, v], [z, u * y - v * x, w]])
 
 
 def homogeneous(R: Array, origin: Array) -> Array:

@@ -141,6 +141,7 @@ def _covariance(estimate: SurfaceEstimate) -> Array:
         root = np.concatenate([root, np.zeros((3, 9))])
         root[:-3, 6:] = root[:-3, 6:] @ (_Q_TO_C * (V @ V.T) / _Q_TO_C.T)
         root[-3:, 6:] = open_ / UNIT / WIDE
+    if len(root) > 9:
         root = np.linalg.qr(root, mode="r")
     inverse = np.linalg.inv(root)
     result: Array = inverse @ inverse.T / np.outer(units, units)

@@ -27,7 +27,7 @@ from canprobe.touch.nonlinear import robust
 from canprobe.touch.quadric import UNIT, Design, Linearised, gradient_rows, linearise, value_rows
 from canprobe.touch.terms import DEGREE, terms
 
-NONE, USUAL, TAIL = 0.75, 0.22, 0.03
+NONE, USUAL, TAIL = 0.85, 0.12, 0.03
 """Prior weights of: no misfit; a usual one; one that is only believed when seen."""
 CHANGES = (0.05, 0.15, 0.5)
 """A usual change of curvature along a surface: dK/ds over ‖K‖²."""
@@ -39,8 +39,13 @@ TRUST = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""
 CERTAIN = 0.99
 """Probability of a misfit from which an estimate mentions it."""
+_PER_SQUARE = UNIT**-2.0
+_CUBIC = DEGREE == 3
 _NEVER_LESS = 0.1
 """‖K‖ · length at which the ratio of quartic to cubic terms stops falling."""
+_USUAL = np.concatenate([[0.0], np.square(CHANGES) / 36.0])
+_VARIANCES = np.concatenate([_USUAL, EVIDENCE])
+"""No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
 _PRIOR = np.concatenate(
     [[NONE], np.full(len(CHANGES), USUAL / len(CHANGES)), np.full(len(EVIDENCE), TAIL / len(EVIDENCE))]
 )
@@ -81,7 +86,7 @@ class Averaged(NamedTuple):
 
 def scales(curvature: float) -> Array:
     """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
-    return np.where(DEGREE == 3, 1.0, 0.25 * max(curvature, _NEVER_LESS))
+    return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _NEVER_LESS))
 
 
 def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
@@ -93,18 +98,21 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
         carried: (9, 9) what a unit of each puts the parameters off by, with the sign turned.
         curvature: ‖K‖ · length.
     """
-    usual = np.square(np.array(CHANGES) * curvature**2 / 6.0)
-    variance = np.concatenate([[0.0], usual, EVIDENCE / max(float(m.max()), 1e-300)])[:, None]
-    share = variance / (1.0 + variance * m)
-    weight = _PRIOR * _relative(0.5 * (s * s * share - np.log1p(variance * m)).sum(axis=1))
+    variance = _VARIANCES.copy()
+    variance[: len(_USUAL)] *= curvature**4
+    variance[len(_USUAL) :] /= max(float(m.max()), 1e-300)
+    wider = 1.0 + variance[:, None] * m
+    share = variance[:, None] / wider
+    likelihood = 0.5 * (share @ (s * s) - np.log(wider).sum(axis=1))
+    weight = _PRIOR * np.exp(likelihood - likelihood.max())
     weight /= weight.sum()
     shifts = -(share * s) @ carried.T
     mean = weight @ shifts
     apart = shifts - mean
     left = weight @ share
     spread = (carried * left) @ carried.T + (apart.T * weight) @ apart
-    changed = float(weight @ np.square(shifts[:, 6:] / UNIT).sum(axis=1))
-    spread[6:, 6:] += np.diag(UNIT**2) * (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed
+    changed = float(weight @ np.square(shifts[:, 6:]) @ _PER_SQUARE)
+    spread.flat[60::10] += (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed / _PER_SQUARE  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
     return Averaged(mean, spread, left, 1.0 - float(weight[0]), trusted)
 
@@ -135,11 +143,6 @@ def term_rows(at: Linearised, d: Design) -> Array:
     """Whitened rows (n, 3, 9) of the terms at the likely places of samples."""
     found = terms(at.X[:, 0], at.X[:, 1])
     return at.jacobian(found[:, 0], at.V[:, :, :2] @ found[:, 1:], d)
-
-
-def _relative(log_likelihood: Array) -> Array:
-    result: Array = np.exp(log_likelihood - log_likelihood.max())
-    return result
 
 
 def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array, Array, Array]:

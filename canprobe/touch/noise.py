@@ -66,10 +66,14 @@ class Noise:
     Attributes:
         point: (n,) standard deviation per axis, m, or (n, 3, 3) covariances, m².
         normal: (n,) standard deviation per tangent axis, rad, or (n, 3, 3) covariances.
+        coupling: 1/m; an error e of a point along the surface comes with one of `−coupling · e` of its outward normal.
+            0 for independent errors; 1/R_p where both come from one centroid on a probe of that radius, which is felt
+            as a turn of `(K + coupling) e` against the surface.
     """
 
     point: Array
     normal: Array
+    coupling: float = 0.0
 
     @property
     def isotropic(self) -> bool:
@@ -90,25 +94,26 @@ class Noise:
         """The same noise in units of a length and in the frame whose axes are the columns of R (3, 3)."""
         point = self.point / length if self.point.ndim == 1 else R.T @ self.point @ R / length**2
         normal = self.normal if self.normal.ndim == 1 else R.T @ self.normal @ R
-        return Noise(point, normal)
+        return Noise(point, normal, self.coupling * length)
 
     def covariances(self) -> tuple[Array, Array]:
         """Both as (n, 3, 3)."""
         return _as_covariance(self.point), _as_covariance(self.normal)
 
 
-def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike) -> Noise:
+def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling: float = 0.0) -> Noise:
     """Checked noise of n samples.
 
     Args:
         n: samples.
         sigma_point: m; a number, (n,), or covariances (3, 3) or (n, 3, 3) in m².
         sigma_normal: rad; in the same forms.
+        coupling: 1/m, see `Noise`.
 
     Raises:
         UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
     """
-    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal))
+    return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), coupling)
 
 
 def _one(n: int, name: str, value: ArrayLike) -> Array:

@@ -172,9 +172,9 @@ def compute_patch(
     taxels, dead = mended(taxels)
     pressure = calibration.pascals[taxels]
     n_active = int(np.count_nonzero(pressure))
-    peak = int(taxels.max())
-    peak_pa = float(calibration.pascals[peak])
-    at_pad, at_window = _edges(pressure, window)
+    counts = taxels.tobytes()
+    peak = max(counts)
+    peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
     if window is not None and at_window > WORTH_COMPLETING * peak_pa:
         pressure = completed(pressure, window, calibration.weights, float(calibration.pascals[calibration.counts_max]))
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
@@ -225,16 +225,16 @@ def _patch(
     )
 
 
-def _edges(pressure: Array, window: Sequence[int] | None) -> tuple[float, float]:
-    """Highest pressure at the pad's edge, and at an edge of the window inside the pad, Pa."""
-    rows, cols = np.maximum.reduce(pressure, axis=1).tolist(), np.maximum.reduce(pressure, axis=0).tolist()
-    at_pad: float = max(rows[0], rows[-1], cols[0], cols[-1])
+def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
+    """Highest count at the pad's edge, and at an edge of the window inside the pad."""
+    at_pad = max(counts[:SIDE] + counts[-SIDE:] + counts[::SIDE] + counts[SIDE - 1 :: SIDE])
     if window is None:
-        return at_pad, 0.0
+        return at_pad, 0
     r0, c0, n_rows, n_cols = window
-    r1, c1 = r0 + n_rows - 1, c0 + n_cols - 1
-    inner = [rows[r] for r in (r0, r1) if 0 < r < SIDE - 1] + [cols[c] for c in (c0, c1) if 0 < c < SIDE - 1]
-    return at_pad, max(inner, default=0.0)
+    rows = [r for r in (r0, r0 + n_rows - 1) if 0 < r < SIDE - 1]
+    cols = [c for c in (c0, c0 + n_cols - 1) if 0 < c < SIDE - 1]
+    inside = [counts[SIDE * r : SIDE * (r + 1)] for r in rows] + [counts[c::SIDE] for c in cols]
+    return at_pad, max(b"".join(inside), default=0)
 
 
 def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -> Patch:

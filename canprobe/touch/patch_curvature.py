@@ -9,6 +9,9 @@ covariance, so the patch fades where a path excites all of K and speaks where it
 do: outside the calibrated range it counts less and less, and so it does the further it is from what the motion
 knows, by the weight of an outlier.
 
+Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
+tells: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
+
 The layer's model is stated in `patch_moments`.
 """
 
@@ -31,8 +34,14 @@ from canprobe.touch.rank import turned
 
 LEAST_FRAMES = 8
 """Fewer frames make no estimate."""
-MOST_FRAMES = 64
-"""Frames that the running mean reaches back: 0.3 s at 200 Hz, 8 mm at 25 mm/s."""
+MOST_FRAMES = 32
+"""Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
+FEW_FRAMES = 8
+"""The same of the shorter mean."""
+FINE = 0.05
+"""`GROSS` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
+YOUNGER = 4.0
+"""Frames by which the shorter mean must be the younger one to tell a drift."""
 GROSS = 0.2
 """Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
 MOST_ROUNDS = 6
@@ -54,6 +63,44 @@ class Fused(NamedTuple):
     q: Array
     patch: Array
     weight: float
+
+
+class _Seen(NamedTuple):
+    """Moments in their principal axes, and how far they are off by what changed along the path."""
+
+    moments: Moments
+    drift: Moments
+
+
+class _Mean:
+    """Running mean of moments over so many frames at most, and how old it is; `gross`: as `GROSS`."""
+
+    def __init__(self, most: int, gross: float) -> None:
+        self.moments: Moments = (0.0, 0.0, 0.0)
+        self.age = 0.0
+        self._most, self._gross = most, gross
+        self._frames = 0
+
+    def add(self, xx: float, xy: float, yy: float) -> float:
+        """Take the moments of a frame; its share in the mean, small where it is far from it."""
+        self._frames = min(self._frames + 1, self._most)
+        share = 1.0 / self._frames
+        mxx, mxy, myy = self.moments
+        dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
+        if self._frames >= LEAST_FRAMES:
+            share *= min(1.0, self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
+        self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
+        self.age = (1.0 - share) * (self.age + 1.0)
+        return share
+
+    def drift_from(self, younger: _Mean) -> Moments:
+        """How far this is off by what changed since, if it went on as a younger mean says."""
+        apart = self.age - younger.age
+        if apart < YOUNGER:
+            return 0.0, 0.0, 0.0
+        times = self.age / apart
+        xx, xy, yy = (times * (now - then) for now, then in zip(younger.moments, self.moments, strict=True))
+        return xx, xy, yy
 
 
 class PatchCurvature:
@@ -79,7 +126,7 @@ class PatchCurvature:
         self._memory = PadMemory()
         self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
         self._last: tuple[float, float, float] | None = None
-        self._xx = self._xy = self._yy = 0.0
+        self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""
@@ -92,16 +139,11 @@ class PatchCurvature:
             return
         self._carry(*(-sample.n_base).tolist())
         self.frames = min(self.frames + 1, MOST_FRAMES)
-        share = 1.0 / self.frames
         (uu, uv, vv), memory = sample.moments, self.model.fit.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
-        dxx, dxy, dyy = xx - self._xx, xy - self._xy, yy - self._yy
-        if self.frames > LEAST_FRAMES:
-            share *= min(1.0, GROSS * (self._xx + self._yy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
-        self._xx += share * dxx
-        self._xy += share * dxy
-        self._yy += share * dyy
+        self._recent.add(xx, xy, yy)
+        share = self._mean.add(xx, xy, yy)
         self.force += share * (sample.force_n - self.force)
 
     def _carry(self, zx: float, zy: float, zz: float) -> None:
@@ -146,21 +188,22 @@ class PatchCurvature:
         if self.frames < LEAST_FRAMES:
             return None
         c, s = self._in_axes(T_base_contact[:3, 0].tolist())
-        xx, xy, yy = _turned(self._xx, self._xy, self._yy, c, -s)
+        xx, xy, yy = _turned(*self._mean.moments, c, -s)
         angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
-        found = self._solve((mean + half, 0.0, mean - half), known)
+        found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
         return None if found is None else Fused(turn.T @ found.q, turn.T @ found.patch @ turn, found.weight)
 
-    def _solve(self, v: Moments, motion: CurvatureInformation) -> Fused | None:
+    def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
         """From the last answer, and where that fails from the ideal layer; again where patch and motion disagree."""
         last, self._last = self._last, None
-        found = None if last is None else self._iterated(last, v, motion, 1.0)
-        if found is None and (start := self.model.start(v, self.force)) is not None:
-            found = self._iterated(start, v, motion, 1.0)
+        found = None if last is None else self._iterated(last, seen, motion, 1.0)
+        if found is None and (start := self.model.start(seen.moments, self.force)) is not None:
+            found = self._iterated(start, seen, motion, 1.0)
         if found is None:
             return None
         k, patch, cost = found
@@ -168,27 +211,30 @@ class PatchCurvature:
         ratio = CHI2_999 / max(cost, CHI2_999)
         weight = ratio * ratio
         if weight < 1.0:
-            found = self._iterated(k, v, motion, weight)
+            found = self._iterated(k, seen, motion, weight)
             if found is None:
                 return None
             k, patch, _ = found
         return Fused(TO_Q * k, patch, weight)
 
     def _iterated(
-        self, k: Moments, v: Moments, motion: CurvatureInformation, weight: float
+        self, k: Moments, seen: _Seen, motion: CurvatureInformation, weight: float
     ) -> tuple[Moments, Array, float] | None:
         """Gauss–Newton from K: K, the patch's information and the cost; None where it does not settle."""
         step = math.inf
         try:
             for _ in range(MOST_ROUNDS):
-                J, r, W = self.model.linearised(v, self.force, self.frames, k)
+                J, r, W = self.model.linearised(seen.moments, self.force, self.frames, k)
+                W = _less_certain(W, seen)
                 W *= weight * self.model.trust(k, self.force)
-                off = motion.q - TO_Q * k
-                patch = J.T @ W @ J
-                way = solved(patch + motion.information, J.T @ W @ r + motion.information @ off)
-                cost = float(r @ W @ r + off @ motion.information @ off)
-                k = _entries(TO_Q * k + way)
-                step = float(np.abs(way).max())
+                JW, q = J.T @ W, TO_Q * k
+                patch = JW @ J
+                off = motion.q - q
+                pull = motion.information @ off
+                way = solved(patch + motion.information, JW @ r + pull)
+                cost = float(r @ W @ r + off @ pull)
+                k = _entries(q + way)
+                step = max(map(abs, way.tolist()))
                 if step < SETTLED / self.model.radius:
                     break
         except (ValueError, np.linalg.LinAlgError):
@@ -196,6 +242,16 @@ class PatchCurvature:
         if step > UNSETTLED / self.model.radius or not patch.any():
             return None
         return k, patch, cost
+
+
+def _less_certain(W: Array, seen: _Seen) -> Array:
+    """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
+    (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
+    relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
+    b = W @ relative
+    size = float(b @ relative)
+    result: Array = W - np.outer(b, b) / (1.0 + size)
+    return result
 
 
 def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:

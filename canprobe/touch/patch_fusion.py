@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, eigen, solved, upper_root
+from canprobe.touch._arrays import Array, eigen, inverted
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.evidence import TO_Q
@@ -19,6 +19,7 @@ NAMED = 0.1
 """Share of the information about K that the patch gives from which on the estimate's method names it."""
 DOUBTED = 0.5
 """Weight of the patch below which the estimate says that it contradicts the motion."""
+_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
 def fuse(motion: SurfaceEstimate, patch: PatchCurvature, length: float) -> SurfaceEstimate:
@@ -42,12 +43,13 @@ def fuse(motion: SurfaceEstimate, patch: PatchCurvature, length: float) -> Surfa
     decision = _decide(data + found.patch, found.q, length)
     root = None if motion.model_root is None else _joined(motion.model_root, found.patch)
     total = motion.evidence.information + found.patch
-    share = float(np.trace(solved(total, found.patch))) / 3.0
+    inverse = inverted(total)
+    share = float((inverse * found.patch).sum()) / 3.0
     return build_estimate(
-        _solution(motion.S, found.q, total, decision, has_prior=has_prior, root=root),
+        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
         length=1.0,
         T_frame_contact=motion.T_frame_contact,
-        condition_number=motion.condition_number,
+        problem_root=motion.problem_root,
         innovation=motion.innovation,
         distance=motion.distance,
         samples=motion.samples,
@@ -72,10 +74,10 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
     plane = np.zeros((4, 4))
     plane[2, 3] = plane[3, 2] = -0.5
     return build_estimate(
-        _solution(plane, found.q, found.patch, _decide(found.patch, found.q, length)),
+        _solution(plane, found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
         length=1.0,
         T_frame_contact=T,
-        condition_number=math.sqrt(float(np.linalg.cond(found.patch))),
+        problem_root=_root(found.patch),
         innovation=1.0,
         distance=0.0,
         samples=float(patch.frames),
@@ -90,11 +92,17 @@ def _notes(found: Fused, share: float) -> tuple[str, ...]:
 
 
 def _joined(model_root: Array, patch: Array) -> Array:
-    """(9, 9) root of the information about the entries of S with the patch's part about K."""
+    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
     rows = np.zeros((3, 9))
-    values, vectors = eigen(patch)
-    rows[:, 6:] = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T / UNIT
-    return upper_root(np.concatenate([model_root, rows]))
+    rows[:, 6:] = _root(patch) / UNIT
+    return np.concatenate([model_root, rows])
+
+
+def _root(information: Array) -> Array:
+    """(3, 3) root of the patch's information, which may be singular."""
+    values, vectors = eigen(information)
+    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return result
 
 
 def _decide(information: Array, q: Array, length: float) -> Decision:
@@ -105,11 +113,13 @@ def _decide(information: Array, q: Array, length: float) -> Decision:
 
 
 def _solution(
-    S: Array, q: Array, information: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
 ) -> Solution:
+    """From q and its covariance (3, 3)."""
     c = parameters_of(S)
+    if has_prior or decision.rank == 3:
+        c[6:] = UNIT * q
+        return Solution(c, covariance * _TO_K, decision, has_prior, root)
     V = decision.vectors[:, decision.passed]
-    c[6:] = UNIT * (q if has_prior else V @ (V.T @ q))
-    if decision.rank < 3 and not has_prior:
-        return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)
-    return Solution(c, solved(information, np.eye(3)) / np.outer(TO_Q, TO_Q), decision, has_prior, root)
+    c[6:] = UNIT * (V @ (V.T @ q))
+    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)

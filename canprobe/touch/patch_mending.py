@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 LEAST_COUNTS = 20
 """Counts that each of the four neighbours must show: more than a patch's slope can fall to nothing from."""
 
+_LEVELS = bytes((count > 0) + (count >= LEAST_COUNTS) for count in range(256))
+_GAP = bytes((2, 0, 2))
+"""A dead taxel between its left and its right neighbour, in levels of counts."""
+
 Image = NDArray[np.uint8]
 
 
@@ -24,7 +28,7 @@ def mended(taxels: Image) -> tuple[Image, int]:
     Returns:
         The same array where none is dead; else a copy in which each has the mean of its four neighbours.
     """
-    if not _may_have_dead(taxels.reshape(-1)):
+    if _GAP not in taxels.tobytes().translate(_LEVELS):  # the usual case, in a fraction of the whole search
         return taxels, 0
     inner = taxels[1:-1, 1:-1]
     sides = (taxels[:-2, 1:-1], taxels[2:, 1:-1], taxels[1:-1, :-2], taxels[1:-1, 2:])
@@ -37,10 +41,3 @@ def mended(taxels: Image) -> tuple[Image, int]:
     whole = taxels.copy()
     whole[1:-1, 1:-1][dead] = np.rint(mean[dead]).astype(np.uint8)
     return whole, n
-
-
-def _may_have_dead(flat: NDArray[np.uint8]) -> bool:
-    """Whether a 0 has four neighbours that show something, rows taken as one line: a fraction of the whole search."""
-    high = flat >= LEAST_COUNTS
-    around = high[16:-18] & high[18:-16] & high[1:-33] & high[33:-1]
-    return bool((around & (flat[17:-17] == 0)).any())

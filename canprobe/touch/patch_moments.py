@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import mul
 from typing import Any
 
 import numpy as np
@@ -130,7 +131,7 @@ class MomentModel:
         return square * (alpha + beta * xx), square * beta * xy, square * (alpha + beta * yy)
 
     def _along(self, a: float, b: float, t: float) -> float:
-        return math.fsum([c * term for c, term in zip(self.fit.coefficients, terms(a, b, t), strict=True)])
+        return math.fsum(map(mul, self.fit.coefficients, terms(a, b, t)))
 
     def trust(self, k: Moments, force: float) -> float:
         """1 where the calibration pressed such patches (K in 1/m, measured force in N), falling to 0 beyond.
@@ -195,15 +196,10 @@ class MomentModel:
 
     def _covariance(self, by_force: list[float], frames: float, lightness: float) -> Array:
         """(3, 3) of the relative residuals of V11, V12, V22: an error of the force moves the prediction with it."""
-        floor = lightness * np.array(self.fit.floor)
-        noise = self.fit.frame_sigma**2 / max(frames, 1.0)
-        order = (0, 2, 1)
-        return np.array(
-            [
-                [
-                    floor[i, j] + noise * (i == j) - b * floor[j, 3] - a * floor[i, 3] + a * b * floor[3, 3]
-                    for j, a in zip(order, by_force, strict=True)
-                ]
-                for i, b in zip(order, by_force, strict=True)
-            ]
-        )
+        floor, noise = self.fit.floor, self.fit.frame_sigma**2 / max(frames, 1.0)
+        parts = tuple(zip((0, 2, 1), by_force, strict=True))
+        last = floor[3]
+        covariance = [[floor[i][j] - b * last[j] - a * last[i] + a * b * last[3] for j, a in parts] for i, b in parts]
+        result: Array = lightness * np.array(covariance)
+        result.flat[::4] += noise
+        return result

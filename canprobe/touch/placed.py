@@ -118,7 +118,7 @@ class PlacedShape:
         Returns:
             Everything in the base frame.
         """
-        bx, by, bz = np.asarray(point_base, dtype=float).tolist()
+        bx, by, bz = point_base if isinstance(point_base, tuple) else np.asarray(point_base, dtype=float).tolist()
         ox, oy, oz = self._origin
         x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
         bx, by, bz = bx - ox, by - oy, bz - oz

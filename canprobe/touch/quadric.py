@@ -29,6 +29,10 @@ _FLAT = BASIS.reshape(9, 16)
 _PICK = np.array([4 * i + j for i, j in _INDEX])
 _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
+_WIDE = np.concatenate([BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
+"""S as the sum of ten matrices, side by side."""
+_ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX, (2, 3))])
+"""Where the parameters stand in each of them, and c34."""
 
 
 class Rows(NamedTuple):
@@ -176,9 +180,10 @@ def linearise(c: Array, d: Design) -> Linearised:
     V[:, 0], V[:, 1:] = g * inverse[:, None], d.T
     r[:, 1:] = (d.T @ V[:, 0, :, None])[:, :, 0]
     bend = (V.reshape(-1, 3) @ B).reshape(V.shape) @ d.T.mT * inverse[:, None, None]
-    W = _whitener(bend[:, 1:], V[:, 0], d)
+    felt = bend[:, 1:] + d.noise.coupling * np.eye(2)  # turn against the surface that an error of the point is felt as
+    W = _whitener(felt, V[:, 0], d)
     r = (W @ r[:, :, None])[:, :, 0]
-    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], bend[:, 1:], V[:, 0])
+    X = _likely_places(d, X, (r[:, None] @ W)[:, 0], felt, V[:, 0])
     g = X @ B + h
     inverse = 1.0 / np.sqrt(np.einsum("ij,ij->i", g, g))
     V[:, 0] = g * inverse[:, None]
@@ -224,11 +229,11 @@ def transport(c: Array, T: Array) -> tuple[Array, Array]:
     Returns:
         c' (9,) and M (9, 9).
     """
-    S = T.T @ matrix_of(c) @ T
-    scale = -0.5 / S[2, 3]
-    moved = (T.T @ BASIS @ T).reshape(9, 16)
-    c_new: Array = S.reshape(16)[_PICK] * scale
-    M: Array = scale * (moved[:, _PICK].T + np.outer(2.0 * c_new, moved[:, 11]))
+    moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(-1).take(_ENTRIES)
+    entries = moved[:, :9] @ c + moved[:, 9]
+    scale = -0.5 / float(entries[9])
+    c_new = scale * entries[:9]
+    M: Array = scale * (moved[:9, :9] + (2.0 * c_new)[:, None] * moved[9, :9])
     return c_new, M
 
 

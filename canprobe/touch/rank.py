@@ -47,7 +47,7 @@ class Decision(NamedTuple):
     @property
     def rank(self) -> int:
         """Number of observed combinations."""
-        return int(np.count_nonzero(self.passed))
+        return int(self.passed.tolist().count(True))
 
 
 def nothing_observed() -> Decision:
@@ -86,7 +86,7 @@ def _least(curvature: float, largest: float) -> float:
 
 def _axes(spread: Array) -> tuple[float, float, Array]:
     """Eigenvalues of the spread and, as columns in q, the curvature along its main axis, the twist, and across."""
-    a, b, d = float(spread[0, 0]), float(spread[0, 1]), float(spread[1, 1])
+    (a, b), (_, d) = spread.tolist()
     mean, half = 0.5 * (a + d), 0.5 * (a - d)
     radius = math.hypot(half, b)
     angle = 0.5 * math.atan2(b, half)
@@ -108,7 +108,7 @@ def spread_share(spread: Array) -> Array:
     """
     small, large, axes = _axes(spread)
     true = [max(0.0, 1.0 - 1.0 / max(s, 1e-300)) for s in (large, 0.5 * (small + large), small)]
-    result: Array = (axes * true) @ axes.T
+    result: Array = axes * np.array(true) @ axes.T
     return result
 
 

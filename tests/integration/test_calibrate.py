@@ -50,6 +50,11 @@ def test_it_presses_gently_and_lets_go_between_the_touches(calibrated):
     assert all(force[a:b].min() == 0.0 for a, b in itertools.pairwise(touches))
 
 
+def test_its_frames_are_those_the_plan_lists(calibrated):
+    measured = canprobe.measure_traffic(calibrated.out, calibrated.plan)
+    assert measured.as_planned and measured.unlisted == {} and measured.missing == ()
+
+
 def test_a_layer_of_another_stiffness_does_not_move_the_tool():
     """Three times as stiff as stated: the force alone would say 0.18 mm too deep, and the tool would follow."""
     scene = fast(canprobe.load_scene("calibrate"), task={"touches": 5}, plant={"stiffness_n_m3": 3 * 1.27e8})

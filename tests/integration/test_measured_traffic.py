@@ -10,6 +10,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.build import make_task
+from canprobe.cell.recording import read_recording
 from canprobe.cli import main
 from canprobe.errors import UsageError
 from canprobe.session import Session, resolve_scene
@@ -37,6 +38,18 @@ def test_a_touch_is_as_planned_to_the_frame(press):
             assert one.bits <= one.planned_bits
         assert one.late == 0, one.kind
         assert one.slowest is None or 0.3 < one.slowest <= 1.0
+    assert measured.load < measured.planned_worst
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["axial", "cylinder", "free", "listen", "plane", "saddle", "sphere"])
+def test_a_packaged_scene_sends_what_its_plan_lists_and_nothing_else(name, tmp_path):
+    """The others are measured where they are run anyway."""
+    result = undrawn_run(canprobe.load_scene(name), out=tmp_path, duration_s=0.5)
+    measured = canprobe.measure_traffic(tmp_path, result.plan)
+    assert measured.as_planned and measured.exact
+    assert measured.unlisted == {} and measured.missing == () and measured.error_frames == 0
+    assert all(one.late == 0 for one in measured.classes)
     assert measured.load < measured.planned_worst
 
 
@@ -75,19 +88,35 @@ def test_logs_that_cannot_be_measured(press, tmp_path):
         canprobe.measure_traffic(two, result.plan)
 
 
-def carry_out(scene):
-    session = Session(resolve_scene(scene, duration_s=0.3))
+def carry_out(scene, out=None):
+    session = Session(resolve_scene(scene, duration_s=0.3), out)
     with session:
         session.run(make_task(session.plan))
     return session
 
 
-def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors():
-    """One bit in 10 000 fails: about one frame in 90 is sent again."""
+def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors(tmp_path):
+    """One bit in 10 000 fails: about one frame in 90 is sent again. The log has the error frames, as candump has."""
     scene = timed(canprobe.load_scene("free"), bit_error_rate=1e-4)
-    first, second = carry_out(scene), carry_out(scene)
+    first, second = carry_out(scene, tmp_path), carry_out(scene)
     buses = [session.lockstep for session in (first, second)]
     assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
     assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
     assert first.meters["can0"].report().as_planned
     assert first.cell.drives.missed == 0
+    measured = canprobe.measure_traffic(tmp_path, first.plan)
+    assert measured.error_frames == first.meters["can0"].report().error_frames == buses[0].error_frames > 0
+    assert measured.as_planned and f"error frames: {measured.error_frames}" in measured.text()
+    lines = [line for line in (tmp_path / "bus.log").read_text().splitlines() if " 20000088#" in line]
+    assert len(lines) == measured.error_frames
+    recording = read_recording(tmp_path / "bus.log", first.plan, as_taken=False)
+    assert recording.error_frames == measured.error_frames
+
+
+def test_a_run_on_a_bus_with_errors_says_so():
+    scene = timed(canprobe.load_scene("free"), bit_error_rate=1e-4)
+    result = canprobe.run(scene, files=False, duration_s=0.2)
+    (warning,) = result.summary["warnings"]
+    assert warning.startswith("bus.bit_error_rate = 0.0001: ") and f"  warning    {warning}" in result.text()
+    frames = result.summary["traffic"]["can0"]["error_frames"]
+    assert frames > 0 and f"  noted      bus error frames: {frames}, the first in cycle 0" in result.text()

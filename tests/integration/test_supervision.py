@@ -8,143 +8,21 @@ from struct import pack, unpack
 
 import numpy as np
 import pytest
+from injected import FREE_CYCLE, HOLD_CYCLE, Injected, altered, send
 
 import canprobe
 from canprobe.bus.port import ControllerState
-from canprobe.cell.build import make_task
 from canprobe.cell.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Command
 from canprobe.cell.supervision import Reaction
 from canprobe.cell.tasks.touch_settings import Phase
-from canprobe.emulator.faults import Fault, FaultKind
-from canprobe.emulator.faulty_node import FaultyNode
-from canprobe.errors import CanprobeError, InterfaceError, NodeError, SafetyStop
-from canprobe.protocol.cia402 import POWERED_STATES, DriveState
+from canprobe.emulator.faults import FaultKind
+from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.emcy import Emcy
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
-from canprobe.session import Session, resolve_scene
-
-LONG_NS = 10_000_000_000
-FREE_CYCLE = 80
-"""A cycle in which the arm of `free` moves."""
-HOLD_CYCLE = 700
-"""A cycle in which `press` holds its force."""
-
-
-class Injected:
-    """A run in which something happens at one cycle; what came of it, and when."""
-
-    def __init__(self, name, at, action, *, until=400, own=False, **changes):
-        scene = resolve_scene(canprobe.load_scene(name), duration_s=3.0)
-        if scene.task.kind in ("press", "scan"):
-            scene = replace(scene, task=replace(scene.task, clearance_mm=0.8))
-        scene = replace(scene, **{k: replace(getattr(scene, k), **v) for k, v in changes.items()})
-        self.session = Session(scene)
-        self.limits = limits_of(self.session.plan)
-        self.nodes = {}
-        self.session.joins = self._join
-        self.task = make_task(self.session.plan)
-        self.at, self.action, self.until, self.own = at, action, at + until, own
-        self.injected_ns = self.answered_ns = self.error = None
-        self.held = 0
-        self._run()
-
-    def _join(self, participant):
-        if not hasattr(participant, "node_id"):
-            return participant
-        sensor = self.session.scene.sensor
-        of_sensor = sensor is not None and participant.node_id == sensor.node_id
-        ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(participant.node_id, "tpdo")] if of_sensor else ()
-        self.nodes[participant.node_id] = FaultyNode(participant, (), ids)
-        return self.nodes[participant.node_id]
-
-    def now(self):
-        return self.session.lockstep.clock.now_ns()
-
-    def fault(self, kind, node_id, **more):
-        self.nodes[node_id].add(Fault(kind, node_id, self.now(), more.pop("duration_ns", LONG_NS), **more))
-
-    def step(self, measurement):
-        if measurement.cycle == self.at:
-            self.injected_ns = self.now()
-            self.action(self)
-        if measurement.cycle > self.until:
-            return Command(done=True)
-        command = Command() if self.own else self.task.step(measurement)
-        if self.answered_ns is None and getattr(self.task, "phase", 0) == Phase.RETREAT and self.injected_ns:
-            self.answered_ns = self.now()
-        return self.command(measurement, command)
-
-    def command(self, measurement, command):
-        return command
-
-    def _run(self):
-        def step(measurement):
-            return self.step(measurement)
-
-        if not self.own and hasattr(self.task, "retreat"):
-            step.retreat = self.task.retreat
-            step.shape = self.task.shape
-        with self.session:
-            try:
-                self.session.run(step, progress=self._progress)
-            except (CanprobeError, KeyboardInterrupt, ZeroDivisionError) as error:
-                self.error = error
-                if self.answered_ns is None:
-                    self.answered_ns = self.now()
-
-    def _progress(self, measurement):
-        supervisor = self.session.cell.supervisor
-        self.held += supervisor.seen.controller_state is ControllerState.PASSIVE
-        self.after(measurement)
-
-    def after(self, measurement):
-        pass
-
-    def assert_within(self, key):
-        """The reaction came after the fault and within the time of the table."""
-        limit = BY_KEY[key].within(self.limits)
-        assert 0 <= self.answered_ns - self.injected_ns <= limit
-        return self
-
-    def assert_counted(self, key):
-        """The condition was counted within its time, and the run went on to its end."""
-        supervisor = self.session.cell.supervisor
-        assert self.error is None
-        assert supervisor.counts[key] > 0
-        waited = (supervisor.first[key] - self.at) * self.limits.period_ns
-        assert 0 <= waited <= BY_KEY[key].within(self.limits)
-        return self
-
-    def assert_drives_off(self, but=()):
-        for node_id in range(1, 7):
-            if node_id not in but:
-                word = self.nodes[node_id].node.dictionary.number(0x6041)
-                assert canprobe_state(word) not in POWERED_STATES
-
-
-def canprobe_state(word):
-    from canprobe.protocol.cia402 import state_of
-
-    return state_of(word)
-
-
-def send(run, frame):
-    """A frame from somebody who is no node of the cell."""
-    run.session.lockstep.port().send_batch([frame])
-
-
-def altered(node, can_id, change):
-    """Let a node send an identifier with other data; with None it does not send it."""
-    inner = node._sent
-
-    def sent(frames, t_ns):
-        changed = [(i, change(d) if i == can_id else d) for i, d in frames]
-        return inner([frame for frame in changed if frame[1] is not None], t_ns)
-
-    node._sent = sent
-
+from canprobe.session import Session
 
 # nodes
 
@@ -595,9 +473,9 @@ def test_the_drives_of_a_dead_master_stop_by_themselves():
         clock, start = run.session.lockstep.clock, run.now()
         limit = BY_KEY["master_dead"].within(run.limits)
         clock.sleep_until_ns(start + limit - run.limits.period_ns)
-        seen["before"] = [canprobe_state(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+        seen["before"] = [state_of(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
         clock.sleep_until_ns(start + limit + 1)
-        seen["after"] = [canprobe_state(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
+        seen["after"] = [state_of(run.nodes[i].node.dictionary.number(0x6041)) for i in range(1, 7)]
 
     run = Injected("free", FREE_CYCLE, die)
     assert seen["before"] == [DriveState.OPERATION_ENABLED] * 6

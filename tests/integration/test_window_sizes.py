@@ -50,16 +50,13 @@ def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
     assert [(w.value, w.read_back) for w in setup.writes if w.index == 0x2008] == [(side, True)]
 
 
-def test_a_larger_window_feels_more_of_a_soft_contact():
-    """The truth is the plant's: 8×8 taxels cut the patch of a soft pad, 10×10 less of it; the force holds in both."""
+def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
+    """The truth is the plant's: 10×10 taxels hold the patch of a soft pad; what 8×8 cut off is carried on."""
     foam = canprobe.load_scene("foam")
     assert make_plan(foam).scene.sensor.window == 10
-    small, large = (
-        canprobe.run(scene, files=False, duration_s=1.0).summary for scene in (change(foam, sensor={"window": 8}), foam)
-    )
-    assert large["contact"]["force_rms_error_n"] < small["contact"]["force_rms_error_n"] < 0.12
-    assert large["shape"]["position_rms_mm"] < 0.9 * small["shape"]["position_rms_mm"]
-    assert large["shape"]["normal_rms_deg"] < 0.9 * small["shape"]["normal_rms_deg"]
+    for scene in (foam, change(foam, sensor={"window": 8})):
+        contact = canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
+        assert contact["force_rms_error_n"] < 0.06 * contact["force_target_n"]
 
 
 # --- the choice -------------------------------------------------------------------------------------------------------
@@ -102,8 +99,9 @@ def test_auto_takes_what_fits_and_says_why():
 
 
 def test_what_does_not_fit_names_the_windows_that_do():
-    with pytest.raises(PlanError, match=r"5695 µs of the 5000 µs in 2 cycles; ways out: sensor.window = 8 \(87 %"):
+    with pytest.raises(PlanError, match=r"5695 µs of the 5000 µs in 2 cycles") as refused:
         make_plan(change(canprobe.load_scene("cylinder"), sensor={"window": 12}))
+    assert refused.value.ways_out[0].startswith("sensor.window = 8: load 87 %")
 
 
 def test_on_can_fd_every_word_of_every_window_has_its_place():

@@ -17,6 +17,7 @@ from canprobe.studies.fault_cases import PHASES, FaultCase
 from canprobe.studies.fault_runs import carry_out, draw_case, peak, phase_windows, run_seed
 from canprobe.studies.fault_scenes import FORCE_MAX_N, SCENARIOS, seeded_plan
 from canprobe.studies.fault_scores import Peak, score_force
+from canprobe.studies.faults import findings, table_rows
 
 FEATURES = "press, features"
 S = 1_000_000_000
@@ -97,6 +98,26 @@ def test_one_run_is_told_by_its_seed(capsys):
     assert main(["study", "bound", "--seed", "3"]) == 2
 
 
+@pytest.mark.parametrize("seed", [1321, 4008])
+def test_a_drive_that_was_lost_in_contact_near_the_limit(seed):
+    """These stayed above the limit for 1305 and 335 ms while the cell stopped where it stood."""
+    run = run_seed(seed)
+    assert run["failures"] == [] and run["outcome"] == "bus or node failure"
+    assert FORCE_MAX_N < run["force_max_n"] < 3.5 and 0.0 < run["above_ms"] < 50.0
+
+
+def test_a_force_that_the_cell_does_not_make_is_not_judged():
+    common = {"hits": 1, "failures": [], "kinds": ["drop"], "phase": "scan", "outcome": "completed"}
+    hand = common | {"force_bound_n": None, "force_max_n": 3.9, "above_ms": 615.0}
+    cell = common | {"force_bound_n": 8.0, "force_max_n": 3.2, "above_ms": 20.0}
+    told = findings([hand, cell])[1]
+    assert told.startswith("The cell presses in 1 runs:") and told.endswith(
+        "3 N in 1, for 20 ms at most, highest 3.20 N."
+    )
+    row = table_rows([hand, cell])[0]
+    assert (row["fault"], row["runs"], row["force_max_n"], row["above_ms"]) == ("drop", 2, 3.2, 20.0)
+
+
 def deaf_to_findings(monkeypatch):
     monkeypatch.setattr(Supervisor, "finding", lambda self, **_: None)
     monkeypatch.setattr(touch, "touch_finding", lambda _: None)
@@ -115,13 +136,13 @@ def test_the_score_sees_a_force_above_the_limit(monkeypatch):
 def test_the_score_sees_motion_and_power_after_the_stop(monkeypatch):
     monkeypatch.setattr("canprobe.cell.cell.Cell._stop_drives", lambda self: None)
     monkeypatch.setattr("canprobe.cell.bringup.BringUp.release", lambda self: None)
-    monkeypatch.setattr("canprobe.emulator.drive_supervision.Supervision._await_sync", lambda self, t_ns: None)
+    monkeypatch.setattr("canprobe.emulator.drive_supervision.Supervision._sync_missing", lambda self, due_ns: None)
     monkeypatch.setattr("canprobe.emulator.node.SlaveNode._communication_error", lambda self, t_ns: None)
     run = carry_out(FaultCase(0, FEATURES, "", ()))
     assert any("OPERATION_ENABLED after the stop" in failure for failure in run["failures"])
 
 
-def test_the_score_sees_a_hang_a_crash_and_a_torn_log(monkeypatch):
+def test_the_score_sees_a_hang_a_crash_a_torn_log_and_no_summary(monkeypatch):
     monkeypatch.setattr(fault_witness, "LONGEST_S", 0.5)
     assert any(f.startswith("hang") for f in carry_out(FaultCase(0, FEATURES, "", ()))["failures"])
     monkeypatch.undo()
@@ -131,9 +152,11 @@ def test_the_score_sees_a_hang_a_crash_and_a_torn_log(monkeypatch):
 
     monkeypatch.setattr(touch.TouchTask, "step", crash)
     monkeypatch.setattr("canprobe.session.TrafficMeter.frames", property(lambda self: 1))
+    monkeypatch.setattr("canprobe.studies.fault_scores.summarise", lambda *_: {"force": float("nan")})
     failures = carry_out(FaultCase(0, FEATURES, "", ()))["failures"]
     assert any("ZeroDivisionError" in failure for failure in failures)
     assert any(failure.startswith("log:") for failure in failures)
+    assert any(failure.startswith("summary: ValueError") for failure in failures)
 
 
 @pytest.mark.parametrize("kind", FaultKind)

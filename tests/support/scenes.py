@@ -18,8 +18,18 @@ def change(scene: Scene, **sections: dict[str, Any]) -> Scene:
     return dataclasses.replace(scene, **changed)
 
 
-def reasons(scene: Scene) -> tuple[str, ...]:
-    """The problems of a scene that must have some."""
+def refused(scene: Scene) -> PlanError:
+    """Why a scene that must have no plan has none."""
     with pytest.raises(PlanError) as caught:
         make_plan(scene)
-    return tuple(caught.value.problems)
+    return caught.value
+
+
+def reasons(scene: Scene) -> tuple[str, ...]:
+    """The problems of a scene that must have some."""
+    return refused(scene).problems
+
+
+def ways_out(scene: Scene) -> tuple[str, ...]:
+    """What would make a scene fit that must not."""
+    return refused(scene).ways_out

@@ -95,3 +95,26 @@ def test_methods_without_a_noise_model_refuse(method, truth):
     path = truth.path("sphere")
     with pytest.raises(UsageError, match="correlation"):
         fit_surface(path.points, path.normals, **SIGMA, method=method, correlation=KNOWN)
+
+
+def test_coupled_errors_are_one_error():
+    """One centroid gives point and normal: its error is felt as (K + 1/R_p) e. Only stated so do regions cover."""
+    rng = np.random.default_rng(7)
+    radius, probe, e = 0.05, 0.04, 40e-6
+    t = np.linspace(-1.0, 0.0, 120)
+    true = np.stack([0.2 * t, 0.08 * np.sin(11.0 * t), -np.ones_like(t)], axis=1)
+    true /= np.linalg.norm(true, axis=1, keepdims=True)
+    inside: dict[float, list[bool]] = {1.0 / probe: [], 0.0: []}
+    for _ in range(60):
+        error = e * rng.normal(size=true.shape)
+        error -= true * np.sum(error * true, axis=1, keepdims=True)
+        points = radius * true + error + 10e-6 * rng.normal(size=(len(t), 1)) * true
+        normals = true - error / probe
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        for coupling, hits in inside.items():
+            tilt = 1e-4 if coupling else e / probe  # the same normals, taken for independent ones
+            found = fit_surface(points, normals, sigma_point=e, sigma_normal=tilt, coupling=coupling, quadric=True)
+            d = (found.K - np.eye(2) / radius)[[0, 0, 1], [0, 1, 1]]
+            hits.append(bool(d @ np.linalg.solve(found.covariance, d) < 7.815))
+    assert np.mean(inside[1.0 / probe]) >= 0.9
+    assert np.mean(inside[0.0]) <= np.mean(inside[1.0 / probe]) - 0.1

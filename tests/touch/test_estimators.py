@@ -16,6 +16,7 @@ from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.noise import make_noise
 from canprobe.touch.prior import Prior
 from canprobe.touch.quadric_row import sample_rows
+from canprobe.touch.terms import basis, monomials
 
 NOISE = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
 WEIGHT = np.array([1.0, 2.0, 1.0])
@@ -80,9 +81,10 @@ def test_one_row_is_the_row_of_the_batch(truth):
     c[:3] = [0.01, -0.02, 0.001]
     batch = quadric.rows(c, quadric.design(p / 0.02, n, make_noise(160, 1e-2, 3e-3)))
     for i in rng.choice(160, 20):
-        row = np.array(sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), 1e-4, 9e-6).rows)
-        assert np.allclose(row[:, 9], -batch.r[i], rtol=1e-9, atol=1e-9)
-        assert np.allclose(row[:, :9], batch.J[i], rtol=1e-9, atol=1e-6)
+        one = sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), 1e-4, 9e-6)
+        J = np.reshape(one.weights, (3, 4)) @ basis(np.array([monomials(*one.place)]))[0, :, :9]
+        assert np.allclose(one.residuals, -batch.r[i], rtol=1e-9, atol=1e-9)
+        assert np.allclose(J, batch.J[i], rtol=1e-9, atol=1e-6)
 
 
 def test_rows_are_the_derivative_of_residuals(truth):

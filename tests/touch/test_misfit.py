@@ -64,7 +64,7 @@ def test_a_misfit_that_shows_is_corrected(method, scale, share_left):
 @pytest.mark.parametrize(
     ("method", "scale", "least", "plain_most"),
     [
-        ("ml", 1.0, 0.6, 0.45),
+        ("ml", 1.0, 0.5, 0.45),
         ("ml", 3.0, 0.90, 0.05),
         ("ml", 8.0, 0.90, 0.05),
         ("recursive", 3.0, 0.90, 0.1),
@@ -114,3 +114,19 @@ def test_a_quadric_stays_what_it_is():
             claims[quadric].append(np.trace(e.covariance))
     assert np.mean(squares[False]) < 1.1 * np.mean(squares[True])
     assert np.mean(claims[True]) < np.mean(claims[False]) < 1.1 * np.mean(claims[True])
+
+
+def test_on_a_plane_a_region_does_not_grow_with_its_own_error():
+    """What c13, c23, c33 add is proportional to K, on a plane to its noise: counted there, all regions would hold 0."""
+    a = np.linspace(0.0, 2.0 * np.pi, 160)
+    places = 0.8e-3 * np.stack([np.sin(a), 1.0 - np.cos(a), np.zeros_like(a)], axis=1)
+    inside = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        points = places + 20e-6 * rng.normal(size=places.shape)
+        normals = np.array([0.0, 0.0, -1.0]) + 1e-3 * rng.normal(size=places.shape)
+        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+        e = fit_surface(points, normals, sigma_point=20e-6, sigma_normal=1e-3, quadric=True)
+        k = e.K[[0, 0, 1], [0, 1, 1]]
+        inside.append(k @ np.linalg.solve(e.covariance, k) < 7.815)
+    assert 0.91 <= np.mean(inside) <= 0.985

@@ -8,6 +8,8 @@ import pytest
 from canprobe.emulator.plant.contact import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.emulator.tactile_image import follow, middle
+from canprobe.planning.cut_patch import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
+from canprobe.scene import ProbeSettings
 from canprobe.touch.patch import SIDE, PatchCalibration, compute_patch
 from canprobe.touch.patch_beyond import completed
 
@@ -97,3 +99,26 @@ def test_force_and_centroid_of_a_soft_contact(shape):
     assert np.mean(cut) < -0.03
     assert np.max(off) < 0.2e-3
     assert np.mean(off) < 0.5 * np.mean(cut_off)
+
+
+@pytest.mark.parametrize(
+    ("side", "stiffness"), [(6, 1.27e7), (6, 2.3e7), (6, 6e7), (6, 1.27e8), (8, 1.27e7), (8, 6e7), (10, 1.27e7)]
+)
+def test_what_the_plan_says_of_a_window_that_cuts(side, stiffness):
+    """2 N on a plane, against the whole image: within the share that `cut_patch` tells."""
+    probe = ProbeSettings(radius_mm=EXACT.radius_m * 1e3, stiffness_n_m3=stiffness)
+    assert measured_share(2.0, probe, side) >= CARRIED_SHARE and side >= CARRIED_SIDE
+    depth = depth_for_force(2.0, (0.0, 0.0), EXACT.radius_m, stiffness)
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        array = TaxelArray(TaxelConfig(), rng, stiffness_n_m3=stiffness)
+        image = array.image(tuple(rng.uniform(-2.0, 2.0, 2) * PITCH), depth, (0.0, 0.0), np.eye(2), 0.0)
+        window = (*around(image, side), side, side)
+        patch = compute_patch(seen(image, window), EXACT, window)
+        assert abs(patch.force / compute_patch(image, EXACT).force - 1.0) < CARRIED_ERROR
+
+
+def around(image, side):
+    """First row and column of the window that has the centroid in its middle."""
+    places = np.indices(image.shape).reshape(2, -1) @ image.reshape(-1).astype(float) / image.sum()
+    return [int(np.clip(round(place - (side - 1) / 2), 0, SIDE - side)) for place in places]

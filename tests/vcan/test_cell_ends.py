@@ -67,6 +67,7 @@ def test_one_node_is_missing_then_there_then_killed(bench: Any) -> None:
     (line,) = bench.start(*run, "missing").end(3)
     assert line.startswith("canprobe: node 3: (joint 3) sent no boot-up within ")
     assert "nor did" not in line
+    assert bench.results("missing").summary["stop_reason"] == line.removeprefix("canprobe: ")
 
     third = bench.start("emulate", scene, "--channel", "vcan0", "--nodes", "3")
     bench.bus.until_booted(3, by=third)

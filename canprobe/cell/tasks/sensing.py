@@ -14,6 +14,7 @@ from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import PumaModel
 from canprobe.touch.compliance import stiffness_from_slope
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
+from canprobe.touch.pad_lag import Lag, PadLag
 from canprobe.touch.patch import Patch, PatchCalibration, compute_patch, patch_from_features
 from canprobe.touch.patch_image import MomentImage, Moments
 from canprobe.touch.patch_mending import mended
@@ -78,6 +79,7 @@ class ContactSensing:
         radius: of the probe, m.
         stiffness: K/h of the layer, N/m³.
         moment_image: gives the contacts the second moments of their images; None leaves them out.
+        lag: how far the array's centroids trail the contact; None: they do not.
     """
 
     def __init__(
@@ -89,6 +91,7 @@ class ContactSensing:
         stiffness: float,
         *,
         moment_image: MomentImage | None = None,
+        lag: Lag | None = None,
     ) -> None:
         self.model = model
         self.flange_probe = flange_probe
@@ -100,6 +103,7 @@ class ContactSensing:
         self.dropped = 0
         self._calibration = calibration
         self._moment_image = moment_image
+        self._lag = None if lag is None else PadLag(lag)
         self._history = JointHistory()
 
     def step(self, measurement: Measurement) -> Patch | None:
@@ -155,10 +159,11 @@ class ContactSensing:
             self.dropped += 1
             return None
         T_base_probe = forward(self.model, q) @ self.flange_probe
+        t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         return contact_sample(
-            t_s=sample.t_sample_ns * 1e-9,
+            t_s=t_s,
             T_base_probe=T_base_probe,
-            uv=(patch.u, patch.v),
+            uv=uv if self._lag is None else self._lag.step(t_s, *uv),
             depth=self.depth(patch.force),
             radius=self.radius,
             force_n=patch.force,

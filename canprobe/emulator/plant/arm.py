@@ -91,7 +91,10 @@ class _Axis:
         else:
             self.slope = (end - start) / (1e-9 * (t1 - t0))
             self.r, self.end, self.end_ns = start + self.slope * 1e-9 * (self.t_ns - t0), end, t1
-        self.plan_event()
+        if self.coming:
+            self.plan_event()
+        else:
+            self.event_ns = self.end_ns
 
     def plan_event(self) -> None:
         self.event_ns = min(self.end_ns, self.coming[0][0]) if self.coming else self.end_ns
@@ -122,6 +125,7 @@ class IdealArm:
         self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
         self.lag_s = 2.0 * damping_ratio / self.w
         """How far the motors stay behind a steady ramp, s."""
+        self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
         self.t_ns = 0
         self._axes = [_Axis(c, self.lag_s) for c in joints_to_counts(model, q0).tolist()]
         self._phi: dict[int, Transition] = {}
@@ -148,8 +152,8 @@ class IdealArm:
             a.coming.append(ramp)
             a.plan_event()
             return
-        states = self._states()
-        a.anchor(self.t_ns, states[axis])
+        states = self._evaluated or self._states()
+        a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
         a.coming.clear()
         a.begin(ramp)
         states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
@@ -195,7 +199,7 @@ class IdealArm:
         Args:
             axis: 0 to 5.
         """
-        return self._states()[axis][0]
+        return (self._evaluated or self._states())[axis][0]
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one joint over its continuous limit, as a drive reports it (6077h).
@@ -208,8 +212,8 @@ class IdealArm:
         Returns:
             Permille, within the peak of +-2000.
         """
-        stiffness, damping = self.w * self.w, 2 * self.z * self.w
-        states = self._states()
+        stiffness, damping = self._stiffness, self._damping
+        states = self._evaluated or self._states()
         rate = acceleration = 0.0
         for motor, share in self._rows[axis]:
             q, v, r = states[motor]
@@ -218,7 +222,7 @@ class IdealArm:
         torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
         torque += COULOMB_NM[axis] * tanh(rate / STICTION_RATE)
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
-        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+        return permille if abs(permille) <= PEAK_PERMILLE else max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Nothing: these motors track as they do, whatever torque that takes.

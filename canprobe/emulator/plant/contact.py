@@ -7,12 +7,11 @@ It stops being true where the patch is no longer small against both radii.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import pi, sqrt
+from typing import NamedTuple
 
 
-@dataclass(frozen=True, slots=True)
-class Contact:
+class Contact(NamedTuple):
     """What one indentation gives.
 
     Attributes:

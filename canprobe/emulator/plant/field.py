@@ -107,8 +107,9 @@ class PressureField:
         u, v = np.meshgrid(axis, axis)
         arc = np.hypot(u, v) / radius_m
         sinc = np.sinc(arc / np.pi)
-        self._directions = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc)))
-        self._area = sinc  # area of a pad cell on the sphere over du dv
+        # Directions of the samples; and the area of a pad cell on the sphere over du dv.
+        self._samples = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc), sinc))
+        self._directions, self._area = self._samples[:3], self._samples[3]
         self._rows = _averaging_matrix(samples, blur_pitch)
         self._columns = np.ascontiguousarray(self._rows.T)
 
@@ -171,18 +172,17 @@ class PressureField:
                 (m21 * x0 + m22 * y0, m21 * x1 + m22 * y1, m21 * x2 + m22 * y2),
             )
         )
-        block = self._directions[:, r0:r1, c0:c1]
-        along, first, second = (frame @ block.reshape(3, -1)).reshape(block.shape)
+        samples = self._samples[:, r0:r1, c0:c1].reshape(4, -1)
+        squeeze, *across = frame.dot(samples[:3])  # along the contact's direction, and along the principal ones
         # Probe height above its lowest point: R (1 - s.d), exact; object height from its principal curvatures.
-        squeeze = radius * along
-        first *= first
-        second *= second
-        first *= 0.5 * kappa[0] * radius * radius
-        second *= 0.5 * kappa[1] * radius * radius
-        squeeze -= first
-        squeeze -= second
+        squeeze *= radius
+        for curvature, way in zip(kappa, across, strict=True):
+            if curvature:
+                height = np.square(way, out=way)
+                height *= 0.5 * curvature * radius * radius
+                squeeze -= height
         squeeze += depth - radius
         np.maximum(squeeze, 0.0, out=squeeze)
-        squeeze *= self._area[r0:r1, c0:c1]
-        means: Array = self._rows[:, r0:r1] @ squeeze @ self._columns[c0:c1]
+        squeeze *= samples[3]
+        means: Array = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
         return means

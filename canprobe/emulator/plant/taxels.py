@@ -165,7 +165,7 @@ class TaxelArray:
             y *= pressure_factor
         y = self._remember(_saturate(y) if self.config.saturation else y, t_s)
         if self.config.crosstalk > 0.0:
-            y = self._mix @ y @ self._mix
+            y = self._mix.dot(y).dot(self._mix)
         return self._convert(y)
 
     def _remember(self, y: Array, t_s: float) -> Array:
@@ -181,9 +181,14 @@ class TaxelArray:
         self._t_s = t_s
         if self.config.creep_per_decade > 0.0:
             # Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
-            flat = y.reshape(-1)
-            self._creep = flat + self._decay_of(dt) * (self._creep - flat)
-            y = y + self.config.creep_per_decade * self._creep.sum(axis=0).reshape(SIDE, SIDE)
+            creep, flat = self._creep, y.reshape(-1)
+            creep -= flat
+            creep *= self._decay_of(dt)
+            creep += flat
+            crept: Array = np.add.reduce(creep).reshape(SIDE, SIDE)
+            crept *= self.config.creep_per_decade
+            crept += y
+            return crept
         return y
 
     def _decay_of(self, dt: float) -> Array:
@@ -200,7 +205,9 @@ class TaxelArray:
         top = self.config.adc_max
         counts = y * top
         if self.config.noise > 0.0:
-            counts += (self.config.noise * top) * self._rng.standard_normal((SIDE, SIDE))
+            noise = self._rng.standard_normal((SIDE, SIDE))
+            noise *= self.config.noise * top
+            counts += noise
         counts += 0.5  # the conversion below cuts off
         np.maximum(counts, 0.0, out=counts)
         np.minimum(counts, top + 0.5, out=counts)
@@ -212,10 +219,11 @@ class TaxelArray:
 
 
 def _saturate(x: Array) -> Array:
-    """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat."""
+    """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat; in place."""
     fourth = x * (1.0 / _SATURATION_KNEE)
     fourth *= fourth
     fourth *= fourth
     fourth += 1.0
-    result: Array = x / np.sqrt(np.sqrt(fourth))
-    return result
+    np.sqrt(fourth, out=fourth)
+    x /= np.sqrt(fourth, out=fourth)
+    return x

@@ -6,7 +6,7 @@ and only when somebody asks. Contact pushes the dynamic arm back, not the ideal 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos, pi, sin
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -127,7 +127,7 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
-        self._need_arm().set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
+        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
 
     def motor_counts(self, axis: int) -> float:
         """Motor position now, counts, continuous; 0 without an arm.
@@ -302,7 +302,7 @@ class Plant:
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
-        return replace(NO_CONTACT, force=float(np.linalg.norm(force)))
+        return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
 
 
 def _turned(axes: Axes, R: Array) -> Axes:

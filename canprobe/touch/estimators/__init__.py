@@ -25,6 +25,7 @@ def make_estimator(
     prior: Prior | None = None,
     lag: int = 10,
     correlation: Correlation | None = None,
+    coupling: float = 0.0,
 ) -> Estimator:
     """An online estimator.
 
@@ -38,6 +39,8 @@ def make_estimator(
         window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
         prior: of `ml` and `recursive`; None for the weak default.
         correlation: of the noise along the path, `recursive` only; the deviations are then those of one sample.
+        coupling: of the errors of point and normal, `ml` and `recursive` only: 1/R_p where both come from one centroid
+            on the probe, 1/m; 0 for independent errors.
         lag: samples between the two of a difference, `chen1996` only.
 
     Raises:
@@ -55,11 +58,14 @@ def make_estimator(
             window=window,
             prior=prior,
             correlation=correlation,
+            coupling=coupling,
         )
     if method == "ml":
         from canprobe.touch.estimators.ml import MlEstimator
 
-        return MlEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior)
+        return MlEstimator(
+            sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior, coupling=coupling
+        )
     if method == "chord":
         from canprobe.touch.estimators.chord import ChordEstimator
 

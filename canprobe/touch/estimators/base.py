@@ -90,6 +90,8 @@ class Gate:
 
     def notes(self) -> tuple[str, ...]:
         """What was in doubt about the images of the last contacts."""
+        if not any(self._doubts):
+            return ()
         counts = Counter(doubt for doubts in self._doubts if doubts for doubt in doubts)
         return tuple(f"{n} of the last {len(self._doubts)} contacts: {doubt.value}" for doubt, n in counts.items())
 
@@ -135,16 +137,18 @@ class WindowEstimator:
     Args:
         sigma_point, sigma_normal: see `Gate`.
         window: samples that are kept.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
     """
 
     least = 2
     """Fewer samples give no answer."""
 
-    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int) -> None:
+    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, coupling: float = 0.0) -> None:
         if window < self.least:
             raise UsageError(f"window: expected at least {self.least} samples, got {window}")
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
+        self._coupling = coupling
         self._samples: deque[ContactSample] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
@@ -176,4 +180,4 @@ class WindowEstimator:
         points: Array = np.array([s.p_base for s in self._samples])
         normals: Array = np.array([s.n_base for s in self._samples])
         sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
-        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1]))
+        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling))

@@ -11,52 +11,60 @@ from canprobe.touch._arrays import Array
 from canprobe.touch.noise import Noise
 from canprobe.touch.nonlinear import CHI2_999
 from canprobe.touch.quadric import Design, design
-from canprobe.touch.quadric_row import SampleRows, sample_rows
-from canprobe.touch.terms import terms
+from canprobe.touch.quadric_row import sample_rows
+from canprobe.touch.terms import basis, monomials
 
 
 class Touch(NamedTuple):
-    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise (m, rad)."""
+    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise.
+
+    The noise is in m, rad and, what couples them (`Noise.coupling`), 1/m.
+    """
 
     point: Array
     normal: Array
     sigma_point: float
     sigma_normal: float
+    coupling: float = 0.0
 
 
-def equations(c: Array, T_base_work: Array, length: float, touch: Touch) -> SampleRows:
-    """The rows of one contact at parameters (9,).
+class Equations(NamedTuple):
+    """Of n contacts in a filter's frame.
+
+    Attributes:
+        rows: (n, 3, 18) whitened: of the parameters and of the terms that a quadric leaves out.
+        residuals: (n, 3) their signs turned.
+    """
+
+    rows: Array
+    residuals: Array
+
+
+def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Touch]) -> Equations:
+    """The rows of contacts at parameters (9,).
 
     Args:
         c: parameters in the working frame, in units of `length`.
         T_base_work: (4, 4), m.
         length: m.
-        touch: the contact.
+        touches: the contacts.
     """
-    R, origin = T_base_work[:3, :3], T_base_work[:3, 3]
-    x = ((touch.point - origin) @ R / length).tolist()
-    n = (touch.normal @ R).tolist()
-    return sample_rows(c.tolist(), x, n, (touch.sigma_point / length) ** 2, touch.sigma_normal**2)
+    points, normals = _in_frame(T_base_work, length, touches)
+    at, square = c.tolist(), 1.0 / length**2
+    found = [
+        sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
+        for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
+    ]
+    table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
+    return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
 
 
-def joined(contacts: Sequence[SampleRows]) -> tuple[Array, Array]:
-    """Rows of parameters and terms (`terms`) of contacts (n, 3, 18), and minus the residuals (n, 3)."""
-    own = np.array([c.rows for c in contacts])
-    x, y = np.array([c.place for c in contacts]).T
-    rows = np.empty((len(contacts), 3, 18))
-    rows[:, :, :9] = own[:, :, :9]
-    rows[:, :, 9:] = np.array([c.weights for c in contacts]) @ terms(x, y)
-    return rows, own[:, :, 9]
-
-
-def squared_innovation(contact: SampleRows, inverse: Array) -> float:
-    """Squared innovation of one contact, χ² of 3, under an inverse root (9, 9) of the information."""
-    rows = np.array(contact.rows)
-    predicted = rows[:, :9] @ inverse
-    total = 0.0
-    for residual, row in zip(rows[:, 9].tolist(), predicted, strict=True):
-        total += residual * residual / (1.0 + float(row @ row))
-    return total
+def squared_innovations(e: Equations, inverse: Array) -> list[float]:
+    """Squared innovation of each contact, χ² of 3, under an inverse root (9, 9) of the information."""
+    predicted = e.rows[:, :, :9] @ inverse
+    variance = 1.0 + np.square(predicted).sum(axis=2)
+    found: list[float] = (np.square(e.residuals) / variance).sum(axis=1).tolist()
+    return found
 
 
 def weight_of(square: float) -> float:
@@ -67,8 +75,14 @@ def weight_of(square: float) -> float:
 
 def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
     """The constant parts of many contacts at once (`quadric.design`)."""
+    points, normals = _in_frame(T_base_work, length, touches)
+    sigma_point = np.array([t.sigma_point for t in touches]) / length
+    sigma_normal = np.array([t.sigma_normal for t in touches])
+    return design(points, normals, Noise(sigma_point, sigma_normal, touches[0].coupling * length))
+
+
+def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tuple[Array, Array]:
+    """Places, dimensionless, and normals (n, 3) in the working frame."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]) @ R / length
-    normals = np.array([t.normal for t in touches]) @ R
-    sigma_point = np.array([t.sigma_point for t in touches]) / length
-    return design(points, normals, Noise(sigma_point, np.array([t.sigma_normal for t in touches])))
+    return points, np.array([t.normal for t in touches]) @ R

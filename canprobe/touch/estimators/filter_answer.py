@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, inverted, lower_root, upper_root
+from canprobe.touch._arrays import Array, inverted, inverted_upper, lower_root, upper_root
 from canprobe.touch.anchor import Anchor, anchor
 from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
+from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.evidence import curvature_covariance, evidence_of
 from canprobe.touch.misfit import misfit_notes
-from canprobe.touch.nonlinear import DIFFUSE
+from canprobe.touch.nonlinear import DIFFUSE, size_of
 from canprobe.touch.quadric import UNIT
 from canprobe.touch.rank import Decision, decide, nothing_observed
 
@@ -46,7 +47,7 @@ def filter_estimate(
     samples: float,
     prior: str,
     notes: tuple[str, ...],
-    quadric: bool,
+    expected: Expected | None,
 ) -> SurfaceEstimate:
     """The answer at the foot of a point.
 
@@ -55,19 +56,22 @@ def filter_estimate(
         point: (3,) in base, m.
         spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
         innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
-        quadric: the surface is one exactly; else what a quadric leaves out is allowed for (`left_out`).
+        expected: of the samples, to allow for what a quadric leaves out (`left_out`); None: the surface is one exactly.
     """
-    found = _answered(state, point, spread, quadric=quadric)
+    found = _answered(state, point, spread, expected)
     a, decision = found.anchor, found.decision
-    evidence = evidence_of(a.c, a.M @ found.deviation, found.spread, state.length)
-    known = decision.vectors[:, decision.passed]
-    a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-    singular = np.linalg.svd(state.root, compute_uv=False)
+    deviation = a.M @ found.deviation
+    covariance = curvature_covariance(a.c, deviation)
+    evidence = evidence_of(a.c, covariance, found.spread, state.length)
+    if decision.rank < 3:
+        known = decision.vectors[:, decision.passed]
+        a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+        covariance = np.full((3, 3), math.nan)
     return build_estimate(
-        _solution(a, decision, found.deviation),
+        Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
         length=state.length,
         T_frame_contact=a.T_frame_contact,
-        condition_number=float(singular[0] / singular[-1]),
+        problem_root=state.root,
         innovation=innovation,
         distance=distance,
         samples=samples,
@@ -78,28 +82,21 @@ def filter_estimate(
     )
 
 
-def _answered(state: InformationFilter, point: Array, spread: Array, *, quadric: bool) -> _Answer:
+def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
     """With the sandwich covariance, amended where all is observed."""
     place = state.place(point)
     a = anchor(state.c, state.T, place, state.length)
     tangent = a.T_frame_contact[:3, :2]
     flat = tangent.T @ spread @ tangent
     q = a.M[6:] @ state.inverse / UNIT[:, None]
-    decision = decide(inverted(upper_root(q.T)).T, flat, float(np.linalg.norm(a.c[6:] / UNIT)))
+    decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
     noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
     notes: tuple[str, ...] = ()
-    if decision.rank == 3 and not quadric:
-        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place)
+    if decision.rank == 3 and expected is not None:
+        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, expected)
         notes = misfit_notes(amended.misfit, trusted=amended.trusted)
         if not amended.trusted:
             return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
         a = anchor(amended.c, state.T, place, state.length)
         noise += state.root @ amended.covariance @ state.root.T
     return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)
-
-
-def _solution(a: Anchor, decision: Decision, deviation: Array) -> Solution:
-    root = inverted(a.M @ deviation)
-    if decision.rank < 3:
-        return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior=False, root=root)
-    return Solution(a.c, curvature_covariance(a.c, a.M @ deviation), decision, has_prior=False, root=root)

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, inverted, upper_root
+from canprobe.touch._arrays import Array, inverted, inverted_upper, upper_root
 from canprobe.touch.anchor import foot
 from canprobe.touch.estimators.left_out import LeftOut
 from canprobe.touch.frames import homogeneous, transported_rotation
@@ -104,7 +104,8 @@ class InformationFilter:
         self.T = homogeneous(R @ turned, self.T[:3, 3] + R @ (self.length * x))
 
     def _set_root(self, root: Array) -> None:
-        self.root, self.inverse = root, inverted(root)
+        """Take an upper triangular root."""
+        self.root, self.inverse = root, inverted_upper(root)
 
 
 def _prior_rows(prior: Prior, length: float) -> Array:

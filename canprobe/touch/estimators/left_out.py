@@ -11,11 +11,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, eigen, inverted, solved
+from canprobe.touch._arrays import Array, eigen, solved
 from canprobe.touch.estimators.score import Score
 from canprobe.touch.misfit import averaged, scales
 from canprobe.touch.noise import Correlation
-from canprobe.touch.quadric import UNIT
+from canprobe.touch.nonlinear import size_of
 from canprobe.touch.terms import shifted
 
 _REGULAR = 1e-9
@@ -36,6 +36,21 @@ class Amended(NamedTuple):
     covariance: Array
     misfit: float
     trusted: bool
+
+
+class Expected(NamedTuple):
+    """What is known beforehand of what a filter is given.
+
+    Attributes:
+        noise: variance of the residuals over what is stated. Generous deviations make a misfit look like noise.
+        curvature: least ‖K‖ · length whose usual changes are reckoned with: a flat place need not lie on a plane.
+    """
+
+    noise: float = 1.0
+    curvature: float = 0.0
+
+
+AS_STATED = Expected()
 
 
 class LeftOut:
@@ -77,37 +92,37 @@ class LeftOut:
     def carry(self, back: Array, x: float, y: float) -> None:
         """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
         A, Q = shifted(x, y)
-        away = inverted(A)
+        away = 2.0 * np.eye(9) - A  # its inverse: a quartic term leaves cubic ones behind, a cubic one none
         wide = np.zeros((18, 18))
         wide[:9, :9], wide[:9, 9:], wide[9:, 9:] = back, -(back @ Q) @ away, away
         self.score.carry(wide)
         self._information = wide.T @ self._information @ wide
         self._slope = away.T @ self._slope
 
-    def amend(self, c: Array, H: Array, place: Array) -> Amended:
+    def amend(self, c: Array, H: Array, place: Array, expected: Expected = AS_STATED) -> Amended:
         """Average an answer over the terms.
 
         Args:
             c: (9,) parameters of the filter.
             H: (9, 9) inverse of their information.
             place: (3,) where the answer is wanted, in the filter's frame.
+            expected: of the samples.
         """
-        curvature = float(np.linalg.norm(c[6:] / UNIT))
+        curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
-        N, M = self._information[:9, 9:] * D, self._information[9:, 9:] * np.outer(D, D)
-        S = self.score.matrix
-        S_cc, S_ca, S_aa = S[:9, :9], S[:9, 9:] * D, S[9:, 9:] * np.outer(D, D)
-        HN = H @ N
-        shared = S_ca - S_cc @ HN
-        V = S_aa - S_ca.T @ HN - HN.T @ shared  # of y = m a + noise, all that the samples say about the terms
-        V += _REGULAR * np.trace(V) * np.eye(9)
-        m = M - N.T @ HN
+        X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
+        X[:9] = H @ self._information[:9, 9:] * -D
+        X[9:].flat[::10] = D
+        shared = self.score.matrix @ X
+        V = X.T @ shared  # of y = m a + noise, all that the samples say about the terms
+        V.flat[::10] += _REGULAR * V.trace()
+        m = D[:, None] * (self._information[9:] @ X)
         weighted = solved(V, m)
         values, U = eigen(m @ weighted)
         s = U.T @ (weighted.T @ (D * self._slope))
-        off = -HN
+        off = X[:9]
         off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
         off = off @ U
-        found = averaged(np.maximum(values, 0.0), s, -off, curvature)
-        both = H @ shared @ (weighted @ U * found.share) @ off.T
+        found = averaged(np.maximum(values, 0.0) / expected.noise, s / expected.noise, -off, curvature)
+        both = H @ shared[:9] @ (weighted @ U * found.share) @ off.T
         return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)

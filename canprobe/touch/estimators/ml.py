@@ -15,10 +15,19 @@ class MlEstimator(WindowEstimator):
         sigma_point, sigma_normal: effective noise, m and rad.
         window: samples kept.
         prior: None for `Prior.weak` over the extent of the window.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
     """
 
-    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, prior: Prior | None = None) -> None:
-        super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
+    def __init__(
+        self,
+        *,
+        sigma_point: float,
+        sigma_normal: float,
+        window: int,
+        prior: Prior | None = None,
+        coupling: float = 0.0,
+    ) -> None:
+        super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, coupling=coupling)
         self._prior = prior
 
     def _solve(self, touches: Touches) -> SurfaceEstimate:

@@ -21,15 +21,15 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.change import ChangeTest
-from canprobe.touch.estimators.equations import Touch, equations, joined, squared_innovation, weight_of
+from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
 from canprobe.touch.estimators.filter_answer import filter_estimate
 from canprobe.touch.estimators.information import InformationFilter
+from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.estimators.start import Start
 from canprobe.touch.estimators.travel import Spread, Travel
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.noise import Correlation
 from canprobe.touch.prior import Prior
-from canprobe.touch.quadric_row import SampleRows
 
 STEP = 0.025
 """Travel between two updates over the memory."""
@@ -39,6 +39,8 @@ MOST_PENDING = 16
 """Samples of one step that are kept; of a slower motion the last ones."""
 STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
+GENEROUS = 0.5
+"""Usual innovation below which the stated noise is not believed where a misfit is looked for."""
 AGREEING = 11.34
 """Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
@@ -51,11 +53,11 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """A contact against what the filter says: its equations, squared innovation and weight."""
+    """Contacts against what the filter says: their equations, squared innovations and weights."""
 
-    rows: SampleRows
-    square: float
-    weight: float
+    equations: Equations
+    squares: list[float]
+    weights: list[float]
 
 
 class RecursiveEstimator:
@@ -66,6 +68,7 @@ class RecursiveEstimator:
         memory_m: path after which a sample's information has fallen to 1/e, m.
         window: samples per memory at the nominal pace; slower motion is not believed more than twice that.
         prior: None for `Prior.weak` over the memory; none on curvature itself, which forgetting would wear away.
+        coupling: of the errors of point and normal (`Noise`), 1/m.
         correlation: of the noise along the path. The samples are weighed as if they were independent, the covariance
             is what such an answer has under correlated noise.
         quadric: the surface is known to be one; else its cubic and quartic terms are allowed for (`left_out`).
@@ -79,9 +82,11 @@ class RecursiveEstimator:
         memory_m: float = 0.02,
         window: int = 160,
         prior: Prior | None = None,
+        coupling: float = 0.0,
         correlation: Correlation | None = None,
         quadric: bool = False,
     ) -> None:
+        self._coupling = coupling
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
         self._memory = positive("memory_m", memory_m)
@@ -109,7 +114,7 @@ class RecursiveEstimator:
         """Take one contact."""
         if not self._gate.passes(sample, self.dropped):
             return
-        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample))
+        touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
@@ -133,8 +138,13 @@ class RecursiveEstimator:
             samples=self._spread.weight,
             prior=self._prior.name,
             notes=self._notes(),
-            quadric=self._quadric,
+            expected=None if self._quadric else self._expected(),
         )
+
+    def _expected(self) -> Expected:
+        """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
+        usual = self._change.usual
+        return Expected(usual if usual < GENEROUS else 1.0, self._coupling * self._memory)
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
@@ -144,29 +154,28 @@ class RecursiveEstimator:
 
     def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
-        compared = [self._compared(p) for p in self._pending] if self._settled else []
+        compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
-        if any([self._change.take(c.square, caution) for c in compared]):
+        if compared and any([self._change.take(square, caution) for square in compared.squares]):
             self._change.alarm()
-            self._drop_agreeing(compared)
+            self._drop_agreeing(compared.squares)
             self._spread.fade(0.0)
             self._start = Start(self._memory, self._prior)
-        if self._start is None:
-            self._absorb(compared, moved)
-        else:
+        if self._start is not None:
             self._begin_with(self._start, moved)
+        elif compared:
+            self._absorb(compared, moved)
 
-    def _compared(self, pending: _Pending) -> _Compared:
-        rows = equations(self._filter.c, self._filter.T, self._memory, pending.touch)
-        square = squared_innovation(rows, self._filter.inverse)
-        return _Compared(rows, square, pending.weight * weight_of(square))
+    def _compared(self) -> _Compared:
+        found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
+        squares = squared_innovations(found, self._filter.inverse)
+        return _Compared(found, squares, [p.weight * weight_of(s) for p, s in zip(self._pending, squares, strict=True)])
 
-    def _absorb(self, compared: Sequence[_Compared], moved: float) -> None:
+    def _absorb(self, compared: _Compared, moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array([c.weight for c in compared])
-        crowd = self._weigh(moved, weight)
-        rows, residuals = joined([c.rows for c in compared])
-        root = np.sqrt(crowd * weight)[:, None]
+        weight = np.array(compared.weights)
+        root = np.sqrt(self._weigh(moved, weight) * weight)[:, None]
+        rows, residuals = compared.equations
         self._filter.take(rows * root[:, :, None], residuals * root, moved)
         if self._last is not None:
             self._filter.follow(self._last.point)
@@ -199,9 +208,9 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self, compared: Sequence[_Compared]) -> None:
+    def _drop_agreeing(self, squares: Sequence[float]) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
         limit = AGREEING * self._change.usual
-        agree = [i for i, c in enumerate(compared[:-1]) if c.square <= limit]
+        agree = [i for i, square in enumerate(squares[:-1]) if square <= limit]
         for _ in range(agree[-1] + 1 if agree else 0):
             self._pending.popleft()

@@ -8,6 +8,8 @@ Source: Huber, "The behavior of maximum likelihood estimates under nonstandard c
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from canprobe.touch._arrays import Array
@@ -67,11 +69,13 @@ class Score:
         if self._correlation is None:
             return np.asarray(J.T @ J, dtype=np.float64)
         n, k = len(J) // 3, J.shape[1]
-        places = moved / n * np.arange(1.0, n + 1.0)
-        by_sample = J.reshape(n, 3 * k)
-        own = J.T @ mixed(self._correlation.matrix(places), J.reshape(n, 3, k)).reshape(-1, k)
-        fades = np.exp(-places / self._correlation.length)
-        cross = (fades @ by_sample).reshape(3, k).T @ (kept * self._recent)
-        newest = self._correlation.shares[:, None] * ((fades[-1] / fades) @ by_sample).reshape(3, k)
-        self._recent = kept * fades[-1] * self._recent + newest
-        return np.asarray(own + cross + cross.T, dtype=np.float64)
+        fade = math.exp(-moved / (n * self._correlation.length))
+        shared = self._correlation.shares[:, None] * J.reshape(n, 3, k)
+        recent, past = kept * self._recent, np.empty((n, 3, k))
+        for i in range(n):
+            recent *= fade
+            past[i] = recent
+            recent += shared[i]
+        self._recent = recent
+        cross = J.T @ past.reshape(-1, k)
+        return np.asarray(J.T @ J + cross + cross.T, dtype=np.float64)

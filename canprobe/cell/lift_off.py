@@ -1,0 +1,101 @@
+"""Taking the probe off the object without its task: with the drives that still obey, a short way, back along the pole.
+
+A lost drive stands still, by its own quick stop or because nobody tells it anything else, and where it stands is known.
+The others carry the tool's point away from the object on a straight line, its orientation left open. A drive that tells
+a position it cannot have reached may be moving: then nothing is moved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.drives import DriveGroup
+from canprobe.cell.measurement import Measurement
+from canprobe.robot.kinematics import forward_jacobian
+from canprobe.robot.lifting import lifting_step
+from canprobe.robot.puma260 import PumaModel
+
+Vector = NDArray[np.float64]
+WAY = 6e-3
+"""m: as far as a touch retreats, and further than the softest pad is pressed in."""
+SPEED = 20e-3
+"""m/s, the mean; it begins with twice as much, which then falls to zero."""
+ARRIVE_S = 0.02
+"""For the drives' lag at the end."""
+
+
+class LiftOff:
+    """One way back, cycle by cycle.
+
+    Args:
+        drives: the arm; those that do not obey are told to stop from now on.
+        model: the arm's geometry.
+        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        period_s: of the cycle.
+        obeys: whether the node of a drive does what it is told, as far as NMT and EMCY tell.
+    """
+
+    def __init__(
+        self,
+        drives: DriveGroup,
+        model: PumaModel,
+        flange_probe: Vector,
+        period_s: float,
+        obeys: Callable[[int], bool],
+    ) -> None:
+        self._drives, self._model, self._flange_probe = drives, model, flange_probe
+        self._period_s = period_s
+        self._obeys = obeys
+        self._free = self._obeying()
+        self._targets = drives.targets()
+        self._away: Vector | None = None
+        self._t = 0.0
+
+    def _obeying(self) -> NDArray[np.bool_]:
+        """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
+        drives = self._drives
+        heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
+        return np.array([age == 0 and enabled and self._obeys(axis.node_id) for axis, age, enabled in heard])
+
+    @property
+    def possible(self) -> bool:
+        """Some drives obey, and none tells what cannot be."""
+        return bool(self._free.any()) and not self._drives.disbelieved
+
+    def begin(self) -> None:
+        """Tell the drives that do not obey to stop."""
+        axes = zip(self._drives.axes, self._free, strict=True)
+        self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
+
+    def step(self, measurement: Measurement) -> Vector | None:
+        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on."""
+        if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
+            return None
+        T, J = forward_jacobian(self._model, measurement.q, self._flange_probe)
+        if self._away is None:
+            self._away = -T[:3, 2]
+        before, self._t = self._gone(self._t), self._t + self._period_s
+        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+            return None
+        move = self._away * (self._gone(self._t) - before)
+        if move.any():
+            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
+            if counts is None:
+                return None
+            self._targets = self._targets + counts
+        q: Vector = self._model.joints_per_count @ self._targets
+        return q
+
+    def _still_obeyed(self) -> bool:
+        """A TPDO may be missing now and then; who has left operation does not come back."""
+        enabled = np.array(self._drives.enabled_ones())
+        late = np.array(self._drives.ages()) >= 3
+        return not bool((self._free & (~enabled | late)).any())
+
+    @staticmethod
+    def _gone(t: float) -> float:
+        """Way after ``t`` seconds, m."""
+        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)

@@ -1,0 +1,29 @@
+"""When an interrupt is raised."""
+
+from __future__ import annotations
+
+import signal
+
+import pytest
+
+from canprobe.cli.interrupts import Terminated, interrupts_held, termination_interrupts
+
+
+@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+def test_an_interrupt_waits_for_the_end_of_the_block(number, kind):
+    done = []
+    before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]
+    with pytest.raises(kind) as raised, termination_interrupts():
+        with interrupts_held():
+            signal.raise_signal(number)
+            done.append("whole")
+        done.append("not reached")
+    assert done == ["whole"] and raised.type is kind
+    assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_without_one_nothing_happens_and_an_error_passes():
+    with pytest.raises(ZeroDivisionError), interrupts_held():
+        raise ZeroDivisionError
+    with interrupts_held():
+        pass

@@ -1,0 +1,105 @@
+"""A node is lost while the probe presses: the drives that obey take it off, unless one may be moving by itself."""
+
+from __future__ import annotations
+
+from itertools import count
+from struct import pack, unpack
+
+import numpy as np
+import pytest
+from injected import HOLD_CYCLE, Injected, altered, send
+
+from canprobe.cell.lift_off import WAY
+from canprobe.cell.measurement import Command
+from canprobe.emulator.faults import FaultKind
+from canprobe.errors import SafetyStop
+from canprobe.protocol.frames import SYNC_ID, NmtState
+
+
+def lifted(run):
+    """How far the probe's centre went back along its pole after the fault, m, and how far to the side."""
+    truth = run.session.truth
+    way = truth["probe_centre"][-1] - truth["probe_centre"][run.at]
+    back = -float(way @ truth["pole"][run.at])
+    return back, float(np.linalg.norm(way + back * truth["pole"][run.at]))
+
+
+def mute(node_id):
+    return "drive_silent", lambda r: r.fault(FaultKind.MUTE, node_id)
+
+
+LOST = {
+    "joint 1 is mute": mute(1),
+    "joint 3 boots again": ("nmt_state", lambda r: r.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)),
+    "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
+    "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
+    "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
+}
+
+
+@pytest.mark.parametrize("what", LOST)
+def test_the_probe_is_taken_off(what):
+    key, action = LOST[what]
+    run = Injected("press", HOLD_CYCLE, action)
+    run.assert_within(key).assert_drives_off(but=(6,) if "frozen" in what else ())
+    assert run.session.truth["force"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.truth["force"][-1] == 0.0
+    back, aside = lifted(run)
+    assert 0.95 * WAY < back < 1.2 * WAY and aside < 0.05 * WAY, "without a sensor the task begins to retreat by itself"
+    assert any(fault.endswith(": lift off") for fault in run.session.cell.faults)
+    if what.startswith("joint"):
+        motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.counts.T
+        lost = int(what.split()[1]) - 1
+        turned = np.ptp(motors, axis=0)
+        assert turned[lost] < 30, "it stood still"
+        assert turned.max() > 100, "others did not"
+
+
+def test_two_lost_drives_leave_four():
+    def both(run):
+        run.fault(FaultKind.MUTE, 2)
+        run.fault(FaultKind.MUTE, 6)
+
+    run = Injected("press", HOLD_CYCLE, both)
+    run.assert_within("drive_silent").assert_drives_off()
+    assert run.session.truth["force"][-1] == 0.0
+
+
+def pressed_on(run, told):
+    run.assert_drives_off()
+    assert run.session.truth["force"][-1] == pytest.approx(2.0, abs=0.3)
+    assert abs(lifted(run)[0]) < 0.1 * WAY
+    assert any(told in fault for fault in (str(run.error), *run.session.cell.faults))
+
+
+def test_a_drive_that_tells_what_cannot_be_may_be_moving():
+    change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
+    run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
+    pressed_on(run, "the probe stays where it is")
+
+
+def test_with_another_master_nothing_moves():
+    pressed_on(Injected("press", HOLD_CYCLE, lambda r: send(r, (SYNC_ID, b""))), "another master")
+
+
+def test_a_way_back_on_which_the_force_grows_ends():
+    def misfeel(run):
+        force = count(2.0, 0.01)
+        run.session.cell.supervisor.felt = lambda: next(force)
+        run.fault(FaultKind.MUTE, 4)
+
+    run = Injected("press", HOLD_CYCLE, misfeel)
+    run.assert_drives_off()
+    assert 0.0 < lifted(run)[0] < 0.5 * WAY
+
+
+def test_an_own_controller_that_cannot_retreat_is_taken_off_at_the_force_limit():
+    class Pressing(Injected):
+        def command(self, measurement, command):
+            return self.task.step(measurement) if measurement.cycle < self.at else Command()
+
+    run = Pressing("press", 5000, lambda _: None, own=True, limits={"force_max_n": 1.0})
+    assert isinstance(run.error, SafetyStop) and "above the limit of 1.00 N" in str(run.error)
+    run.assert_drives_off()
+    assert 1.0 < run.session.truth["force"].max() < 1.5
+    assert run.session.truth["force"][-1] == 0.0
