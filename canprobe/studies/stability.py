@@ -86,7 +86,7 @@ def _quick_cases() -> list[Case]:
     return [
         Case("told", 1e4, rate_hz=200.0, feels=False, hold_s=0.1),
         Case("told", 1e7, feels=False),
-        Case("felt", 6e4),
+        Case("drives", 1e6, bandwidth_hz=3.0, fidelity="dynamic"),
         Case("felt", 1e4, late_ms=20.0),
         Case("felt", 1e4, rate_hz=1000.0),
         _round(10_000.0, 1.0),
@@ -170,11 +170,14 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
         settles = [r for r in told if r["eigenvalue"] < 1.0]
         right = sum(r["ended"] == "stable" for r in settles)
         not_settling = [r for r in told if r["eigenvalue"] >= 1.0]
+        unheard = sum("no tactile frame" in r["reason"] for r in settles)
+        over = sum("above the limit" in r["reason"] for r in settles)
         wrong = sum(r["ended"] != "stable" for r in not_settling)
         early = sum(r["ended"] != "stable" and r["contact_n_m"] > approach_limit(r) for r in not_settling)
         said.append(
             f"Servo that believes what it was told, from 1e+03 N/m up: of {len(settles)} touches whose eigenvalues lie "
-            f"inside the unit circle {right} are stable, of {len(not_settling)} outside {wrong} are not; {early} of "
+            f"inside the unit circle {right} are stable, {unheard} heard no image in time, {over} went over the force "
+            f"limit at the touch itself; of {len(not_settling)} outside {wrong} are not stable; {early} of "
             "these are beyond the approach's own limit, and tell nothing about the loop."
         )
     felt = [r for r in rows if r["view"] == "felt" and r["ended"] != "refused"]

@@ -6,9 +6,9 @@ true force. The plan is asked first: what a bus cannot carry is a row with the p
 CAN FD for the taxels. What the drives send and get is classical all the same, so that a rate stays beyond a bus of
 1 Mbit/s: such rates are scanned on a bus of 8 Mbit/s, which no CAN has, to show what the rate alone would bring.
 
-The knee is the cheapest combination on a real bus whose errors are all small enough (`ENOUGH`) and whose servo also
-holds the stiffest contact that the cell is made for, 40 kN/m: a scan of each setting there tells. There is one scan a
-combination: two of a setting with other noise differ by some tenths of their errors.
+The knee is the cheapest combination on a classical bus whose errors are all small enough (`ENOUGH`) and whose servo
+also holds the stiffest contact that the cell is made for, 40 kN/m: a scan of each setting there tells. There is one
+scan a combination: two of a setting with other noise differ by some tenths of their errors.
 """
 
 from __future__ import annotations
@@ -200,9 +200,9 @@ def _row(case: Case, answer: Row) -> Row:
 
 
 def good(rows: Iterable[Row], fidelity: str) -> list[Row]:
-    """The rows of a fidelity on a real bus that are good enough, the cheapest first."""
+    """The rows of a fidelity on a classical bus that are good enough, the cheapest first."""
     mine = [r for r in rows if r["fidelity"] == fidelity and all(r.get(m) is not None for m in MEASURES)]
-    mine = [r for r in mine if r["bus"] in REAL and r["stiff"] == "holds"]
+    mine = [r for r in mine if r["bus"] == CLASSICAL and r["stiff"] == "holds"]
     found = [r for r in mine if all(r[m] <= most for m, most in ENOUGH.items())]
     return sorted(found, key=lambda r: float(r["cost_ms_per_s"]))
 
@@ -233,8 +233,8 @@ def _knee(best: Row | None) -> str:
     if best is None:
         return f"no combination is within {limits} of curvature, normal and force and holds 40 kN/m"
     return (
-        f"the knee, the cheapest within {limits} of curvature, normal and force whose servo also holds a contact of "
-        f"40 kN/m, is {_told(best)}"
+        f"the knee, the cheapest on classical CAN within {limits} of curvature, normal and force whose servo also "
+        f"holds a contact of 40 kN/m, is {_told(best)}"
     )
 
 

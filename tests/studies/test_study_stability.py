@@ -9,9 +9,20 @@ import numpy as np
 import pytest
 
 from canprobe.emulator.plant.arm import natural_frequency
+from canprobe.robot.kinematics import forward
+from canprobe.robot.puma260 import MODELS
+from canprobe.scene_geometry import T_flange_probe, rotation_rpy
 from canprobe.studies import stability
 from canprobe.studies.stability_loop import ForceLoop, sample_map, spectral_radius, steepest_ratio
-from canprobe.studies.stability_runs import Case, layer_stiffness, longest_above, loop_of, scene_of
+from canprobe.studies.stability_runs import (
+    Case,
+    layer_stiffness,
+    longest_above,
+    loop_of,
+    scene_of,
+    touch_in_posture,
+    upright,
+)
 from canprobe.studies.study_files import write_study
 from canprobe.touch.contact import indentation_from_force
 
@@ -99,6 +110,29 @@ def test_feeling_takes_the_wrong_stiffness_out_of_the_loop_within_its_bound():
     assert loop_of(Case("x", 1e6)).depth_ratio > 10.0
 
 
+def test_a_posture_touches_where_the_arm_would_be():
+    """Joints by the forward kinematics: 10 mm above, the pole points at the place, against its normal."""
+    case = stability.cases(False)[16]
+    T = forward(MODELS["upenn"], np.radians(case.posture_deg)) @ T_flange_probe(scene_of(case).probe)
+    tip = 1e3 * T[:3, 3] + 40.0 * T[:3, 2]
+    np.testing.assert_allclose(tip + 10.0 * T[:3, 2], case.at_mm, atol=1e-6)
+    np.testing.assert_allclose(-T[:3, 2], case.normal, atol=1e-9)
+    _, normal, away = touch_in_posture((90.0, 65.0, 15.0, -360.0, 5.0, 0.0))
+    assert abs(away[4] - 5.0) < 2.0 and normal == pytest.approx(normal / np.linalg.norm(normal))
+
+
+@pytest.mark.parametrize("normal", [(0.0, 0.0, 1.0), (0.6, 0.0, 0.8), (0.0, 0.985, -0.174), (-0.48, 0.6, 0.64)])
+def test_an_object_stands_upright_on_its_normal(normal):
+    unit = np.array(normal) / np.linalg.norm(normal)
+    z = rotation_rpy(*np.radians(upright(tuple(unit))))[:, 2]
+    np.testing.assert_allclose(z, unit, atol=1e-12)
+
+
+def test_the_array_is_one_that_the_wanted_force_does_not_saturate():
+    scales = [scene_of(Case("x", k)).sensor.full_scale_kpa for k in (1e3, 1e4, 2e4, 1e7)]
+    assert scales == [100.0, 100.0, 300.0, 300.0]
+
+
 def test_time_above_a_limit():
     times, forces = np.arange(7) * 10, np.array([0.0, 3.0, 3.0, 1.0, 3.0, 3.0, 3.0])
     assert longest_above(times, forces, 2.0) == 20
@@ -151,7 +185,7 @@ def test_findings_name_every_touch_that_ends_otherwise(tmp_path):
     said = "\n".join(stability.findings([good, bad]))
     assert "told, 1e+06 N/m" in said
     assert "failed, hang" in said
-    assert "of 1 outside 1 are not" in said
+    assert "of 1 outside 1 are not stable" in said
     assert good["eigenvalue"] < 1.0 < bad["eigenvalue"]
 
 
