@@ -1,4 +1,4 @@
-"""What a run leaves behind whose bring-up failed: every file, and a summary that is JSON."""
+"""What a run leaves behind that did not get far, or that held in the middle: every file, and a summary that is JSON."""
 
 from __future__ import annotations
 
@@ -56,3 +56,13 @@ def test_a_failed_bring_up_leaves_every_file(tmp_path: Path, monkeypatch: pytest
     resets = [data for _, _, can_id, data in read_candump(tmp_path / "bus.log") if can_id == 0]
     assert resets.count(b"\x81\x03") == 3, "two retries"
     canprobe.load_scene(tmp_path / "scene.toml")
+
+
+def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A drive is not heard for four cycles of the scan; the task is not asked in those that hold."""
+    run_with([Fault(FaultKind.DROP, 3, 2700 * MS, 11 * MS)], "press", tmp_path, monkeypatch, 1.0)
+    summary = read_json(tmp_path / "summary.json")
+    assert summary["completed"] and any(fault.endswith("hold") for fault in summary["faults"])
+    with np.load(tmp_path / "log.npz") as log:
+        assert np.isnan(log["force_n"][len(log["t_s"]) // 2 : -10]).any(), "it did hold in the scan"
+    assert 0.0 < summary["contact"]["force_measured_rms_error_n"] < 0.2
