@@ -24,7 +24,10 @@ def press():
 
 
 def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
-    """Asked for 3 N instead of 2 N during the hold, the plant's true force is 3 N; then stop, long before the end."""
+    """Asked for 3 N instead of 2 N during the hold, that is what is felt; then stop, long before the end.
+
+    The true force is up to a twelfth higher: an array that was only pressed, and not yet rolled over, reads low.
+    """
     queue, task = deque(), make_task(press.plan)
     controller = RequestedTask(task, None, (queue,), 2.5e-3)
     held = 0
@@ -46,7 +49,8 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     assert np.abs(np.diff(target)).max() == pytest.approx(FORCE_RATE * 2.5e-3)  # no step
     first, last = task.scan_cycles
     assert last - first == pytest.approx(480, abs=2)
-    assert press.truth["force"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.15)
+    assert log["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.1)
+    assert press.truth["force"][last - 60 : last].mean() == pytest.approx(3.0, rel=1 / 12)
     assert task.reason is None and press.cell.faults == []
 
 
