@@ -276,7 +276,7 @@ def _bound_ratio(
 
     None where the contact patch helped most answers: the bound is that of points and normals.
     """
-    from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M
+    from canprobe.cell.tasks.build import SIGMA_NORMAL_RAD, SIGMA_POINT_M, centroid_coupling
 
     shape = scene.shape
     if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
@@ -288,7 +288,7 @@ def _bound_ratio(
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=0.0 if scene.probe is None else 1e3 / scene.probe.radius_mm,
+        coupling=0.0 if scene.probe is None else centroid_coupling(scene.probe),
     )
     return None if bound is None else score.kappa_rms / bound
 

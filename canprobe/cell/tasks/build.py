@@ -20,7 +20,7 @@ from canprobe.cell.tasks.touch_settings import TouchSettings
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
 from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene, ServoSettings, TaskSettings
+from canprobe.scene import ProbeSettings, Scene, ServoSettings, TaskSettings
 from canprobe.scene_geometry import T_flange_probe, scan_axes
 from canprobe.touch.patch_image import MomentImage
 from canprobe.touch.servo import SurfaceGains
@@ -141,6 +141,11 @@ def _strategy(task: TaskSettings) -> Strategy | None:
     return make_strategy(task.strategy, task.length_mm * 1e-3, task.width_mm * 1e-3, task.wavelength_mm * 1e-3)
 
 
+def centroid_coupling(probe: ProbeSettings) -> float:
+    """`Noise.coupling` of contacts that the array on this probe feels, 1/m."""
+    return 1e3 / probe.radius_mm
+
+
 def make_shape_estimator(scene: Scene, method: str) -> Estimator:
     """An estimator as the scene sets it, by name."""
     from canprobe.touch.estimators import make_estimator  # only where a shape is asked for
@@ -157,7 +162,7 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
         memory_m=memory,
         window=window,
         correlation=Correlation(*CORRELATION),
-        coupling=1e3 / scene.probe.radius_mm,
+        coupling=centroid_coupling(scene.probe),
     )
     if method not in WITH_PATCH or not _uses_patch(scene):
         return estimator
