@@ -182,7 +182,7 @@ def build_estimate(
     if decision.rank == 3:
         kappa, local = _principal(k)
         observed = np.array([True, True])
-        umbilic = _is_umbilic(k, covariance)
+        umbilic = is_umbilic(k, covariance)
     else:
         k, covariance, kappa, local, observed = _partly(k, covariance, decision, solution.has_prior, length)
         umbilic = False
@@ -226,7 +226,7 @@ def _principal(K: Array) -> tuple[Array, Array]:
     return np.array([mean + radius, mean - radius]), np.array([[c, s], [-s, c]])
 
 
-def _is_umbilic(K: Array, covariance: Array) -> bool:
+def is_umbilic(K: Array, covariance: Array) -> bool:
     """The deviator (K11 − K22, 2 K12) is within its 95 % region of 0."""
     (k11, k12), (_, k22) = K.tolist()
     (c11, c12, c13), (_, c22, c23), (_, _, c33) = covariance.tolist()

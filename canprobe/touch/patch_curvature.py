@@ -80,6 +80,12 @@ class _Mean:
         self.age = 0.0
         self._most, self._gross = most, gross
         self._frames = 0
+        self._apart = 0
+
+    @property
+    def frames(self) -> int:
+        """How many the mean stands for."""
+        return self._frames
 
     def add(self, xx: float, xy: float, yy: float) -> float:
         """Take the moments of a frame; its share in the mean, small where it is far from it."""
@@ -88,10 +94,20 @@ class _Mean:
         mxx, mxy, myy = self.moments
         dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
         if self._frames >= LEAST_FRAMES:
-            share *= min(1.0, self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300))
+            nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
+            self._apart = self._apart + 1 if nearness < 1.0 else 0
+            if self._apart == LEAST_FRAMES:
+                return self._restart(xx, xy, yy)
+            share *= min(1.0, nearness)
         self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
         self.age = (1.0 - share) * (self.age + 1.0)
         return share
+
+    def _restart(self, *moments: float) -> float:
+        """So many in a row are no outliers: what was before them is not what is felt now."""
+        xx, xy, yy = moments
+        self.moments, self.age, self._frames, self._apart = (xx, xy, yy), 0.0, 1, 0
+        return 1.0
 
     def drift_from(self, younger: _Mean) -> Moments:
         """How far this is off by what changed since, if it went on as a younger mean says."""
@@ -142,12 +158,12 @@ class PatchCurvature:
             self.refused += 1
             return
         self._carry(*(-sample.n_base).tolist())
-        self.frames = min(self.frames + 1, MOST_FRAMES)
         (uu, uv, vv), memory = sample.moments, self.model.fit.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
         self._recent.add(xx, xy, yy)
         share = self._mean.add(xx, xy, yy)
+        self.frames = self._mean.frames
         self.force += share * (sample.force_n - self.force)
 
     def _carry(self, zx: float, zy: float, zz: float) -> None:

@@ -40,7 +40,7 @@ third of what is stated, so the share is of that. Set on seed 0 of eight scenes,
 CYCLES_TO_EFFECT = 2
 Vector = NDArray[np.float64]
 WITH_PATCH = ("recursive", "ml")
-"""Estimators whose answers the patch completes; the others stay what they are in the literature."""
+"""Estimators whose answers the patch completes and whose regions follow changes; the others stay what they are in the literature."""
 
 
 def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
@@ -164,12 +164,20 @@ def make_shape_estimator(scene: Scene, method: str) -> Estimator:
         correlation=Correlation(*CORRELATION),
         coupling=centroid_coupling(scene.probe),
     )
-    if method not in WITH_PATCH or not _uses_patch(scene):
+    if method not in WITH_PATCH:
         return estimator
+    from canprobe.touch.estimators.following import FollowingEstimator
+
+    return FollowingEstimator(_with_patch(scene, estimator, memory) if _uses_patch(scene) else estimator, memory)
+
+
+def _with_patch(scene: Scene, estimator: Estimator, memory: float) -> Estimator:
+    """The estimator with the contact patch as its second sensor."""
     from canprobe.cell.tasks.patch_fits import moment_model
     from canprobe.touch.estimators.patched import PatchedEstimator
     from canprobe.touch.patch_curvature import PatchCurvature
 
+    assert scene.probe is not None and scene.sensor is not None
     model = moment_model(
         array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
         scene.probe.stiffness_n_m3,

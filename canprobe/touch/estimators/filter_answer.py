@@ -48,7 +48,6 @@ def filter_estimate(
     prior: str,
     notes: tuple[str, ...],
     expected: Expected | None,
-    lag: Array | None,
 ) -> SurfaceEstimate:
     """The answer at the foot of a point.
 
@@ -58,9 +57,8 @@ def filter_estimate(
         spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
         innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
         expected: of the samples, to allow for what a quadric leaves out (`left_out`); None: the surface is one exactly.
-        lag: (9,) one standard deviation of what the parameters lag behind (`Trend`); None for none.
     """
-    found = _answered(state, point, spread, expected, lag)
+    found = _answered(state, point, spread, expected)
     a, decision = found.anchor, found.decision
     deviation = a.M @ found.deviation
     covariance = curvature_covariance(a.c, deviation)
@@ -84,9 +82,7 @@ def filter_estimate(
     )
 
 
-def _answered(
-    state: InformationFilter, point: Array, spread: Array, expected: Expected | None, lag: Array | None
-) -> _Answer:
+def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
     """With the sandwich covariance, amended where all is observed."""
     place = state.place(point)
     a = anchor(state.c, state.T, place, state.length)
@@ -103,7 +99,4 @@ def _answered(
             return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
         a = anchor(amended.c, state.T, place, state.length)
         noise += state.root @ amended.covariance @ state.root.T
-    if lag is not None:
-        late = state.root @ lag
-        noise += np.outer(late, late)
     return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)

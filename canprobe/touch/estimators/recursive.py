@@ -27,7 +27,6 @@ from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.estimators.start import Start
 from canprobe.touch.estimators.travel import Spread, Travel
-from canprobe.touch.estimators.trend import Trend
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.noise import Correlation
 from canprobe.touch.prior import Prior
@@ -107,7 +106,6 @@ class RecursiveEstimator:
         self._travel = Travel(max(STEP * self._memory, 3.0 * self._gate.sigma_point))
         self._spread = Spread()
         self._change = ChangeTest()
-        self._trend = Trend(self._memory)
         self._start: Start | None = Start(self._memory, self._prior)
         self._settled = False
         self._doubtful = 0.0
@@ -146,7 +144,6 @@ class RecursiveEstimator:
             prior=self._prior.name,
             notes=self._notes(),
             expected=None if self._quadric else self._expected(),
-            lag=None if self._quadric else self._trend.lag(self._filter.T),
         )
 
     def _expected(self) -> Expected:
@@ -169,13 +166,10 @@ class RecursiveEstimator:
             self._drop_agreeing(compared.squares)
             self._spread.fade(0.0)
             self._start = Start(self._memory, self._prior)
-            self._trend.reset()
         if self._start is not None:
             self._begin_with(self._start, moved)
         elif compared:
             self._absorb(compared, moved)
-        if self._settled:
-            self._trend.take(self._filter.c, self._filter.T, moved)
 
     def _compared(self) -> _Compared:
         found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])

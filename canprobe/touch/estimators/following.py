@@ -1,0 +1,130 @@
+"""An estimator whose regions grow where its answers change along the path.
+
+A memory is a mean over the path, and a patch is one over its own size. Where curvature changes along the path the mean
+is that of an earlier place; the terms that a quadric leaves out (`misfit`) follow most of the change, not all of it.
+What is left has the direction in which the answers move, and is taken to be what they moved by over a small share of
+the memory. So it is nothing where the answers stay, however uncertain the surface was before, and it is large for a
+while where they go over from one curvature to another. The answers themselves are not touched.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+
+from canprobe.touch._arrays import Array
+from canprobe.touch.contact import ContactSample
+from canprobe.touch.estimate import SurfaceEstimate, is_umbilic
+from canprobe.touch.estimators.base import Dropped, Estimator
+from canprobe.touch.evidence import TO_Q
+
+SPAN = 0.5
+"""Path, over the memory, along which a change of the answers is looked for."""
+LEAST_SPAN = 0.05
+"""The same just after a start."""
+LAG = 0.075
+"""Path, over the memory, that an answer lags behind, one standard deviation: 1.5 mm of 20 mm, half a patch. Set on the
+calibration seeds of `canprobe study pipeline`."""
+
+
+class FollowingEstimator:
+    """Any estimator; the covariance of its answers grows by what they lag behind.
+
+    Args:
+        inner: the estimator.
+        memory_m: path that it remembers, m.
+    """
+
+    def __init__(self, inner: Estimator, memory_m: float) -> None:
+        self.inner = inner
+        self._memory = memory_m
+        self._past: deque[tuple[float, Array]] = deque()
+        self._place: Array | None = None
+        self._travelled = 0.0
+
+    @property
+    def dropped(self) -> Dropped:
+        """Samples that were not used."""
+        return self.inner.dropped
+
+    @dropped.setter
+    def dropped(self, dropped: Dropped) -> None:
+        self.inner.dropped = dropped
+
+    @property
+    def changes(self) -> int:
+        """How often the surface was found to have changed."""
+        return self.inner.changes
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        self.inner.add(sample)
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self.inner.reset()
+        self._past.clear()
+        self._place = None
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the last contact, or None before there is any."""
+        answer = self.inner.estimate()
+        if answer is None or answer.rank < 3:
+            return answer
+        if self._place is not None:
+            self._travelled += float(np.linalg.norm(answer.point - self._place))
+        self._place = answer.point
+        tensor = answer.curvature_tensor_base()
+        late = self._late(tensor)
+        self._past.append((self._travelled, tensor))
+        return answer if late is None else less_certain(answer, late)
+
+    def _late(self, tensor: Array) -> Array | None:
+        """(3, 3) change of the curvature tensor over the path that an answer lags behind; None where there is none."""
+        past = self._past
+        while len(past) > 1 and self._travelled - past[1][0] >= SPAN * self._memory:
+            past.popleft()
+        if not past or self._travelled - past[0][0] < LEAST_SPAN * self._memory:
+            return None
+        then, before = past[0]
+        result: Array = (tensor - before) * (LAG * self._memory / (self._travelled - then))
+        return result
+
+
+def less_certain(answer: SurfaceEstimate, late: Array) -> SurfaceEstimate:
+    """An answer whose curvature is also off by a share of a tensor, of either sign, with standard deviation 1.
+
+    Args:
+        answer: everything observed.
+        late: (3, 3) of the frame of the points, 1/m.
+    """
+    P = answer.T_frame_contact[:3, :2]
+    (k11, k12), (_, k22) = (P.T @ late @ P).tolist()
+    entries = np.array([k11, k12, k22])
+    covariance = answer.covariance + np.outer(entries, entries)
+    root = answer.model_root
+    if root is not None:
+        root = _with_error(root, np.array([0.0] * 6 + [0.5 * k11, 0.5 * k12, 0.5 * k22]))
+    seen = answer.information @ (TO_Q * entries)
+    information = answer.information - np.outer(seen, seen) / (1.0 + float(TO_Q * entries @ seen))
+    return replace(
+        answer,
+        covariance=covariance,
+        information=information,
+        model_root=root,
+        umbilic=is_umbilic(answer.K, covariance),
+    )
+
+
+def _with_error(root: Array, error: Array) -> Array:
+    """A root (n, k) of an information once the parameters have one more error (k,) of random size."""
+    u = root @ error
+    square = float(u @ u)
+    if square == 0.0:
+        return root
+    share = (1.0 - 1.0 / math.sqrt(1.0 + square)) / square
+    result: Array = root - np.outer(share * u, u @ root)
+    return result
