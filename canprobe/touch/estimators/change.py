@@ -9,6 +9,9 @@ from __future__ import annotations
 
 from collections import deque
 
+import numpy as np
+
+from canprobe.touch._arrays import Array
 from canprobe.touch.nonlinear import CHI2_999
 
 LAST_FEW, BEST = 8, 3
@@ -21,6 +24,10 @@ samples among the eight, one in a thousand and one in a hundred are above the se
 USUAL = (0.3, 2.0)
 """Bounds of the usual innovation that an alarm is measured by. It is small where the stated noise is generous; above
 the upper bound no innovation, capped as it is, could ever set off an alarm."""
+AGREES = 4.8
+"""Squared residual over the median one up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
+_MEDIAN = 2.366
+"""Median of χ² of 3."""
 RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
@@ -72,3 +79,14 @@ class ChangeTest:
 
 def _bounded(usual: float) -> float:
     return min(max(usual, USUAL[0]), USUAL[1])
+
+
+def looks_changed(squares: Array) -> bool:
+    """The same test on a batch: whether its last few samples disagree with the fit of all of them.
+
+    Args:
+        squares: (n,) squared residuals, χ² of 3, in the order of time.
+    """
+    usual = _bounded(float(np.median(squares)) / _MEDIAN)
+    last = np.sort(np.minimum(squares[-LAST_FEW:], CHI2_999)) / 3.0
+    return bool(last.mean() >= ALARM * usual and last[:BEST].mean() >= ALARM_OF_BEST * BEST_SHARE * usual)
