@@ -8,7 +8,7 @@ residuals insist, anything (`EVIDENCE`). The weights are the prior's times the m
 quadric stays one, a misfit that shows is corrected, one that could hide in the noise widens the covariance.
 
 The correction is one linear step, and higher terms follow where quartic ones matter: their part is taken to be a
-quarter of `‖K‖ · length` of the correction, and goes into the covariance. A correction of more than a tenth of K is
+third of the correction, and goes into the covariance. A correction of more than a tenth of K is
 beyond that: the path has no local quadric, and K is not observed.
 
 Source: Hoeting, Madigan, Raftery and Volinsky, "Bayesian model averaging: a tutorial", 1999, (1)–(3), with the marginal
@@ -33,8 +33,8 @@ CHANGES = (0.05, 0.15, 0.5)
 """A usual change of curvature along a surface: dK/ds over ‖K‖²."""
 EVIDENCE = 10.0 ** np.arange(1.0, 9.0)
 """Variances of the tail over that of the best known of the terms."""
-LEFT_OUT = 0.25
-"""Higher terms over what cubic and quartic ones changed, per unit of ‖K‖ · length."""
+LEFT_OUT = 0.35
+"""Higher terms over what cubic and quartic ones changed; on an edge they are no smaller where the surface is flat."""
 TRUST = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""
 CERTAIN = 0.99
@@ -112,7 +112,7 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
     left = weight @ share
     spread = (carried * left) @ carried.T + (apart.T * weight) @ apart
     changed = float(weight @ np.square(shifts[:, 6:]) @ _PER_SQUARE)
-    spread.flat[60::10] += (LEFT_OUT * min(curvature, 1.0)) ** 2 * changed / _PER_SQUARE  # of K
+    spread.flat[60::10] += LEFT_OUT**2 * changed / _PER_SQUARE  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
     return Averaged(mean, spread, left, 1.0 - float(weight[0]), trusted)
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch._arrays import Array, solved
+from canprobe.touch._arrays import Array, positive, solved
 from canprobe.touch.contact import ContactSample, direction_to_pad
 from canprobe.touch.evidence import TO_Q, CurvatureInformation
 from canprobe.touch.frames import tangent_rotation
@@ -124,14 +124,16 @@ class PatchCurvature:
 
     Args:
         model: of the sensor.
+        spread: variance of the moments over what the model's calibration found.
 
     Attributes:
         frames: how many the mean stands for, at most `MOST_FRAMES`.
         refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
     """
 
-    def __init__(self, model: MomentModel) -> None:
+    def __init__(self, model: MomentModel, spread: float = 1.0) -> None:
         self.model = model
+        self._spread = positive("spread", spread)
         self.refused = 0
         self.reset()
 
@@ -246,7 +248,7 @@ class PatchCurvature:
             for _ in range(MOST_ROUNDS):
                 J, r, W = self.model.linearised(seen.moments, self.force, self.frames, k)
                 W = _less_certain(W, seen)
-                W *= weight * self.model.trust(k, self.force)
+                W *= weight * self.model.trust(k, self.force) / self._spread
                 JW, q = J.T @ W, TO_Q * k
                 patch = JW @ J
                 off = motion.q - q
