@@ -139,13 +139,9 @@ class PatchCurvature:
 
     def reset(self) -> None:
         """Forget all images: contact was lost."""
-        self._memory = PadMemory()
-        self.forget()
-
-    def forget(self) -> None:
-        """Forget what the images said of the surface: it has changed; the pad still remembers where the patch was."""
         self.frames = 0
         self.force = 0.0
+        self._memory = PadMemory()
         self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
         self._last: tuple[float, float, float] | None = None
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)

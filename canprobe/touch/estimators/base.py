@@ -56,10 +56,6 @@ class Estimator(Protocol):
 
     dropped: Dropped
 
-    @property
-    def changes(self) -> int:
-        """How often the surface was found to have changed: what was felt before is of another one."""
-
     def add(self, sample: ContactSample) -> None:
         """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
 
@@ -151,7 +147,6 @@ class WindowEstimator:
         if window < self.least:
             raise UsageError(f"window: expected at least {self.least} samples, got {window}")
         self.dropped = Dropped()
-        self.changes = 0
         self._gate = Gate(sigma_point, sigma_normal)
         self._coupling = coupling
         self._samples: deque[ContactSample] = deque(maxlen=window)

@@ -54,11 +54,6 @@ class FollowingEstimator:
     def dropped(self, dropped: Dropped) -> None:
         self.inner.dropped = dropped
 
-    @property
-    def changes(self) -> int:
-        """How often the surface was found to have changed."""
-        return self.inner.changes
-
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         self.inner.add(sample)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from canprobe.touch._arrays import Array
@@ -48,8 +50,8 @@ class MlEstimator(WindowEstimator):
         agree = np.flatnonzero(squares <= AGREES * float(np.median(squares)))
         for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_FEW)):
             self._samples.popleft()
-        self.changes += 1
-        return fit_ml(self._touches(), self._prior)
+        answer = fit_ml(self._touches(), self._prior)
+        return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
 
 def squared_residuals(answer: SurfaceEstimate, touches: Touches) -> Array:

@@ -33,17 +33,10 @@ class PatchedEstimator:
     def dropped(self, dropped: Dropped) -> None:
         self._motion.dropped = dropped
 
-    @property
-    def changes(self) -> int:
-        """How often the motion found the surface changed."""
-        return self._motion.changes
-
     def add(self, sample: ContactSample) -> None:
         """Take one contact with its moments."""
-        before, changes = self._motion.dropped.total, self._motion.changes
+        before = self._motion.dropped.total
         self._motion.add(sample)
-        if self._motion.changes != changes:
-            self.patch.forget()
         if self._motion.dropped.total == before:
             self._last = sample
             self.patch.add(sample)

@@ -123,11 +123,6 @@ class RecursiveEstimator:
             self._step(moved)
             self._pending.clear()
 
-    @property
-    def changes(self) -> int:
-        """How often the surface was found to have changed since the start."""
-        return self._change.alarms
-
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact that is no outlier; None before the contact has moved."""
         if self._last is None or self._spread.weight == 0.0:
