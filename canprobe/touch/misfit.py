@@ -33,7 +33,7 @@ CHANGES = (0.05, 0.15, 0.5)
 """A usual change of curvature along a surface: dK/ds over ‖K‖²."""
 EVIDENCE = 10.0 ** np.arange(1.0, 9.0)
 """Variances of the tail over that of the best known of the terms."""
-LEFT_OUT = .35
+LEFT_OUT = 0.35
 """Higher terms over what cubic and quartic ones changed; on an edge they are no smaller where the surface is flat."""
 TRUST = 0.1
 """Largest change of K that is believed, over ‖K‖ or 1/length."""

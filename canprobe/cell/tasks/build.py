@@ -35,15 +35,15 @@ SIGMA_NORMAL_RAD = 2e-3
 """Of what no error of the centroid explains: that one turns the normal by 1/R_p of it as well (`Noise.coupling`)."""
 CORRELATION = (4e-3, 0.015)
 """Length (m) and share of errors that last: gains, hysteresis and creep err alike for millimetres. Single errors are a
-third of what is stated, so the share is of that. Set on seeds 0 and 1 of nine scenes, and what no centroid explains on seeds
-100 and 101 of saddle and sphere; `canprobe study pipeline` verifies with others."""
-SCANNING = 2
+third of what is stated, so the share is of that. Set on seeds 0 and 1 of nine scenes, and what no centroid explains on
+seeds 100 and 101 of saddle and sphere; `canprobe study pipeline` verifies with others."""
+SCANNING = 2.0
 """Variance of second moments on a pad that slides over changing curvature, over that of the presses that the patch was
 calibrated with: of scans of torus, bowl and wave (seed 0) with the patch alone 1.7, 1.5 and 1.0, rounded up."""
 CYCLES_TO_EFFECT = 2
 Vector = NDArray[np.float64]
 WITH_PATCH = ("recursive", "ml")
-"""Estimators whose answers the patch completes and whose regions follow changes; the others stay what they are in the literature."""
+"""Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
 
 def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
