@@ -11,6 +11,7 @@ import numpy as np
 from canprobe.emulator.plant.pushing import Contact, OneTouch, Rubbing
 from canprobe.emulator.plant.pushing_many import ManyTouches
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, NEAR_M, force_laws
+from canprobe.robot.dynamics import LOWER
 from canprobe.robot.kinematics import Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.puma260 import Array, PumaModel
 from canprobe.robot.straight_line import Value, compiled
@@ -79,9 +80,10 @@ class Neighbourhood:
         return OneTouch(
             theta,
             depth,
-            (rows[:6], rows[6:12], rows[12:]),
-            pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)),
-            self.rubbing,
+            (rows[:6], rows[6:12], rows[12:18]),
+            rows[18:],
+            coefficient=pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)),
+            rubbing=self.rubbing,
         )
 
     def _many(self, theta: list[float], touches: Touches) -> Contact:
@@ -101,7 +103,8 @@ class Neighbourhood:
 
 @cache
 def _rows_for(back: tuple[float, ...]) -> Callable[..., tuple[float, ...]]:
-    """(18,) velocities along three directions per motor rate, of (6,) velocities along x, y and z per joint rate."""
+    """(18,) velocities along three directions n, s and t per motor rate, then the (21,) entries of s s' + t t'; of (6,)
+    velocities along x, y and z per joint rate."""
     return compiled("touch_rows", _touch_rows, {}, x=6, y=6, z=6, normal=3, tangents=6, back=back)
 
 
@@ -112,4 +115,4 @@ def _touch_rows(
     for a, b, c in (normal, tangents[:3], tangents[3:]):
         joints = [a * u + b * v + c * w for u, v, w in zip(x, y, z, strict=True)]
         rows += [sum((joints[i] * back[6 * i + j] for i in range(6)), 0.0) for j in range(6)]
-    return rows
+    return [*rows, *(rows[6 + i] * rows[6 + j] + rows[12 + i] * rows[12 + j] for i, j in LOWER)]
