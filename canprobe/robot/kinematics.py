@@ -48,7 +48,7 @@ def chain(model: PumaModel, q: npt.ArrayLike) -> Chain:
     Source: product of the standard DH transforms, worked out by hand; checked against the matrix product in tests.
     """
     d1, a2, offset, a3, d4, d6 = model.links
-    q1, q2, q3, q4, q5, q6 = q if isinstance(q, list) else np.asarray(q, dtype=float).tolist()
+    q1, q2, q3, q4, q5, q6 = q if isinstance(q, list | tuple) else np.asarray(q, dtype=float).tolist()
     c1, s1, c2, s2, c23, s23 = cos(q1), sin(q1), cos(q2), sin(q2), cos(q2 + q3), sin(q2 + q3)
     c4, s4, c5, s5, c6, s6 = cos(q4), sin(q4), cos(q5), sin(q5), cos(q6), sin(q6)
     # Elbow and wrist centre in the vertical plane of the arm, then turned by joint 1.
@@ -162,7 +162,7 @@ def point_velocity(c: Chain, point: Vec, qd: npt.ArrayLike) -> Vec:
     Returns:
         Velocity in the base frame, m/s.
     """
-    w1, w2, w3, w4, w5, w6 = np.asarray(qd, dtype=float).tolist()
+    w1, w2, w3, w4, w5, w6 = qd if isinstance(qd, list | tuple) else np.asarray(qd, dtype=float).tolist()
     px, py, pz = point
     (ax, ay, _), (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = c.axis2, c.axis4, c.axis5, c.z
     ox, oy, oz = w4 * fx + w5 * gx + w6 * hx, w4 * fy + w5 * gy + w6 * hy, w4 * fz + w5 * gz + w6 * hz

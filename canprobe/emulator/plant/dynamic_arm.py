@@ -15,7 +15,7 @@ from canprobe.emulator.plant.equations import ArmEquations
 from canprobe.emulator.plant.held_step import held_rosenbrock2
 from canprobe.emulator.plant.integrators import STEPS, rosenbrock2
 from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.reference import Reference
+from canprobe.emulator.plant.reference import NEVER, Reference
 from canprobe.robot.actuation import (
     CONTINUOUS_TORQUE_NM,
     COULOMB_NM,
@@ -133,9 +133,7 @@ class DynamicArm:
         """
         self._advance_to(self.t_ns)
         rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
-        self.equations.loops.set_loop(
-            axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
-        )
+        self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
         self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
@@ -174,11 +172,15 @@ class DynamicArm:
 
     def _bend(self) -> None:
         """Some reference changes its slope here."""
-        rows = [r.at(self._y_ns) for r in self._references]
-        theta = [x / scale for (x, _), scale in zip(rows, self._scales, strict=True)]
-        slope = [v / scale for (_, v), scale in zip(rows, self._scales, strict=True)]
-        self.equations.loops.set_reference(1e-9 * self._y_ns, theta, slope)
-        self._bend_ns = min(r.next_bend(self._y_ns) for r in self._references)
+        now_ns, theta, slope = self._y_ns, [], []
+        self._bend_ns = NEVER
+        for reference, scale in zip(self._references, self._scales, strict=True):
+            x, v = reference.at(now_ns)
+            theta.append(x / scale)
+            slope.append(v / scale)
+            bend_ns = reference.next_bend(now_ns)
+            self._bend_ns = min(self._bend_ns, bend_ns)
+        self.equations.loops.set_reference(1e-9 * now_ns, theta, slope)
 
     def _stepped(self, end_ns: int) -> Array:
         if self._y_ns >= self._hold_ns + self._stepping.hold_ns:

@@ -17,6 +17,8 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Vec = tuple[float, float, float]
+Directions = tuple[tuple[float, float], tuple[float, float]] | Array
+"""(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
 
 SIDE = 16
 PITCH_M = 0.0254 / SIDE
@@ -142,7 +144,7 @@ class PressureField:
         return means
 
     def mean_pressure(
-        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Array
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
     ) -> Array:
         """Taxel means of ``depth - probe height - object height`` where positive.
 
@@ -150,7 +152,7 @@ class PressureField:
             uv: contact point on the pad, m.
             depth: indentation, m.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: (2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction.
+            directions_pad: of the contact on the pad.
 
         Returns:
             (16, 16) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
@@ -158,7 +160,8 @@ class PressureField:
         if depth <= 0.0:
             return np.zeros((SIDE, SIDE))
         radius = self.radius
-        (m11, m12), (m21, m22) = directions_pad.tolist()
+        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
+        (m11, m12), (m21, m22) = given
         a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
         r0, r1 = self._span(uv[1], hypot(a * m12, b * m22))
         c0, c1 = self._span(uv[0], hypot(a * m11, b * m21))
@@ -172,8 +175,8 @@ class PressureField:
         for curvature, mx, my in ((kappa[0], m11, m12), (kappa[1], m21, m22)):
             if curvature:
                 root = radius * sqrt(0.5 * abs(curvature))
-                mx, my = root * mx, root * my
-                rows.append((mx * x0 + my * y0, mx * x1 + my * y1, mx * x2 + my * y2, 0.0))
+                a, b = root * mx, root * my
+                rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
         samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
         squeeze, *across = np.array(rows).dot(samples[:4])
         for curvature, height in zip(filter(None, kappa), across, strict=True):

@@ -14,7 +14,7 @@ from canprobe.emulator.plant.resting import LEAST_CURVATURE, NEAR_M, force_laws
 from canprobe.robot.dynamics import LOWER
 from canprobe.robot.kinematics import Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.puma260 import Array, PumaModel
-from canprobe.robot.straight_line import Value, compiled
+from canprobe.robot.straight_line import Value, compiled, matrix_product
 from canprobe.touch.objects import ObjectShape, Touches
 
 
@@ -50,7 +50,7 @@ class Neighbourhood:
         self._tool: Vec = tuple(T_flange_probe[:3, 3].tolist())
         self._base: Vec = tuple(base_offset.tolist())
         self._back: tuple[float, ...] = tuple(joints_per_motor.ravel().tolist())
-        self._shares = [[(j, g) for j, g in enumerate(row) if g] for row in joints_per_motor.tolist()]
+        self._joints = matrix_product(joints_per_motor.tolist())
         self._rows = _rows_for(tuple(float(g != 0.0) for g in self._back))
 
     def __call__(self, theta: list[float]) -> Contact | None:
@@ -59,24 +59,24 @@ class Neighbourhood:
         Args:
             theta: (6,) motor coordinates, rad.
         """
-        c = chain(self.model, [sum(g * theta[j] for j, g in row) for row in self._shares])
+        c = chain(self.model, self._joints(theta))
         x, y, z = self._base
         at = point_on_flange(c, self._tool)  # of the arm's own base
         centre = at[0] + x, at[1] + y, at[2] + z
-        foot = self.shape.closest(centre)
+        foot = self.shape.nearest(centre)
         depth = self.radius - foot.distance
         if depth < -NEAR_M:
             return None
         touches = self.shape.touches(centre, self.radius + NEAR_M)
         if touches is not None:
             return self._many(theta, touches)
-        least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa.tolist()
+        least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa
         A, B = 0.5 * max(least, 1.0 / self.radius + k1), 0.5 * max(least, 1.0 / self.radius + k2)
         # The probe's point that touches lies by an arm -n r off its centre.
-        normal, tangents, arm = foot.normal.tolist(), foot.directions.ravel().tolist(), max(depth, 0.0) - self.radius
+        normal, (d1, d2), arm = foot.normal, foot.directions, max(depth, 0.0) - self.radius
         touched = at[0] + arm * normal[0], at[1] + arm * normal[1], at[2] + arm * normal[2]
         x6, y6, z6 = point_jacobian(c, touched)
-        rows = self._rows(x6, y6, z6, normal, tangents, self._back)
+        rows = self._rows(x6, y6, z6, normal, (*d1, *d2), self._back)
         return OneTouch(
             theta,
             depth,

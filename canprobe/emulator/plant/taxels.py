@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.emulator.plant.field import SIDE, PressureField
+from canprobe.emulator.plant.field import SIDE, Directions, PressureField
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
@@ -136,7 +136,7 @@ class TaxelArray:
         uv: tuple[float, float],
         depth: float,
         kappa: tuple[float, float],
-        directions_pad: Array,
+        directions_pad: Directions,
         t_s: float,
         *,
         pressure_factor: float = 1.0,
@@ -147,7 +147,7 @@ class TaxelArray:
             uv: contact point on the pad, m.
             depth: indentation, m; <= 0 is no contact.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: (2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction.
+            directions_pad: of the contact on the pad.
             t_s: time of the sample, s, not before the previous one.
             pressure_factor: of the layer's damping.
 
@@ -189,7 +189,8 @@ class TaxelArray:
         if self.config.creep_per_decade > 0.0:
             self._creep[-1] = y.reshape(-1)
             self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
-            return self._creep[-1].reshape(SIDE, SIDE)
+            crept: Array = self._creep[-1].reshape(SIDE, SIDE)
+            return crept
         return y
 
     def _relaxed_by(self, dt: float) -> Array:

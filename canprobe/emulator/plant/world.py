@@ -6,6 +6,7 @@ and only when somebody asks. Contact pushes the dynamic arm back, not the ideal 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import cos, pi, sin
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,14 +17,15 @@ from canprobe.emulator.plant.arm import IdealArm
 from canprobe.emulator.plant.arms import make_arm
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
-from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
+from canprobe.emulator.plant.field import SIDE, Directions, Vec, pad_basis, pad_coordinates
 from canprobe.emulator.plant.motor import MotorDynamics
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import chain, point_on_flange, point_velocity
-from canprobe.robot.puma260 import Array, counts_to_joints
-from canprobe.touch.objects import ClosestPoint, Touches
+from canprobe.robot.puma260 import Array
+from canprobe.robot.straight_line import matrix_product
+from canprobe.touch.objects import Nearest, Touches
 
 if TYPE_CHECKING:
     from canprobe.emulator.plant.dynamic_arm import DynamicArm
@@ -106,6 +108,7 @@ class Plant:
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
+        self._joints = _at_rest if config.model is None else matrix_product(config.model.joints_per_count.tolist())
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
 
@@ -210,7 +213,7 @@ class Plant:
             s.pad_uv,
             s.depth,
             s.kappa,
-            _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
+            _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else ((1.0, 0.0), (0.0, 1.0)),
             1e-9 * self.t_ns,
             pressure_factor=s.contact.damping_factor,
         )
@@ -237,17 +240,17 @@ class Plant:
         """
         s = self._solution() if state is None else self._solve(state)
         return {
-            "q": s.q,
+            "q": np.array(s.q),
             "probe_centre": np.array(s.probe.centre),
             "pole": np.array(s.probe.axes[2]),
             "force": s.contact.force,
             "depth": s.depth,
             "depth_rate": s.depth_rate,
-            "contact_point": s.foot.point,
-            "contact_normal": s.foot.normal,
-            "kappa": s.foot.kappa,
-            "direction1": s.foot.directions[0],
-            "direction2": s.foot.directions[1],
+            "contact_point": np.array(s.foot.point),
+            "contact_normal": np.array(s.foot.normal),
+            "kappa": np.array(s.foot.kappa),
+            "direction1": np.array(s.foot.directions[0]),
+            "direction2": np.array(s.foot.directions[1]),
             "pad_uv": np.array(s.pad_uv),
             "in_contact": s.depth > 0.0,
         }
@@ -257,7 +260,7 @@ class Plant:
             self._solved = self._solve(self.state())
         return self._solved
 
-    def _probe(self, t_ns: int, q: Array, qd: Array) -> _Probe:
+    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> _Probe:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns)
         if self.arm is None:
@@ -269,17 +272,16 @@ class Plant:
         return _Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
 
     def _solve(self, state: PlantState) -> _Solution:
-        config, q, qd = self.config, np.zeros(6), np.zeros(6)
-        if config.model is not None:
-            q, qd = counts_to_joints(config.model, state.counts), counts_to_joints(config.model, state.rates)
+        config = self.config
+        q, qd = self._joints(state.counts), self._joints(state.rates)
         probe = self._probe(state.t_ns, q, qd)
         if config.object is None:
             return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
-        foot = config.object.closest(probe.centre)
-        nx, ny, nz = foot.normal.tolist()
+        foot = config.object.nearest(probe.centre)
+        nx, ny, nz = foot.normal
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
-        k1, k2 = foot.kappa.tolist()
+        k1, k2 = foot.kappa
         touches = config.object.touches(probe.centre, config.radius_m)
         contact = elastic_contact(
             depth,
@@ -311,19 +313,36 @@ def _turned(axes: Axes, R: Array) -> Axes:
     return tuple(x), tuple(y), tuple(z)
 
 
-def _in_pad(foot: ClosestPoint, probe: _Probe, d: Vec) -> Array:
-    """(2, 2) principal directions in the transported pad basis at the contact direction."""
-    rows: Array = foot.directions.dot(np.array(probe.axes).T).dot(np.array(pad_basis(d)).T)
-    return rows
+def _at_rest(motors: Sequence[float]) -> tuple[float, ...]:
+    """Joints without an arm."""
+    return (0.0,) * 6
+
+
+def _in_pad(foot: Nearest, probe: _Probe, d: Vec) -> Directions:
+    """Principal directions in the transported pad basis at the contact direction."""
+    u, v = (_along(probe.axes, e) for e in pad_basis(d))
+    first, second = foot.directions
+    return (_dot(first, u), _dot(first, v)), (_dot(second, u), _dot(second, v))
+
+
+def _along(axes: Axes, e: Vec) -> Vec:
+    """A vector of the probe's frame in the base frame."""
+    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = axes
+    a, b, c = e
+    return a * x0 + b * y0 + c * z0, a * x1 + b * y1 + c * z1, a * x2 + b * y2 + c * z2
+
+
+def _dot(a: Vec, b: Vec) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @dataclass(slots=True, eq=False)
 class _Solution:
     """Contact at one instant."""
 
-    q: Array
+    q: tuple[float, ...]
     probe: _Probe
-    foot: ClosestPoint
+    foot: Nearest
     depth: float
     depth_rate: float
     contact: Contact
@@ -334,7 +353,8 @@ class _Solution:
 
 
 _POLE = (0.0, 0.0, 1.0)
-_NOWHERE = ClosestPoint(np.zeros(3), np.zeros(3), 0.0, np.zeros(2), np.zeros((2, 3)))
+_ORIGIN = (0.0, 0.0, 0.0)
+_NOWHERE = Nearest(_ORIGIN, _ORIGIN, 0.0, (0.0, 0.0), (_ORIGIN, _ORIGIN))
 
 
 def _refuse_tight_hollow(config: PlantConfig) -> None:
