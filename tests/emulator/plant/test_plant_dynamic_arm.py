@@ -97,6 +97,20 @@ def test_the_push_of_the_object_is_the_force_through_the_jacobian():
     assert truth["force"] > 1.9
 
 
+@pytest.mark.parametrize("rate", [0.3, -0.3, 0.004])
+def test_motors_and_gears_rub_as_published(rate):
+    """Viscous and Coulomb friction of each axis, scaled from the PUMA 560's; tanh turns the sign over 0.01 rad/s."""
+    viscous, coulomb = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012), (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
+    c = config(shape=None)
+    y = make_arm(c)._y + np.repeat((0.0, rate, 0.0), 6)
+    rough, smooth = make_equations(c), make_equations(c, Effects(friction=False))
+    for e in (rough, smooth):
+        e.hold(y)
+    drag = rough.mass()[0] @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]
+    expected = np.array(viscous) * rate + np.array(coulomb) * np.tanh(rate / 0.01)
+    assert drag == pytest.approx(-expected, rel=1e-9)
+
+
 def test_friction_drags_against_the_sliding_and_never_feeds_it():
     c = config()
     arm, smooth = make_arm(c), make_arm(replace(c, dynamics=replace(c.dynamics, friction=0.0)))
