@@ -73,7 +73,8 @@ class DynamicArm:
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Give one motor a ramp, see ``IdealArm.set_ramp``."""
-        self._advance_to(self.t_ns)
+        if self._y_ns < self.t_ns:
+            self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns
         self._torques = None  # the state now is what it is, whatever the reference does from now on

@@ -27,10 +27,11 @@ _LOOPS = ("start", "slope", "ahead", "fed", "gain", "integral", "limit", "viscou
 
 def held_rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
     """``integrators.rosenbrock2``; what is not a held arm with at most one touch takes that one."""
-    touch = problem.contact if isinstance(problem, ArmEquations) else None
-    if not isinstance(problem, ArmEquations) or not problem.held or not isinstance(touch, OneTouch | None):
+    if not isinstance(problem, ArmEquations) or not problem.held:
         return rosenbrock2(problem, t, y, h)
-    loops = problem.loops
+    touch, loops = problem.contact, problem.loops
+    if touch is not None and not isinstance(touch, OneTouch):
+        return rosenbrock2(problem, t, y, h)
     known: tuple[Sequence[float], ...] = (
         y.tolist(), (t, h), problem.lower_mass, problem.bias, (loops.position, loops.unwind),
         loops.start, loops.slope, loops.ahead, loops.fed, loops.gain, loops.integral, loops.limit,
