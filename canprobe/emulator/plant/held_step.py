@@ -1,9 +1,9 @@
 """The default step of the dynamic arm in straight-line code: ``rosenbrock2`` on held dynamics with at most one touch.
 
-The same numbers as ``integrators.rosenbrock2`` on ``ArmEquations``, but for rounding, at a fifth of the time. The rows
-of the rates are multiplied by the mass matrix on both sides, so that its inverse is never needed; the rates of angles
-and integrators are eliminated, which leaves a 6 x 6 system for the accelerations. What its matrix does to the first
-stage's accelerations is known from that stage's right-hand side.
+The same numbers as ``integrators.rosenbrock2`` on ``ArmEquations``, but for rounding, at a seventh of the time. The
+rows of the rates are multiplied by the mass matrix on both sides, so that its inverse is never needed; the rates of
+angles and integrators are eliminated, which leaves a 6 x 6 system for the accelerations. What the mass matrix does to
+the first stage's accelerations is known from that stage's right-hand side.
 """
 
 from __future__ import annotations
