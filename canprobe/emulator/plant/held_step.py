@@ -14,32 +14,40 @@ from functools import cache
 
 import numpy as np
 
-from canprobe.emulator.plant.equations import ArmEquations
+from canprobe.emulator.plant.equations import ArmEquations, State
 from canprobe.emulator.plant.held_parts import Forces, Meeting, Motor, Row, System, Touch, dot, plus
-from canprobe.emulator.plant.integrators import GAMMA, Problem, rosenbrock2
+from canprobe.emulator.plant.integrators import GAMMA, rosenbrock2
 from canprobe.emulator.plant.pushing import OneTouch
 from canprobe.robot.dynamics import LOWER
-from canprobe.robot.puma260 import Array
 from canprobe.robot.straight_line import Value, compiled, where
 
 _LOOPS = ("start", "slope", "ahead", "fed", "gain", "integral", "limit", "viscous", "coulomb")
 
 
-def held_rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
-    """``integrators.rosenbrock2``; what is not a held arm with at most one touch takes that one."""
-    if not isinstance(problem, ArmEquations) or not problem.held:
-        return rosenbrock2(problem, t, y, h)
-    touch, loops = problem.contact, problem.loops
-    if touch is not None and not isinstance(touch, OneTouch):
-        return rosenbrock2(problem, t, y, h)
+def held_rosenbrock2(equations: ArmEquations, t: float, y: State, h: float) -> State:
+    """``integrators.rosenbrock2``; what is not held, or touches in several places, takes that one.
+
+    Args:
+        equations: of the arm.
+        t: s.
+        y: (18,) state.
+        h: length of the step, s.
+
+    Returns:
+        (18,) state after the step.
+    """
+    touch, loops = equations.contact, equations.loops
+    if not equations.held or (touch is not None and not isinstance(touch, OneTouch)):
+        stepped: list[float] = rosenbrock2(equations, t, np.array(y), h).tolist()
+        return stepped
     known: tuple[Sequence[float], ...] = (
-        y.tolist(), (t, h), problem.lower_mass, problem.bias, (loops.position, loops.unwind),
+        y, (t, h), equations.lower_mass, equations.bias, (loops.position, loops.unwind),
         loops.start, loops.slope, loops.ahead, loops.fed, loops.gain, loops.integral, loops.limit,
         loops.viscous, loops.coulomb,
     )  # fmt: skip
     if touch is not None:
         known = *known, touch.n, touch.s, touch.t, touch.plane, touch.law
-    return np.array(_step(touch is not None)(*known))
+    return _step(touch is not None)(*known)
 
 
 @cache

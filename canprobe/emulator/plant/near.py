@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from math import pi, sqrt
 
@@ -53,7 +53,7 @@ class Neighbourhood:
         self._joints = matrix_product(joints_per_motor.tolist())
         self._rows = _rows_for(tuple(float(g != 0.0) for g in self._back))
 
-    def __call__(self, theta: list[float]) -> Contact | None:
+    def __call__(self, theta: Sequence[float]) -> Contact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
 
         Args:
@@ -86,7 +86,7 @@ class Neighbourhood:
             rubbing=self.rubbing,
         )
 
-    def _many(self, theta: list[float], touches: Touches) -> Contact:
+    def _many(self, theta: Sequence[float], touches: Touches) -> Contact:
         """Several places at once."""
         back = self._joints_per_motor
         J = forward_jacobian(self.model, back @ theta, self._T_flange_probe)[1] @ back
