@@ -206,6 +206,18 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
     assert np.abs(expected).max() > 0.1
 
 
+@pytest.mark.parametrize(("kind", "height"), [("cylinder", 0.0), ("tight bowl", RESTS_AT - R)])
+def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
+    shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
+    config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((0.0, 0.0, height)), damping_s_m=5.0)
+    e, back = make_equations(config), joints_per_motor()
+    theta = np.linalg.solve(back, config.q0)
+    e.hold(e.resting(theta))
+    up = np.linalg.solve(forward_jacobian(UPENN, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assert not e.contact.push(theta.tolist(), up.tolist()).any()
+    assert np.abs(e.contact.push(theta.tolist(), (0.01 * up).tolist())).max() > 0.1
+
+
 def test_slopes_of_several_touches_are_those_of_their_push():
     top = POINT + np.array((2e-4, 1e-4, RESTS_AT - R))
     e = make_equations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
