@@ -18,6 +18,7 @@ from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
 from canprobe.link_report import check_links
+from canprobe.note_report import news_teller, telling_notes
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, log_columns, summarise, write_files
 from canprobe.scene import Scene
@@ -293,10 +294,10 @@ def up(
     check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
-        Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
+        telling_notes(Session(resolved, None, say, bridges.observers, ROWS_OF_UP), say) as session,
     ):
         say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
-        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges), news_teller(session, say))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:

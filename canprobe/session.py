@@ -209,7 +209,7 @@ class Session:
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
-            self._cell.faults.append(fault)
+            self._cell.notes.add(fault)
 
     def _log_failure(self) -> str | None:
         return self._candump.failure if self._candump is not None else None

@@ -13,6 +13,7 @@ from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
 from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
+from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
@@ -32,8 +33,6 @@ ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
 TOUCHING_N = 0.15
 """Measured force from which the probe is on an object."""
-FAULTS_KEPT = 100
-"""Faults that are told; a node that says the same for ever must not fill the memory."""
 
 
 class Cell:
@@ -56,7 +55,7 @@ class Cell:
 
     Attributes:
         log: one row a cycle.
-        faults: what went wrong, a line each.
+        notes: what went wrong and was lived with.
         supervisor: the checks, from bring-up on.
     """
 
@@ -81,7 +80,7 @@ class Cell:
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
-        self.faults: list[str] = []
+        self.notes = Notes()
         self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, limits.heartbeat_timeout_ns)
         self.cycle: Cycle | None = None
         self._port = port
@@ -98,6 +97,11 @@ class Cell:
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
+
+    @property
+    def faults(self) -> list[str]:
+        """What went wrong, a line for each kind of it."""
+        return self.notes.lines()
 
     @property
     def counters(self) -> PortCounters:
@@ -262,7 +266,7 @@ class Cell:
                 self._react(finding, retreat)
         elif not self._holding:
             self._holding = True
-            self.faults.append(f"cycle {measurement.cycle}: {finding.error}: hold")
+            self._note_hold(finding.error, measurement)
         return self._holding
 
     def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
@@ -288,15 +292,15 @@ class Cell:
             return
         lift = self._lift_from(lambda node_id: self._obeys(node_id, error))
         if not lift.possible:
-            self.faults.append(f"{error}: the probe stays where it is, as a drive may be moving or none obeys")
+            self.notes.add(f"{error}: the probe stays where it is, as a drive may be moving or none obeys")
             return
         self._say("lift off with the drives that obey")
-        self.faults.append(f"cycle {supervisor.seen.measurement.cycle}: {error}: lift off")
+        self.notes.add(f"cycle {supervisor.seen.measurement.cycle}: {error}: lift off")
         lift.begin()
         try:
             self._lift(lift)
         except CanprobeError as failure:
-            self.faults.append(f"while lifting off: {failure}")
+            self.notes.add(f"while lifting off: {failure}")
 
     def _lift(self, lift: LiftOff) -> None:
         assert self.cycle is not None
@@ -324,8 +328,14 @@ class Cell:
 
     def _note_alarms(self) -> None:
         for event in self.watch.news():
-            if len(self.faults) < FAULTS_KEPT:
-                self.faults.append(str(event))
+            self.notes.add(event.what, node_id=event.node_id, t_s=self._since_first_sync(event.t_ns))
+
+    def _note_hold(self, error: CanprobeError, measurement: Measurement) -> None:
+        reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
+        self.notes.add(f"{reason}: hold", node_id=node_id, t_s=measurement.t_ns * 1e-9)
+
+    def _since_first_sync(self, t_ns: int) -> float:
+        return (t_ns - self.cycle.t_first_ns) * 1e-9 if self.cycle is not None else -1.0
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
@@ -348,7 +358,8 @@ class Cell:
         for action in (self._stop_drives, self._bring_up.release):
             self._try(action)
         self._try(self._port.close)
-        self.faults += self.supervisor.notes()
+        for line in self.supervisor.notes():
+            self.notes.add(line)
 
     def _try(self, action: Callable[[], None]) -> None:
         """Run one step of the way out to its end: an interrupt starts it again once, a failure is noted."""
@@ -358,7 +369,7 @@ class Cell:
             except KeyboardInterrupt:
                 continue
             except CanprobeError as error:
-                self.faults.append(f"while stopping: {error}")
+                self.notes.add(f"while stopping: {error}")
             return
 
     def _stop_drives(self) -> None:
@@ -372,7 +383,7 @@ class Cell:
         disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
         if not self._stop_until(disabled):
             stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
-            self.faults.append(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
+            self.notes.add(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
 
     def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
         """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
@@ -386,5 +397,5 @@ class Cell:
                 failure = error
                 self.cycle.skip()
         if failure is not None:
-            self.faults.append(f"while stopping: {failure}")
+            self.notes.add(f"while stopping: {failure}")
         return False

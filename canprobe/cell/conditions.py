@@ -75,11 +75,11 @@ CONDITIONS: tuple[Condition, ...] = (
     Condition(
         "emcy_communication",
         "EMCY of communication (81xxh, 82xxh)",
-        "every frame",
+        "every frame; 8100h tells of a SYNC more than half a period late",
         Reaction.DEGRADE,
         _cycles(2),
         BY_ITSELF,
-        "noted in `faults`",
+        "noted in `faults`, a line a code; counted",
         count=checks.communication_emcys,
     ),
     Condition(

@@ -26,8 +26,13 @@ class EmcyEvent:
         """Whether it is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
         return self.emcy.code >> 8 in (0x81, 0x82)
 
+    @property
+    def what(self) -> str:
+        """The message in words."""
+        return f"EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+
     def __str__(self) -> str:
-        return f"node {self.node_id}: EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+        return f"node {self.node_id}: {self.what}"
 
 
 class NodeWatch:

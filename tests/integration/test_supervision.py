@@ -67,7 +67,8 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    assert run.session.cell.faults == ["node 4: EMCY 8210h, PDO not processed due to length error"]
+    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {FREE_CYCLE * 0.0025:.2f} s"
+    assert run.session.cell.faults == [told]
 
 
 def test_another_master():
