@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from canprobe.errors import ProtocolError
+from canprobe.errors import NodeError, ProtocolError
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
@@ -139,3 +139,12 @@ class NodeWatch:
     def not_in(self, state: NmtState) -> int | None:
         """A node whose last heartbeat told another state than ``state``, or None."""
         return next((node_id for node_id, seen in self.states.items() if seen is not state), None)
+
+
+def obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
+    """Whether a node does what it is told, as far as NMT and EMCY tell: not the one that the cell is stopped for."""
+    if isinstance(error, NodeError) and error.node_id == node_id:
+        return False
+    alarm = watch.device_alarm
+    operational = watch.states.get(node_id) is NmtState.OPERATIONAL
+    return operational and (alarm is None or alarm.node_id != node_id)

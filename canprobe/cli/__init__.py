@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.cli.interrupts import Terminated
+from canprobe.bus.interrupts import Terminated
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import CanprobeError
 

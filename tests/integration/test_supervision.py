@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from pathlib import Path
 from struct import pack, unpack
@@ -465,6 +466,21 @@ def test_an_interrupt_or_an_exception(error):
     run = Injected("free", FREE_CYCLE, raise_it)
     run.assert_within("interrupt").assert_drives_off()
     assert isinstance(run.error, error)
+
+
+@pytest.mark.parametrize(("hung_ns", "waits"), [(20_000_000, True), (1_100_000_000, False)])
+def test_an_interrupt_does_not_wait_for_a_controller_that_hangs(hung_ns, waits):
+    reached = []
+
+    def hang(run):
+        clock = run.session.lockstep.clock
+        clock.sleep_until_ns(clock.now_ns() + hung_ns)
+        signal.raise_signal(signal.SIGINT)
+        reached.append(True)
+
+    run = Injected("free", FREE_CYCLE, hang, arm={"missed_syncs": 40})
+    run.assert_drives_off()
+    assert isinstance(run.error, KeyboardInterrupt) and bool(reached) is waits
 
 
 def test_the_drives_of_a_dead_master_stop_by_themselves():
