@@ -316,10 +316,10 @@ class Cell:
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
         t_s = supervisor.seen.measurement.t_ns * 1e-9
         if not lift.possible:
-            self.notes.add_error(error, "the probe stays where it is, as a drive may be moving or none obeys", t_s)
+            self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
             return
         self._say("lift off with the drives that obey")
-        self.notes.add_error(error, "lift off", t_s)
+        self.notes.add("lift off", t_s=t_s)
         lift.begin()
         try:
             self._lift(lift)

@@ -67,9 +67,9 @@ class Notes:
             kind.first_s = t_s if kind.first_s is None else kind.first_s
             kind.last_s = t_s
 
-    def add_error(self, error: BaseException, then: str, t_s: float) -> None:
+    def add_error(self, error: CanprobeError, then: str, t_s: float) -> None:
         """The cell found an error, and ``then`` did something about it."""
-        reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (words_of(error), None)
+        reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
         self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
 
     def lines(self) -> list[str]:
@@ -84,15 +84,6 @@ def nodes_text(node_ids: Iterable[int]) -> str:
     runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]
     parts = [part for run in runs for part in ([f"{run[0]}-{run[-1]}"] if len(run) > 2 else map(str, run))]
     return f"node{'s' * (len(ids) > 1)} {', '.join(parts)}"
-
-
-def words_of(error: BaseException) -> str:
-    """An error in words, whoever raised it."""
-    if isinstance(error, CanprobeError):
-        return str(error)
-    if isinstance(error, KeyboardInterrupt):
-        return "interrupted"
-    return f"{type(error).__name__}: {error}".removesuffix(": ")
 
 
 def _time_text(t_s: float) -> str:

@@ -49,7 +49,7 @@ def test_the_probe_is_taken_off(what):
     assert run.session.truth["force"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY < back < 1.2 * WAY and aside < 0.05 * WAY, "without a sensor the task begins to retreat by itself"
-    assert any(": lift off, at " in fault for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
     if what.startswith("joint"):
         motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.counts.T
         lost = int(what.split()[1]) - 1
@@ -78,7 +78,7 @@ def pressed_on(run, told):
 def test_a_drive_that_tells_what_cannot_be_may_be_moving():
     change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
     run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
-    pressed_on(run, "the probe stays where it is")
+    pressed_on(run, "no lift-off: a drive may be moving")
 
 
 def test_with_another_master_nothing_moves():
@@ -104,19 +104,19 @@ def failing(_):
 
 
 LEFT = {
-    "Ctrl-C": (interrupted(signal.SIGINT), KeyboardInterrupt, "interrupted: lift off"),
-    "SIGTERM": (interrupted(signal.SIGTERM), Terminated, "interrupted: lift off"),
-    "the controller fails": (failing, ZeroDivisionError, "ZeroDivisionError: lift off"),
+    "Ctrl-C": (interrupted(signal.SIGINT), KeyboardInterrupt),
+    "SIGTERM": (interrupted(signal.SIGTERM), Terminated),
+    "the controller fails": (failing, ZeroDivisionError),
 }
 
 
 @pytest.mark.parametrize("what", LEFT)
 def test_whoever_ends_the_run_the_probe_is_taken_off(what):
-    action, kind, told = LEFT[what]
+    action, kind = LEFT[what]
     run = Injected("press", HOLD_CYCLE, action)
     run.assert_within("interrupt").assert_drives_off()
     assert type(run.error) is kind
-    assert any(told in fault for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
     assert not any("left pressing" in fault for fault in run.session.cell.faults)
     assert run.session.truth["force"][run.at] == pytest.approx(2.0, abs=0.2)
     assert run.session.truth["force"][-1] == 0.0
