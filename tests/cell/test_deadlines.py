@@ -71,7 +71,7 @@ def test_one_sync_and_none():
 
 
 def strained_syncs(seed, n=2400):
-    """Of a cycle on a machine that is too slow at times: its work takes longer than the period, its waking up 0.1 ms."""
+    """Of a cycle on a machine that is too slow at times: its work takes longer than the period, waking up 0.1 ms."""
     rng = np.random.default_rng(seed)
     busy = np.repeat(rng.random(n // 40) < 0.5, 40)
     work = np.where(busy, rng.uniform(2.3e6, 3.0e6, n), rng.uniform(1.2e6, 2.0e6, n))
