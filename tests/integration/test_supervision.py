@@ -204,6 +204,7 @@ def test_error_passive_holds_until_it_is_over():
 def test_error_passive_for_long_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, passive, until=1500)
     assert "error-passive for 1.0 s" in str(run.error)
+    run.assert_within("error_passive_long")
     assert run.session.truth["force"][-1] == 0.0
 
 
@@ -273,6 +274,7 @@ class Late(Injected):
 def test_the_overrun_budget_makes_the_probe_retreat():
     run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
     assert "of the last second's cycles came more than half a period late" in str(run.error)
+    run.assert_within("overruns")
     assert run.session.truth["force"][-1] == 0.0
 
 
