@@ -177,6 +177,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
             summary["faults"].append(told)
             if failure is None:
                 raise ResultsError(told) from error
+            failure.add_note(told)
     return result
 
 
