@@ -5,18 +5,15 @@ from __future__ import annotations
 import contextlib
 import signal
 from collections.abc import Iterator
-from types import FrameType
 
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM, raised like Ctrl-C where the program stands."""
+from canprobe.bus.interrupts import raise_terminated
 
 
 @contextlib.contextmanager
 def termination_interrupts() -> Iterator[None]:
     """Within the block SIGTERM raises `Terminated`; outside a main thread nothing changes."""
     try:
-        before = signal.signal(signal.SIGTERM, _raise)
+        before = signal.signal(signal.SIGTERM, raise_terminated)
     except ValueError:  # not the main thread: signals are not ours to receive
         yield
         return
@@ -24,10 +21,6 @@ def termination_interrupts() -> Iterator[None]:
         yield
     finally:
         signal.signal(signal.SIGTERM, before)
-
-
-def _raise(_number: int, _frame: FrameType | None) -> None:
-    raise Terminated
 
 
 @contextlib.contextmanager

@@ -6,7 +6,8 @@ import signal
 
 import pytest
 
-from canprobe.cli.interrupts import Terminated, interrupts_held, termination_interrupts
+from canprobe.bus.interrupts import Terminated
+from canprobe.cli.interrupts import interrupts_held, termination_interrupts
 
 
 @pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])

@@ -16,7 +16,7 @@ ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
 @pytest.mark.parametrize(
-    ("name", "cycles", "number", "status"), [("cylinder", 300, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
+    ("name", "cycles", "number", "status"), [("cylinder", 700, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
 )
 def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int, status: int) -> None:
     command = bench.start("run", bench.scene(name), *ON_VCAN0, "--out", "results")
@@ -31,6 +31,10 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
         assert len(truth["t_s"]) >= cycles
         steps = np.abs(np.diff(truth["q"], axis=0)).max(axis=1)
         assert steps[-1] < 0.3 * steps.max(), "the arm comes to rest"
+        if name == "cylinder":
+            assert truth["force"].max() > 1.0, "it was in contact"
+            assert truth["force"][-1] == 0.0, "and was taken off"
+            assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
 def test_up_ends_with_an_interrupt(bench: Any) -> None:
