@@ -57,7 +57,10 @@ class Reference:
         Args:
             t_ns: ns.
         """
-        t0, t1, _, _ = self._ramps[-1]
-        if t0 <= t_ns < t1:  # those before it are over
-            return t1
-        return min((t for r in self._ramps for t in r[:2] if t > t_ns), default=NEVER)
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
