@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM taken between two cycles, where the cell can still act, instead of anywhere in one."""
+"""Ctrl-C, SIGTERM and SIGHUP taken between two cycles, where the cell can still act, instead of anywhere in one."""
 
 from __future__ import annotations
 
@@ -6,23 +6,24 @@ import signal
 from collections.abc import Callable
 from types import FrameType, TracebackType
 
-_NUMBERS = (signal.SIGINT, signal.SIGTERM)
+TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
+"""What ends a process from outside: a service that is stopped, a terminal that is closed."""
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, raised like Ctrl-C where the program stands."""
+    """SIGTERM or SIGHUP, raised like Ctrl-C where the program stands."""
 
 
 def raise_terminated(_number: int, _frame: FrameType | None) -> None:
-    """The handler of SIGTERM."""
+    """The handler of both."""
     raise Terminated
 
 
 class Interrupts:
     """Within the block the first interrupt waits until it is taken; a second one is raised where the program stands.
 
-    So is the first where ``stuck`` says that nobody will come to take it. Ignored signals stay ignored, a SIGTERM that
-    would end the process raises `Terminated`, and outside a main thread nothing changes.
+    So is the first where ``stuck`` says that nobody will come to take it. Ignored signals stay ignored (as `nohup` has
+    it), one that would end the process raises `Terminated`, and outside a main thread nothing changes.
 
     Args:
         stuck: whether the program is held up somewhere.
@@ -36,9 +37,9 @@ class Interrupts:
         self._waiting: int | None = None
 
     def __enter__(self) -> Interrupts:
-        for number in _NUMBERS:
+        for number in (signal.SIGINT, *TERMINATIONS):
             before = signal.getsignal(number)
-            handler = raise_terminated if before is signal.SIG_DFL and number == signal.SIGTERM else before
+            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATIONS else before
             if not callable(handler):
                 continue
             try:

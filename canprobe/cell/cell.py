@@ -94,13 +94,13 @@ class Cell:
         self.cycle: Cycle | None = None
         self._port = port
         self._settings = settings
-        self._say = say
+        self._to_say = say
         self._log_failure = log_failure
         self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), patch_from)
         self._lift_from = lift_from
         self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, setups, times, say)
+        self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
         self._holding = False
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
@@ -121,6 +121,13 @@ class Cell:
     def bring_up_reports(self) -> tuple[NodeReport, ...]:
         """How far each node came in bring-up."""
         return self._bring_up.reports
+
+    def _say(self, text: str) -> None:
+        """Tell the user; whether anybody can hear it must not decide what becomes of the drives."""
+        try:
+            self._to_say(text)
+        except Exception as error:
+            self.notes.add(f"steps could not be told: {type(error).__name__}")
 
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))
@@ -328,18 +335,9 @@ class Cell:
 
     def _lift(self, lift: LiftOff) -> None:
         assert self.cycle is not None
-        supervisor, first = self.supervisor, self.cycle.number
-        known = first + supervisor.seen.limits.cycles_to_feel  # from then on the force is one of the way back
-        highest = 0.0
-        while (q := lift.step(supervisor.seen.measurement)) is not None:
-            command, finding = supervisor.guard_target(Command(q))
-            force = supervisor.felt()
-            if self.cycle.number < known:
-                highest = max(highest, force)
-            if finding is not None or supervisor.must_stop() or force > highest:
-                return
+        while (command := lift.command(self.supervisor)) is not None:
             self.cycle.end(command)
-            self._record(supervisor.seen.measurement, command)
+            self._record(self.supervisor.seen.measurement, command)
             self._look(self.cycle.begin())
 
     def _note_alarms(self) -> None:

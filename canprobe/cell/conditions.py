@@ -319,7 +319,7 @@ CONDITIONS: tuple[Condition, ...] = (
     # outside
     Condition(
         "interrupt",
-        "Ctrl-C, SIGTERM, an exception in your controller",
+        "Ctrl-C, SIGTERM, a closed terminal (SIGHUP), an exception in your controller",
         "the signal or exception",
         Reaction.LIFT,
         _cycles(2),

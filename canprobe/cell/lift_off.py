@@ -9,15 +9,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.measurement import Measurement
+from canprobe.cell.measurement import Command, Measurement
 from canprobe.robot.kinematics import forward_jacobian
 from canprobe.robot.lifting import lifting_step
 from canprobe.robot.puma260 import PumaModel
+
+if TYPE_CHECKING:
+    from canprobe.cell.supervisor import Supervisor
 
 Vector = NDArray[np.float64]
 WAY = 6e-3
@@ -101,6 +105,8 @@ class LiftOff:
         self._drives, self._obeys = drives, obeys
         self._free = self._obeying()
         self._way = WayBack(model, flange_probe, period_s, self._free, drives.targets())
+        self._force_known_from: int | None = None
+        self._highest = 0.0
 
     def _obeying(self) -> NDArray[np.bool_]:
         """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
@@ -123,6 +129,19 @@ class LiftOff:
         if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
             return None
         return self._way.step(measurement.q)
+
+    def command(self, supervisor: Supervisor) -> Command | None:
+        """What the drives are told in this cycle; None at the end, and where the force grows on the way back."""
+        measurement, force = supervisor.seen.measurement, supervisor.felt()
+        q = self.step(measurement)
+        if q is None:
+            return None
+        command, finding = supervisor.guard_target(Command(q))
+        if self._force_known_from is None:
+            self._force_known_from = measurement.cycle + supervisor.seen.limits.cycles_to_feel
+        if measurement.cycle < self._force_known_from:  # what is felt is from before the way back
+            self._highest = max(self._highest, force)
+        return None if finding is not None or supervisor.must_stop() or force > self._highest else command
 
     def _still_obeyed(self) -> bool:
         """A TPDO may be missing now and then; who has left operation does not come back."""

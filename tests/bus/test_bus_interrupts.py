@@ -9,7 +9,7 @@ import pytest
 
 from canprobe.bus.interrupts import Interrupts, Terminated
 
-BOTH = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)]
+BOTH = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, Terminated)]
 
 
 @pytest.fixture(autouse=True)

@@ -106,6 +106,7 @@ def failing(_):
 LEFT = {
     "Ctrl-C": (interrupted(signal.SIGINT), KeyboardInterrupt),
     "SIGTERM": (interrupted(signal.SIGTERM), Terminated),
+    "the terminal is closed": (interrupted(signal.SIGHUP), Terminated),
     "the controller fails": (failing, ZeroDivisionError),
 }
 
@@ -123,6 +124,23 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     back, aside = lifted(run)
     assert 0.95 * WAY < back < 1.05 * WAY and aside < 0.05 * WAY
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_nobody_need_listen():
+    """`canprobe up SCENE 2>&1 | tee FILE`: Ctrl-C ends tee first, and each line said from then on is an error."""
+
+    class Unheard(Injected):
+        def _say(self, text):
+            super()._say(text)
+            if self.injected_ns is not None:
+                raise BrokenPipeError
+
+    run = Unheard("press", HOLD_CYCLE, interrupted(signal.SIGINT))
+    assert isinstance(run.error, KeyboardInterrupt)
+    run.assert_drives_off()
+    assert run.session.truth["force"][-1] == 0.0
+    assert {node.node.core.state for node in run.nodes.values()} == {NmtState.PRE_OPERATIONAL}
+    assert any("BrokenPipeError" in fault for fault in run.session.cell.faults)
 
 
 def test_a_second_interrupt_stops_at_once():

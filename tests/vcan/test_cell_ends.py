@@ -16,7 +16,7 @@ ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 
 
 @pytest.mark.parametrize(
-    ("name", "cycles", "number", "status"), [("cylinder", 700, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
+    ("name", "cycles", "number", "status"), [("cylinder", 300, signal.SIGINT, 130), ("free", 50, signal.SIGTERM, 143)]
 )
 def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int, status: int) -> None:
     command = bench.start("run", bench.scene(name), *ON_VCAN0, "--out", "results")
