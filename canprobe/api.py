@@ -18,10 +18,12 @@ from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
 from canprobe.link_report import check_links
+from canprobe.note_report import news_teller, telling_notes
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, log_columns, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
+from canprobe.session_bus import open_ports
 
 if TYPE_CHECKING:
     from canprobe.cell.commission import Commissioned
@@ -175,6 +177,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
             summary["faults"].append(told)
             if failure is None:
                 raise ResultsError(told) from error
+            failure.add_note(told)
     return result
 
 
@@ -293,10 +296,10 @@ def up(
     check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
-        Session(resolved, None, say, bridges.observers, ROWS_OF_UP) as session,
+        telling_notes(Session(resolved, None, say, bridges.observers, ROWS_OF_UP), say) as session,
     ):
         say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
-        session.run(_requested(plan, None, lambda: make_task(plan), bridges))
+        session.run(_requested(plan, None, lambda: make_task(plan), bridges), news_teller(session, say))
 
 
 def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:
@@ -360,6 +363,7 @@ def monitor(
     *,
     interface: str | None = None,
     channel: str | None = None,
+    sensor_channel: str | None = None,
     bitrate: int | None = None,
     duration_s: float | None = None,
 ) -> Iterator[CellView]:
@@ -367,7 +371,7 @@ def monitor(
 
     Args:
         scene: what is on the bus.
-        interface, channel, bitrate: in the place of the scene's bus.
+        interface, channel, sensor_channel, bitrate: in the place of the scene's.
         duration_s: how long; for ever by default.
 
     Yields:
@@ -378,23 +382,20 @@ def monitor(
         InterfaceError: no such interface, or it was lost.
     """
     from canprobe.bus.clock import MonotonicClock
-    from canprobe.bus.open import open_port
     from canprobe.cell.monitor import Monitor
-    from canprobe.planning import make_plan
 
-    resolved = resolve_scene(scene, interface=interface, channel=channel, bitrate=bitrate)
-    bus = resolved.bus
-    if bus.interface == LOCKSTEP:
+    resolved = resolve_scene(
+        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate
+    )
+    if resolved.bus.interface == LOCKSTEP:
         raise UsageError("monitor: a lockstep bus lives inside one run; name a real interface with --bus")
-    clock = MonotonicClock()
-    port = open_port(bus.interface, bus.channel, bus.bitrate, clock)
-    try:
-        listener = Monitor(make_plan(resolved))
+    plan, clock = make_plan(resolved), MonotonicClock()
+    with open_ports(plan, clock) as ports:
+        listener = Monitor(plan)
         start_ns = next_ns = clock.now_ns()
         while duration_s is None or next_ns < start_ns + duration_s * 1e9:
             next_ns += MONITOR_PERIOD_NS
             clock.sleep_until_ns(next_ns)
-            listener.push(port.drain())
+            for name, port in ports.items():
+                listener.push(port.drain(), name)
             yield listener.view(clock.now_ns())
-    finally:
-        port.close()

@@ -87,6 +87,7 @@ def _targets(task: TaskReplay) -> dict[str, float | None]:
         "compared": task.compared,
         "differing": task.differing,
         "worst_counts": task.worst_counts,
+        "lifted_s": task.lifted_s,
         "parted_s": task.parted_s,
     }
 
@@ -163,6 +164,8 @@ def replay_text(summary: dict[str, Any]) -> str:
         how = "the scene's task drove: its scan is replayed"
         if targets["differing"]:
             how += f" ({targets['differing']} of {targets['compared']} targets differ)"
+        if targets["lifted_s"] is not None:
+            how += f"; lifted off at {targets['lifted_s']:.2f} s"
     elif targets["compared"]:
         since = "" if targets["parted_s"] is None else f" (since {targets['parted_s']:.2f} s)"
         how = f"another controller drove{since}: every contact is fed to the estimators"

@@ -32,7 +32,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import BridgeSettings, Scene
-from canprobe.session_bus import Sink, TrafficCounter, channel_routes, data_bitrate, lockstep_bus
+from canprobe.session_bus import Sink, TrafficCounter, channel_routes, lockstep_bus, open_ports
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -209,7 +209,7 @@ class Session:
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
-            self._cell.faults.append(fault)
+            self._cell.notes.add(fault)
 
     def _log_failure(self) -> str | None:
         return self._candump.failure if self._candump is not None else None
@@ -303,8 +303,6 @@ class Session:
                     self._note(f"truth.npz could not be written: {error.strerror or error}")
 
     def _open_real(self) -> Port:
-        from canprobe.bus.open import open_port
-
         bus = self.scene.bus
         if bus.interface == "virtual" and self.scene.emulated_node_ids:
             raise UsageError(
@@ -315,12 +313,8 @@ class Session:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         clock = MonotonicClock()
         t0_ns = clock.now_ns()
-        ports: dict[str, Port] = {}
-        for planned in self.plan.buses:
-            real = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
-            self._stack.callback(real.close)
-            ports[planned.channel] = RecordingPort(real, Sink(self._writer(planned.channel, t0_ns)))
-        return self._join(ports)
+        real = self._stack.enter_context(open_ports(self.plan, clock))
+        return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from functools import partial
 
-from canprobe.bus.clock import VirtualClock
+from canprobe.bus.clock import Clock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import Port
 from canprobe.planning import Plan
 from canprobe.planning.wire_bits import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
@@ -48,6 +50,25 @@ class TrafficCounter:
 def data_bitrate(bus: BusSettings) -> int | None:
     """Of CAN FD frames, None where the scene has none."""
     return bus.data_bitrate if bus.fd is True else None
+
+
+@contextmanager
+def open_ports(plan: Plan, clock: Clock) -> Iterator[dict[str, Port]]:
+    """The ports of a plan's buses, by channel; closed at the end.
+
+    Raises:
+        InterfaceError: one is missing, down, or cannot be opened.
+    """
+    from canprobe.bus.open import open_port
+
+    bus = plan.scene.bus
+    with ExitStack() as stack:
+        ports: dict[str, Port] = {}
+        for planned in plan.buses:
+            port = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
+            stack.callback(port.close)
+            ports[planned.channel] = port
+        yield ports
 
 
 def channel_routes(plan: Plan) -> dict[int, str]:

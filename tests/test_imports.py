@@ -58,6 +58,7 @@ COMPOSITION = {
     "emulation",
     "link_report",
     "joint_report",
+    "note_report",
 }
 
 # module → packages of its extra; it is imported only where the extra is asked for

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
@@ -13,14 +14,15 @@ from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
 from canprobe.cell.log import CycleLog, LastRows, RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
+from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
 from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
-from canprobe.cell.watch import NodeWatch
+from canprobe.cell.watch import NodeWatch, obeys
 from canprobe.errors import CanprobeError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NmtState
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 if TYPE_CHECKING:
     from canprobe.cell.lift_off import LiftOff
@@ -30,10 +32,16 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
+FREE_IT = "free it before the next run, which takes for zero what the array feels at its beginning"
+STUCK_NS = 1_000_000_000
+"""Time in a cycle after which an interrupt does not wait for its end."""
 TOUCHING_N = 0.15
 """Measured force from which the probe is on an object."""
-FAULTS_KEPT = 100
-"""Faults that are told; a node that says the same for ever must not fill the memory."""
+
+
+def _hold(_: Measurement) -> Command:
+    """Stay where the drives are."""
+    return Command()
 
 
 class Cell:
@@ -56,7 +64,7 @@ class Cell:
 
     Attributes:
         log: one row a cycle.
-        faults: what went wrong, a line each.
+        notes: what went wrong and was lived with.
         supervisor: the checks, from bring-up on.
     """
 
@@ -81,23 +89,28 @@ class Cell:
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
-        self.faults: list[str] = []
+        self.notes = Notes()
         self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, limits.heartbeat_timeout_ns)
         self.cycle: Cycle | None = None
         self._port = port
         self._settings = settings
-        self._say = say
+        self._to_say = say
         self._log_failure = log_failure
         self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), patch_from)
         self._lift_from = lift_from
         self._observers = observers
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, setups, times, say)
+        self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
         self._holding = False
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
+
+    @property
+    def faults(self) -> list[str]:
+        """What went wrong, a line for each kind of it."""
+        return self.notes.lines()
 
     @property
     def counters(self) -> PortCounters:
@@ -108,6 +121,13 @@ class Cell:
     def bring_up_reports(self) -> tuple[NodeReport, ...]:
         """How far each node came in bring-up."""
         return self._bring_up.reports
+
+    def _say(self, text: str) -> None:
+        """Tell the user; whether anybody can hear it must not decide what becomes of the drives."""
+        try:
+            self._to_say(text)
+        except Exception as error:
+            self.notes.add(f"steps could not be told: {type(error).__name__}")
 
     def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
         self.watch.push(can_id, bytes(data), round(t_s * 1e9))
@@ -166,19 +186,33 @@ class Cell:
         self._tracker = getattr(controller, "shape", None)
         self._enable(getattr(controller, "inspect", None))
         assert self.cycle is not None
-        while True:
-            measurement = self.cycle.begin()
-            if self._supervise(measurement, retreat):
-                command = Command()
-            else:
-                command = self._guarded(measurement, step(measurement), retreat)
-            self.cycle.end(command)
-            self._record(measurement, command)
-            progress(measurement)
-            if command.stop_reason is not None:
-                raise SafetyStop(command.stop_reason)
-            if command.done:
-                return
+        with Interrupts(self._stuck) as interrupts:
+            while True:
+                measurement = self.cycle.begin()
+                held = self._supervise(measurement, retreat)
+                command = self._ask(_hold if held else step, measurement, interrupts)
+                command = self._guarded(measurement, command, retreat)
+                self.cycle.end(command)
+                self._record(measurement, command)
+                progress(measurement)
+                if command.stop_reason is not None:
+                    raise SafetyStop(command.stop_reason)
+                if command.done:
+                    return
+
+    def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
+        """What the controller wants; an interrupt, or what it raises instead, ends the run off the object."""
+        try:
+            interrupts.take()
+            return step(measurement)
+        except BaseException as error:
+            self._lift_off(error)
+            raise
+
+    def _stuck(self) -> bool:
+        """The controller, or whoever is called after it, has not come back for long."""
+        assert self.cycle is not None
+        return self._port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
 
     # enabling and supervision
 
@@ -262,7 +296,7 @@ class Cell:
                 self._react(finding, retreat)
         elif not self._holding:
             self._holding = True
-            self.faults.append(f"cycle {measurement.cycle}: {finding.error}: hold")
+            self.notes.add_error(finding.error, "hold", measurement.t_ns * 1e-9)
         return self._holding
 
     def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
@@ -281,51 +315,35 @@ class Cell:
             self._lift_off(finding.error)
         raise finding.error
 
-    def _lift_off(self, error: CanprobeError) -> None:
+    def _lift_off(self, error: BaseException) -> None:
         """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
         if self._lift_from is None or supervisor.felt() < TOUCHING_N or supervisor.must_stop():
             return
-        lift = self._lift_from(lambda node_id: self._obeys(node_id, error))
+        lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
+        t_s = supervisor.seen.measurement.t_ns * 1e-9
         if not lift.possible:
-            self.faults.append(f"{error}: the probe stays where it is, as a drive may be moving or none obeys")
+            self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
             return
         self._say("lift off with the drives that obey")
-        self.faults.append(f"cycle {supervisor.seen.measurement.cycle}: {error}: lift off")
+        self.notes.add("lift off", t_s=t_s)
         lift.begin()
         try:
             self._lift(lift)
         except CanprobeError as failure:
-            self.faults.append(f"while lifting off: {failure}")
+            self.notes.add(f"while lifting off: {failure}")
 
     def _lift(self, lift: LiftOff) -> None:
         assert self.cycle is not None
-        supervisor, first = self.supervisor, self.cycle.number
-        known = first + supervisor.seen.limits.cycles_to_feel  # from then on the force is one of the way back
-        highest = 0.0
-        while (q := lift.step(supervisor.seen.measurement)) is not None:
-            command, finding = supervisor.guard_target(Command(q))
-            force = supervisor.felt()
-            if self.cycle.number < known:
-                highest = max(highest, force)
-            if finding is not None or supervisor.must_stop() or force > highest:
-                return
+        while (command := lift.command(self.supervisor)) is not None:
             self.cycle.end(command)
-            self._record(supervisor.seen.measurement, command)
+            self._record(self.supervisor.seen.measurement, command)
             self._look(self.cycle.begin())
 
-    def _obeys(self, node_id: int, error: CanprobeError) -> bool:
-        """As far as NMT and EMCY tell, and not the node that the cell is stopped for."""
-        if isinstance(error, NodeError) and error.node_id == node_id:
-            return False
-        alarm = self.watch.device_alarm
-        operational = self.watch.states.get(node_id) is NmtState.OPERATIONAL
-        return operational and (alarm is None or alarm.node_id != node_id)
-
     def _note_alarms(self) -> None:
+        first_ns = self.cycle.t_first_ns if self.cycle is not None else 0
         for event in self.watch.news():
-            if len(self.faults) < FAULTS_KEPT:
-                self.faults.append(str(event))
+            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - first_ns) * 1e-9)
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
@@ -345,10 +363,13 @@ class Cell:
 
     def close(self) -> None:
         """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
-        for action in (self._stop_drives, self._bring_up.release):
-            self._try(action)
+        self._try(self._stop_drives)
+        if (force := self.supervisor.felt()) >= TOUCHING_N:
+            self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
+        self._try(self._bring_up.release)
         self._try(self._port.close)
-        self.faults += self.supervisor.notes()
+        for line in self.supervisor.notes():
+            self.notes.add(line)
 
     def _try(self, action: Callable[[], None]) -> None:
         """Run one step of the way out to its end: an interrupt starts it again once, a failure is noted."""
@@ -358,7 +379,7 @@ class Cell:
             except KeyboardInterrupt:
                 continue
             except CanprobeError as error:
-                self.faults.append(f"while stopping: {error}")
+                self.notes.add(f"while stopping: {error}")
             return
 
     def _stop_drives(self) -> None:
@@ -372,7 +393,7 @@ class Cell:
         disabled = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON)
         if not self._stop_until(disabled):
             stuck = [a.node_id for a, s in zip(self.drives.axes, self.drives.states, strict=True) if s not in disabled]
-            self.faults.append(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
+            self.notes.add(f"while stopping: node {stuck[0] if stuck else '?'} did not confirm that it is disabled")
 
     def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
         """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
@@ -386,5 +407,5 @@ class Cell:
                 failure = error
                 self.cycle.skip()
         if failure is not None:
-            self.faults.append(f"while stopping: {failure}")
+            self.notes.add(f"while stopping: {failure}")
         return False

@@ -54,7 +54,7 @@ def _held_up(seen: Seen) -> str:
 def device_emcy(seen: Seen) -> NodeError | None:
     """A device reports an error of its own."""
     event = seen.watch.device_alarm
-    return NodeError(event.node_id, str(event).partition(": ")[2]) if event is not None else None
+    return NodeError(event.node_id, event.what) if event is not None else None
 
 
 def communication_emcys(seen: Seen) -> int:

@@ -75,11 +75,11 @@ CONDITIONS: tuple[Condition, ...] = (
     Condition(
         "emcy_communication",
         "EMCY of communication (81xxh, 82xxh)",
-        "every frame",
+        "every frame; 8100h tells of a SYNC more than half a period late",
         Reaction.DEGRADE,
         _cycles(2),
         BY_ITSELF,
-        "noted in `faults`",
+        "noted in `faults`, a line a code; counted",
         count=checks.communication_emcys,
     ),
     Condition(
@@ -88,7 +88,8 @@ CONDITIONS: tuple[Condition, ...] = (
         "its SYNC, NMT or heartbeat",
         Reaction.STOP,
         _cycles(2),
-        "stop it; bring-up refuses until then",
+        "stop it, free a pressing probe; bring-up refuses until then",
+        "nothing moves where two command",
         check=checks.foreign_master,
         enabling=True,
     ),
@@ -198,7 +199,8 @@ CONDITIONS: tuple[Condition, ...] = (
         "its error frame",
         Reaction.STOP,
         _cycles(2),
-        "the drives stop by themselves; `restart-ms` or `ip link set can0 type can restart`, then run again",
+        "free a pressing probe; `restart-ms` or `ip link set can0 type can restart`, then run again",
+        "nothing can be sent any more, the drives stop by themselves",
         check=checks.bus_off,
         enabling=True,
     ),
@@ -208,7 +210,8 @@ CONDITIONS: tuple[Condition, ...] = (
         "error of the socket",
         Reaction.STOP,
         _cycles(1),
-        "the drives stop by themselves; `ip link set can0 up`, then run again",
+        "free a pressing probe; `ip link set can0 up`, then run again",
+        "nothing can be sent any more, the drives stop by themselves",
     ),
     # time
     Condition(
@@ -316,11 +319,12 @@ CONDITIONS: tuple[Condition, ...] = (
     # outside
     Condition(
         "interrupt",
-        "Ctrl-C, SIGTERM, an exception in your controller",
+        "Ctrl-C, SIGTERM, a closed terminal (SIGHUP), an exception in your controller",
         "the signal or exception",
-        Reaction.STOP,
+        Reaction.LIFT,
         _cycles(2),
         AGAIN,
+        "a second Ctrl-C stops at once",
     ),
     Condition(
         "master_dead",

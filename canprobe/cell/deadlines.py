@@ -7,6 +7,8 @@ from numpy.typing import NDArray
 
 Numbers = NDArray[np.int64]
 _TRIALS = 64
+_EARLIER = 8
+"""By this part of a period at most the phase may be earlier than the one of the least lateness."""
 
 
 def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None) -> tuple[Numbers, Numbers]:
@@ -48,7 +50,32 @@ def _phase(stamps_ns: Numbers, period_ns: int) -> int:
     lateness = period_ns * passed.astype(float) - float(len(residues)) * candidates
     order = np.argsort(lateness, kind="stable")[:_TRIALS]
     trials: list[int] = candidates[order].tolist()
-    return min(trials, key=lambda phase: _implausibility(stamps_ns, phase, period_ns))
+    best = min(trials, key=lambda phase: _implausibility(stamps_ns, phase, period_ns))
+    return _earliest(candidates, _doubled(stamps_ns, candidates, period_ns), best, period_ns // _EARLIER)
+
+
+def _earliest(candidates: Numbers, doubled: Numbers, best: int, most_ns: int) -> int:
+    """The earliest phase before ``best`` that contradicts no more than it does.
+
+    Where many SYNCs are late the least lateness is found too late: those that were in time before it would then all be
+    a whole period late.
+    """
+    i = int(np.searchsorted(candidates, best))
+    while i > 0 and doubled[i - 1] <= doubled[i] and best - candidates[i - 1] <= most_ns:
+        i -= 1
+    return int(candidates[i])
+
+
+def _doubled(stamps_ns: Numbers, phases: Numbers, period_ns: int) -> Numbers:
+    """By phase (m,), ascending: how many SYNCs had the deadline of the one before, as none lies between the two."""
+    close = np.flatnonzero(np.diff(stamps_ns) < period_ns)
+    first = np.searchsorted(phases, stamps_ns[close] % period_ns, side="right")
+    end = np.searchsorted(phases, stamps_ns[close + 1] % period_ns, side="right")
+    steps = np.zeros(len(phases) + 1, np.int64)
+    np.add.at(steps, first, 1)
+    np.add.at(steps, end, -1)
+    between = np.cumsum(steps)[:-1] + np.count_nonzero(end < first)
+    return np.asarray(len(close) - between, dtype=np.int64)
 
 
 def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:

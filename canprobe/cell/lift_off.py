@@ -7,16 +7,21 @@ a position it cannot have reached may be moving: then nothing is moved.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.drives import DriveGroup
-from canprobe.cell.measurement import Measurement
+from canprobe.cell.measurement import Command, Measurement
 from canprobe.robot.kinematics import forward_jacobian
 from canprobe.robot.lifting import lifting_step
 from canprobe.robot.puma260 import PumaModel
+
+if TYPE_CHECKING:
+    from canprobe.cell.supervisor import Supervisor
 
 Vector = NDArray[np.float64]
 WAY = 6e-3
@@ -25,6 +30,57 @@ SPEED = 20e-3
 """m/s, the mean; it begins with twice as much, which then falls to zero."""
 ARRIVE_S = 0.02
 """For the drives' lag at the end."""
+
+
+class WayBack:
+    """The way of the tool's point off the object, cycle by cycle: what the motors are told, of what the joints are.
+
+    Args:
+        model: the arm's geometry.
+        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        period_s: of the cycle.
+        free: motors (6,) that may turn.
+        targets: where the motors were sent last (6,), counts.
+    """
+
+    def __init__(
+        self, model: PumaModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+    ) -> None:
+        self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
+        self._free, self._targets = free, targets
+        self._away: Vector | None = None
+        self._t = 0.0
+
+    def step(self, measured: Vector) -> Vector | None:
+        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on.
+
+        Args:
+            measured: joint angles (6,), rad.
+        """
+        T, J = forward_jacobian(self._model, measured, self._flange_probe)
+        if self._away is None:
+            self._away = -T[:3, 2]
+        before, self._t = self._gone(self._t), self._t + self._period_s
+        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+            return None
+        move = self._away * (self._gone(self._t) - before)
+        if move.any():
+            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
+            if counts is None:
+                return None
+            self._targets = self._targets + counts
+        q: Vector = self._model.joints_per_count @ self._targets
+        return q
+
+    @staticmethod
+    def cycles(period_s: float) -> int:
+        """How many there are at most."""
+        return math.ceil((WAY / SPEED + ARRIVE_S) / period_s) + 1
+
+    @staticmethod
+    def _gone(t: float) -> float:
+        """Way after ``t`` seconds, m."""
+        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)
 
 
 class LiftOff:
@@ -46,13 +102,11 @@ class LiftOff:
         period_s: float,
         obeys: Callable[[int], bool],
     ) -> None:
-        self._drives, self._model, self._flange_probe = drives, model, flange_probe
-        self._period_s = period_s
-        self._obeys = obeys
+        self._drives, self._obeys = drives, obeys
         self._free = self._obeying()
-        self._targets = drives.targets()
-        self._away: Vector | None = None
-        self._t = 0.0
+        self._way = WayBack(model, flange_probe, period_s, self._free, drives.targets())
+        self._force_known_from: int | None = None
+        self._highest = 0.0
 
     def _obeying(self) -> NDArray[np.bool_]:
         """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
@@ -74,28 +128,23 @@ class LiftOff:
         """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on."""
         if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
             return None
-        T, J = forward_jacobian(self._model, measurement.q, self._flange_probe)
-        if self._away is None:
-            self._away = -T[:3, 2]
-        before, self._t = self._gone(self._t), self._t + self._period_s
-        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+        return self._way.step(measurement.q)
+
+    def command(self, supervisor: Supervisor) -> Command | None:
+        """What the drives are told in this cycle; None at the end, and where the force grows on the way back."""
+        measurement, force = supervisor.seen.measurement, supervisor.felt()
+        q = self.step(measurement)
+        if q is None:
             return None
-        move = self._away * (self._gone(self._t) - before)
-        if move.any():
-            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
-            if counts is None:
-                return None
-            self._targets = self._targets + counts
-        q: Vector = self._model.joints_per_count @ self._targets
-        return q
+        command, finding = supervisor.guard_target(Command(q))
+        if self._force_known_from is None:
+            self._force_known_from = measurement.cycle + supervisor.seen.limits.cycles_to_feel
+        if measurement.cycle < self._force_known_from:  # what is felt is from before the way back
+            self._highest = max(self._highest, force)
+        return None if finding is not None or supervisor.must_stop() or force > self._highest else command
 
     def _still_obeyed(self) -> bool:
         """A TPDO may be missing now and then; who has left operation does not come back."""
         enabled = np.array(self._drives.enabled_ones())
         late = np.array(self._drives.ages()) >= 3
         return not bool((self._free & (~enabled | late)).any())
-
-    @staticmethod
-    def _gone(t: float) -> float:
-        """Way after ``t`` seconds, m."""
-        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)

@@ -18,8 +18,8 @@ from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import state_of
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
-from canprobe.protocol.timing import best_case_bits
 from canprobe.robot.puma260 import MODELS, counts_to_joints
 
 SECOND_NS = 1_000_000_000
@@ -51,13 +51,14 @@ class CellView:
     """The cell at one instant; what was not heard is None.
 
     Attributes:
-        channel: of the bus.
+        channel: of the bus, or buses.
         t_s: since the first frame, s.
         nodes: ascending node ids, the master's heartbeat last.
         q_deg: joint angles (6,), deg.
         force_n: of the last whole tactile frame, N.
         taxels: (16, 16) counts of that frame.
-        frames_per_s, load: of the last second; the load without stuff bits, as a share of the bit rate.
+        frames_per_s: of the last second, on all buses.
+        load: of the last second, by channel; without stuff bits, as a share of the bit rate.
         sync_hz: of the last second.
         sync_jitter_us: 99th percentile and largest distance of a SYNC interval from the planned one, µs.
         torn_frames: tactile frames that were not whole.
@@ -70,7 +71,7 @@ class CellView:
     force_n: float | None = None
     taxels: NDArray[np.uint8] | None = None
     frames_per_s: float = 0.0
-    load: float = 0.0
+    load: dict[str, float] = field(default_factory=dict)
     sync_hz: float = 0.0
     sync_jitter_us: tuple[float, float] | None = None
     torn_frames: int = 0
@@ -91,7 +92,9 @@ class Monitor:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._view = CellView(plan.scene.bus.channel)
+        channels = [bus.channel for bus in plan.buses]
+        self._view = CellView("+".join(channels))
+        self._speed_up = plan.scene.bus.data_bitrate / plan.scene.bus.bitrate
         roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
         arm = plan.scene.arm
@@ -103,22 +106,33 @@ class Monitor:
         self._patch_from = patch_from(plan.scene)
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
-        self._recent: deque[tuple[int, int]] = deque()
+        self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
         self._syncs: deque[int] = deque()
 
-    def push(self, frames: Iterable[TimedFrame]) -> None:
-        """Take what was on the bus."""
+    def push(self, frames: Iterable[TimedFrame], channel: str | None = None) -> None:
+        """Take what was on one bus; by default the first, whose SYNC is the one that is timed: all of them have it."""
+        first = next(iter(self._recent))
+        recent = self._recent[first if channel is None else channel]
+        timed = recent is self._recent[first]
         for can_id, data, t_ns in frames:
             if self._first_ns is None:
                 self._first_ns = t_ns
-            self._recent.append((t_ns, best_case_bits(min(len(data), CLASSIC_BYTES))))
-            self._take(can_id, data, t_ns)
+            recent.append((t_ns, self._bits(len(data))))
+            if can_id != SYNC_ID:
+                self._take(can_id, data, t_ns)
+            elif timed:
+                self._syncs.append(t_ns)
+
+    def _bits(self, length: int) -> float:
+        """Of a frame, those of a data phase as bits of the nominal rate."""
+        if length <= CLASSIC_BYTES:
+            return best_case_bits(length)
+        bits = best_case_fd_bits(length)
+        return bits.nominal + bits.data / self._speed_up
 
     def _take(self, can_id: int, data: bytes, t_ns: int) -> None:
         node = self._nodes.get(can_id & 0x7F)
-        if can_id == SYNC_ID:
-            self._syncs.append(t_ns)
-        elif can_id in self._feedback:
+        if can_id in self._feedback:
             self._take_feedback(can_id, data)
         elif self._tactile is not None and can_id in self._tactile.cob_ids:
             self._take_taxels(can_id, data, t_ns)
@@ -166,13 +180,15 @@ class Monitor:
         return view
 
     def _measure_bus(self, view: CellView, now_ns: int) -> None:
-        while self._recent and self._recent[0][0] < now_ns - SECOND_NS:
-            self._recent.popleft()
+        for recent in self._recent.values():
+            while recent and recent[0][0] < now_ns - SECOND_NS:
+                recent.popleft()
         while self._syncs and self._syncs[0] < now_ns - SECOND_NS:
             self._syncs.popleft()
         span_s = min(1.0, max(view.t_s, 1e-3))
-        view.frames_per_s = len(self._recent) / span_s
-        view.load = sum(bits for _, bits in self._recent) / (self._plan.scene.bus.bitrate * span_s)
+        view.frames_per_s = sum(map(len, self._recent.values())) / span_s
+        whole = self._plan.scene.bus.bitrate * span_s
+        view.load = {channel: sum(bits for _, bits in recent) / whole for channel, recent in self._recent.items()}
         view.sync_hz = len(self._syncs) / span_s
         if len(self._syncs) > 2:
             errors = np.abs(np.diff(np.array(self._syncs)) - self._plan.sync.period_ns) * 1e-3

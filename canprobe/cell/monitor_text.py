@@ -27,7 +27,9 @@ def lines(view: CellView) -> Iterator[str]:
         if view.sync_jitter_us is None
         else f"p99 {view.sync_jitter_us[0]:.0f} µs, max {view.sync_jitter_us[1]:.0f} µs"
     )
-    yield f"{view.channel}  {view.t_s:8.1f} s   load {100 * view.load:4.1f} %   {view.frames_per_s:6.0f} frames/s"
+    names = len(view.load) > 1
+    load = ", ".join(f"{name + ' ' if names else ''}{100 * share:4.1f} %" for name, share in view.load.items())
+    yield f"{view.channel}  {view.t_s:8.1f} s   load {load}   {view.frames_per_s:6.0f} frames/s"
     yield f"SYNC {view.sync_hz:6.1f} Hz   jitter {jitter}"
     yield ""
     for node in view.nodes:

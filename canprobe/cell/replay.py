@@ -7,19 +7,20 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.cell.build import make_task
 from canprobe.cell.limits import limits_of
 from canprobe.cell.log_cycles import LogCycle
+from canprobe.cell.logged_way_back import TARGET_TOLERANCE, LoggedWayBack, worst_count
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.cell.tasks.touch_settings import TOUCH_FORCE
 from canprobe.planning.model import Plan
-from canprobe.robot.puma260 import MODELS, joints_to_counts
+from canprobe.robot.puma260 import MODELS
 
-TARGET_TOLERANCE = 1
-"""Counts that a replayed target may differ from the recorded one by rounding."""
+Vector = NDArray[np.float64]
 OWN_COUNTS = 20
 """Median difference up to which the task drove: 0.5 mm or 0.2 deg. One lost line is a few counts for a while."""
 PARTED_COUNTS = 100
@@ -37,6 +38,7 @@ class TaskReplay:
         compared: cycles with recorded targets beside its own.
         differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
         median_counts, worst_counts: the usual and the largest difference.
+        lifted_s: when the cell began to lift off, whatever it did so for, and ended the task's replay (s); else None.
         parted_s: when the recorded targets had left the task's for good, which ended its replay (s); else None.
     """
 
@@ -45,6 +47,7 @@ class TaskReplay:
     differing: int
     median_counts: float
     worst_counts: int
+    lifted_s: float | None
     parted_s: float | None
 
     @property
@@ -73,30 +76,55 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     It ends early where the targets are clearly another controller's.
     """
     task = make_task(plan)
-    assert isinstance(task, TouchTask) and plan.scene.arm is not None
-    model = MODELS[plan.scene.arm.model]
-    patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
-    differences: list[int] = []
-    away = 0
-    hold_cycles = limits_of(plan).hold_cycles
-    for cycle in controller_cycles(cycles):
-        if max(cycle.measurement.q_age, default=0) >= hold_cycles:
+    assert isinstance(task, TouchTask)
+    way_back = LoggedWayBack(plan)
+    comparison = _Comparison(plan)
+    for cycle in way_back.cycles_before(controller_cycles(cycles)):
+        if max(cycle.measurement.q_age, default=0) >= comparison.hold_cycles:
             continue  # a late drive: the cell held, and asked its controller nothing
         command = task.step(cycle.measurement)
-        if cycle.targets is not None and command.q_target is not None:
-            counts = np.round(joints_to_counts(model, command.q_target))
-            differences.append(int(np.abs(counts - cycle.targets).max()))
-            away = away + 1 if differences[-1] > PARTED_COUNTS else 0
-        if command.done or command.stop_reason is not None or away > patience:
+        comparison.add(cycle, command.q_target)
+        if command.done or command.stop_reason is not None or comparison.parted_s is not None:
             break
-    return TaskReplay(
-        task,
-        compared=len(differences),
-        differing=sum(d > TARGET_TOLERANCE for d in differences),
-        median_counts=float(np.median(differences)) if differences else math.inf,
-        worst_counts=max(differences, default=0),
-        parted_s=cycle.measurement.t_ns * 1e-9 if away > patience else None,
-    )
+    else:
+        for cycle, q in way_back.steps:
+            comparison.add(cycle, q)
+    return comparison.result(task, way_back.begun_s)
+
+
+class _Comparison:
+    """Recorded targets beside those of the replay."""
+
+    def __init__(self, plan: Plan) -> None:
+        assert plan.scene.arm is not None
+        self.hold_cycles = limits_of(plan).hold_cycles
+        self.parted_s: float | None = None
+        self._model = MODELS[plan.scene.arm.model]
+        self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
+        self._differences: list[int] = []
+        self._away = 0
+
+    def add(self, cycle: LogCycle, q: Vector | None) -> None:
+        """One cycle, and the joint angles (6,), rad, that its drives should have been told."""
+        if cycle.targets is None or q is None:
+            return
+        self._differences.append(worst_count(self._model, q, cycle.targets))
+        self._away = self._away + 1 if self._differences[-1] > PARTED_COUNTS else 0
+        if self._away > self._patience:
+            self.parted_s = cycle.measurement.t_ns * 1e-9
+
+    def result(self, task: TouchTask, lifted_s: float | None) -> TaskReplay:
+        """What came of it."""
+        differences = self._differences
+        return TaskReplay(
+            task,
+            compared=len(differences),
+            differing=sum(d > TARGET_TOLERANCE for d in differences),
+            median_counts=float(np.median(differences)) if differences else math.inf,
+            worst_counts=max(differences, default=0),
+            lifted_s=lifted_s,
+            parted_s=self.parted_s,
+        )
 
 
 def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:

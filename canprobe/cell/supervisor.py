@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
+SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,8 +52,8 @@ class Supervisor:
         self._sample: TactileSample | None = None
         self._hidden = HiddenForce()
         self._joints = JointGuard(seen.limits)
-        window = max(1, round(1e9 / seen.limits.period_ns))
-        self._late: deque[int] = deque([0] * window, maxlen=window)
+        period_ns = seen.limits.period_ns
+        self._late = deque((t_ns, 0) for t_ns in range(-SECOND_NS, 0, period_ns))  # before its first it was in time
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
@@ -71,10 +72,7 @@ class Supervisor:
     ) -> None:
         """Take in one cycle."""
         seen = self.seen
-        late = overruns - seen.overruns
-        self._late_sum += late - self._late[0]
-        self._late.append(late)
-        seen.late_share = self._late_sum / len(self._late)
+        self._count_late(overruns - seen.overruns, measurement.t_ns)
         seen.overruns = overruns
         seen.gap_ns = sync_ns - seen.sync_ns if seen.sync_ns else 0
         seen.measurement, seen.sync_ns, seen.counters = measurement, sync_ns, counters
@@ -87,6 +85,15 @@ class Supervisor:
         counts = [count(seen) for count in self._counters]
         if counts != self._counted:
             self._note(counts, measurement.cycle)
+
+    def _count_late(self, late: int, t_ns: int) -> None:
+        """Late cycles are longer than others: the last second has fewer of them."""
+        cycles = self._late
+        cycles.append((t_ns, late))
+        self._late_sum += late
+        while cycles[0][0] <= t_ns - SECOND_NS:
+            self._late_sum -= cycles.popleft()[1]
+        self.seen.late_share = self._late_sum / len(cycles)
 
     def _note(self, counts: list[int], cycle: int) -> None:
         self._counted = counts

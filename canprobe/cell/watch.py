@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from canprobe.errors import ProtocolError
+from canprobe.errors import NodeError, ProtocolError
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
 
@@ -26,8 +26,13 @@ class EmcyEvent:
         """Whether it is about frames rather than the device. Source: CiA 301, error codes 81xxh and 82xxh."""
         return self.emcy.code >> 8 in (0x81, 0x82)
 
+    @property
+    def what(self) -> str:
+        """The message in words."""
+        return f"EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+
     def __str__(self) -> str:
-        return f"node {self.node_id}: EMCY {self.emcy.code:04X}h, {describe(self.emcy.code)}"
+        return f"node {self.node_id}: {self.what}"
 
 
 class NodeWatch:
@@ -134,3 +139,12 @@ class NodeWatch:
     def not_in(self, state: NmtState) -> int | None:
         """A node whose last heartbeat told another state than ``state``, or None."""
         return next((node_id for node_id, seen in self.states.items() if seen is not state), None)
+
+
+def obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
+    """Whether a node does what it is told, as far as NMT and EMCY tell: not the one that the cell is stopped for."""
+    if isinstance(error, NodeError) and error.node_id == node_id:
+        return False
+    alarm = watch.device_alarm
+    operational = watch.states.get(node_id) is NmtState.OPERATIONAL
+    return operational and (alarm is None or alarm.node_id != node_id)

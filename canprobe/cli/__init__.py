@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.cli.interrupts import Terminated
+from canprobe.bus.interrupts import Terminated
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import CanprobeError
 
@@ -58,7 +58,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as leaving:
         return leaving.code if isinstance(leaving.code, int) else 0
     except CanprobeError as error:
-        return _complain(str(error), error.exit_status)
+        return _complain("\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_status)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter's last flush goes nowhere
         return 141

@@ -15,6 +15,7 @@ _EXAMPLE = """\
 examples:
   canprobe monitor cylinder --bus socketcan --channel can0
   canprobe monitor cylinder --bus socketcan --channel can0 --duration 2 --json
+  canprobe monitor two.toml --bus socketcan --channel arm=can0 --channel sensor=can1
 """
 
 
@@ -46,6 +47,7 @@ def run(args: argparse.Namespace) -> int:
             scene,
             interface=target.interface,
             channel=target.channel,
+            sensor_channel=target.sensor_channel,
             bitrate=target.bitrate,
             duration_s=duration_s,
         ):

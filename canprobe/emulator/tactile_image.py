@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,10 +30,18 @@ def is_overloaded(raw: Raw) -> bool:
 def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
     """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
     if tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8:
-        return np.where(raw >= threshold, raw, np.uint8(0))
+        return _kept(threshold).take(raw.astype(np.intp))
     counts = _scaled(raw, tare, gain_permille)
     np.rint(counts, out=counts)
-    return _limited(counts, threshold).astype(np.uint8)
+    return _kept(threshold).take(counts.astype(np.intp), mode="clip")
+
+
+@cache
+def _kept(threshold: int) -> Image:
+    """(256,) what remains of each count."""
+    counts = np.arange(FULL_SCALE + 1, dtype=np.uint8)
+    counts[: max(threshold, 0)] = 0
+    return counts
 
 
 def correct_finely(

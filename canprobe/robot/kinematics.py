@@ -48,7 +48,7 @@ def chain(model: PumaModel, q: npt.ArrayLike) -> Chain:
     Source: product of the standard DH transforms, worked out by hand; checked against the matrix product in tests.
     """
     d1, a2, offset, a3, d4, d6 = model.links
-    q1, q2, q3, q4, q5, q6 = q if isinstance(q, list) else np.asarray(q, dtype=float).tolist()
+    q1, q2, q3, q4, q5, q6 = q if isinstance(q, (list, tuple)) else np.asarray(q, dtype=float).tolist()
     c1, s1, c2, s2, c23, s23 = cos(q1), sin(q1), cos(q2), sin(q2), cos(q2 + q3), sin(q2 + q3)
     c4, s4, c5, s5, c6, s6 = cos(q4), sin(q4), cos(q5), sin(q5), cos(q6), sin(q6)
     # Elbow and wrist centre in the vertical plane of the arm, then turned by joint 1.
@@ -79,7 +79,8 @@ def chain(model: PumaModel, q: npt.ArrayLike) -> Chain:
 
 def _pose(c: Chain) -> Array:
     (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = c.x, c.y, c.z, c.flange
-    return np.array(((x0, y0, z0, p0), (x1, y1, z1, p1), (x2, y2, z2, p2), (0.0, 0.0, 0.0, 1.0)))
+    flat = (x0, y0, z0, p0, x1, y1, z1, p1, x2, y2, z2, p2, 0.0, 0.0, 0.0, 1.0)  # nested ones take numpy longer
+    return np.array(flat).reshape(4, 4)
 
 
 def forward(model: PumaModel, q: npt.ArrayLike) -> Array:
@@ -112,8 +113,9 @@ def forward_jacobian(model: PumaModel, q: npt.ArrayLike, T_flange_tool: Array) -
     (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = c.axis4, c.axis5, c.z
     px, py, pz = T_base_tool[:3, 3].tolist()
     ax, ay, _ = c.axis2
-    turns = (0.0, ax, ax, fx, gx, hx), (0.0, ay, ay, fy, gy, hy), (1.0, 0.0, 0.0, fz, gz, hz)
-    return T_base_tool, np.array((*point_jacobian(c, (px, py, pz)), *turns))
+    x, y, z = point_jacobian(c, (px, py, pz))
+    turns = (0.0, ax, ax, fx, gx, hx, 0.0, ay, ay, fy, gy, hy, 1.0, 0.0, 0.0, fz, gz, hz)
+    return T_base_tool, np.array((*x, *y, *z, *turns)).reshape(6, 6)
 
 
 def point_jacobian(c: Chain, point: Vec) -> tuple[Six, Six, Six]:
@@ -162,7 +164,7 @@ def point_velocity(c: Chain, point: Vec, qd: npt.ArrayLike) -> Vec:
     Returns:
         Velocity in the base frame, m/s.
     """
-    w1, w2, w3, w4, w5, w6 = np.asarray(qd, dtype=float).tolist()
+    w1, w2, w3, w4, w5, w6 = qd if isinstance(qd, (list, tuple)) else np.asarray(qd, dtype=float).tolist()
     px, py, pz = point
     (ax, ay, _), (fx, fy, fz), (gx, gy, gz), (hx, hy, hz) = c.axis2, c.axis4, c.axis5, c.z
     ox, oy, oz = w4 * fx + w5 * gx + w6 * hx, w4 * fy + w5 * gy + w6 * hy, w4 * fz + w5 * gz + w6 * hz

@@ -146,6 +146,19 @@ def compiled(
     return function
 
 
+def matrix_product(matrix: Sequence[Numbers]) -> Callable[[Numbers], tuple[float, ...]]:
+    """Function x -> A x on plain floats.
+
+    Args:
+        matrix: A, rows of equal length, of at least one entry that is not zero each.
+    """
+
+    def work(x: list[Value]) -> list[Value]:
+        return [sum((value * share for value, share in zip(x, row, strict=True) if share), 0.0) for row in matrix]
+
+    return compiled("matrix_product", work, {}, x=len(matrix[0]))
+
+
 def _source(name: str, arguments: Mapping[str, int], results: Sequence[Value]) -> str:
     """The function's text: a value that is used once stands where it is used, the others get names."""
     order = _needed(results)

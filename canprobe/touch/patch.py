@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, positive, read_only
 from canprobe.touch.contact import Doubt
-from canprobe.touch.patch_beyond import WORTH_COMPLETING, completed
+from canprobe.touch.patch_beyond import WORTH_COMPLETING, Continuation
 from canprobe.touch.patch_mending import mended
 
 SIDE = 16
@@ -131,6 +131,7 @@ class PatchCalibration:
     bias: float = 0.0
     pascals: Array = field(init=False, repr=False)
     weights: Array = field(init=False, repr=False)
+    continuation: Continuation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         for name in ("full_scale_pa", "exponent", "counts_max", "pitch_m", "radius_m", "force_gain"):
@@ -139,7 +140,9 @@ class PatchCalibration:
         pascals = self.full_scale_pa * (counts / self.counts_max) ** self.exponent
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
-        object.__setattr__(self, "weights", read_only(_moment_weights(self.pitch_m, self.radius_m)))
+        weights = read_only(_moment_weights(self.pitch_m, self.radius_m))
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "continuation", Continuation(weights, float(pascals[self.counts_max])))
 
 
 def _moment_weights(pitch: float, radius: float) -> Array:
@@ -176,7 +179,7 @@ def compute_patch(
     peak = max(counts)
     peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
     if window is not None and at_window > WORTH_COMPLETING * peak_pa:
-        pressure = completed(pressure, window, calibration.weights, float(calibration.pascals[calibration.counts_max]))
+        pressure = calibration.continuation.completed(pressure, window, peak_pa)
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
     return _patch(
         moments,

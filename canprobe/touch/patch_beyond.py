@@ -28,30 +28,44 @@ LEAST_FALL = 0.3
 """Share of the peak by which the pressure must fall over half the pad in every direction: else it is no patch."""
 
 
-def completed(pressure: Array, window: Sequence[int], weights: Array, saturated_pa: float) -> Array:
-    """The pressures of the whole pad, those outside the window carried on from those inside.
+class Continuation:
+    """Carries on what a window of one array cuts off.
 
     Args:
-        pressure: (n, n) of the taxels, Pa; 0 outside the window.
-        window: first row, first column, rows, columns.
         weights: (n², 6) area of each taxel × (1, u, v, uu, uv, vv), the place in any unit.
         saturated_pa: pressure from which on a taxel says no more than that, and is left out of the fit.
-
-    Returns:
-        A filled copy; the same array where the taxels show no quadratic with a summit.
     """
-    seen = pressure.reshape(-1)
-    used = np.flatnonzero((seen >= LEAST_SHARE * seen.max()) & (seen < saturated_pa))
-    if len(used) < LEAST_TAXELS:
-        return pressure
-    terms = weights[used]
-    _, quadratic, singular = dposv(terms.T @ terms, terms.T @ (seen[used] * terms[:, 0]))
-    _, _, _, uu, uv, vv = quadratic.tolist()
-    least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * weights[-1, 3] / weights[-1, 0]
-    if singular or not least_fall > LEAST_FALL * seen.max():
-        return pressure
-    whole: Array = np.maximum(weights @ quadratic / weights[:, 0], 0.0).reshape(pressure.shape)
-    row, column, rows, columns = window
-    inside = slice(row, row + rows), slice(column, column + columns)
-    whole[inside] = pressure[inside]
-    return whole
+
+    def __init__(self, weights: Array, saturated_pa: float) -> None:
+        area = weights[:, :1]
+        self._saturated_pa = saturated_pa
+        self._terms = weights / area
+        self._normal = (weights[:, :, None] * weights[:, None, :]).reshape(len(weights), -1)
+        self._right = weights * area
+        self._corner = float(self._terms[-1, 3])
+
+    def completed(self, pressure: Array, window: Sequence[int], peak_pa: float) -> Array:
+        """The pressures of the whole pad, those outside the window carried on from those inside.
+
+        Args:
+            pressure: (n, n) of the taxels, Pa; 0 outside the window.
+            window: first row, first column, rows, columns.
+            peak_pa: the highest of them.
+
+        Returns:
+            A filled copy; the same array where the taxels show no quadratic with a summit.
+        """
+        seen = pressure.reshape(-1)
+        used = ((seen >= LEAST_SHARE * peak_pa) & (seen < self._saturated_pa)).astype(float)
+        if used.sum() < LEAST_TAXELS:
+            return pressure
+        _, quadratic, singular = dposv((used @ self._normal).reshape(6, 6), (used * seen) @ self._right)
+        _, _, _, uu, uv, vv = quadratic.tolist()
+        least_fall = -0.5 * (uu + vv + math.hypot(uu - vv, uv)) * self._corner
+        if singular or not least_fall > LEAST_FALL * peak_pa:
+            return pressure
+        whole: Array = np.maximum(self._terms @ quadratic, 0.0).reshape(pressure.shape)
+        row, column, rows, columns = window
+        inside = slice(row, row + rows), slice(column, column + columns)
+        whole[inside] = pressure[inside]
+        return whole

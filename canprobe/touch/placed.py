@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf, sqrt
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,17 @@ Array = npt.NDArray[np.float64]
 
 Foot = tuple[float, float, float, float, float, float, float, float, float, float, float, float]
 """Local closest point: point xyz, outward normal xyz, signed distance, kappa1, kappa2, direction1 xyz."""
+Vec = tuple[float, float, float]
+
+
+class Nearest(NamedTuple):
+    """What ``ClosestPoint`` holds, in plain floats for those who ask in every cycle."""
+
+    point: Vec
+    normal: Vec
+    distance: float
+    kappa: tuple[float, float]
+    directions: tuple[Vec, Vec]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -67,6 +78,9 @@ class ObjectShape(Protocol):
 
     def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
         """Closest surface point to a (3,) point of the base frame, m."""
+
+    def nearest(self, point_base: Vec) -> Nearest:
+        """The same in plain floats."""
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
         """Where a ball touches if that is not its closest point alone (see ``PlacedShape``)."""
@@ -118,17 +132,36 @@ class PlacedShape:
         Returns:
             Everything in the base frame.
         """
-        bx, by, bz = point_base if isinstance(point_base, tuple) else np.asarray(point_base, dtype=float).tolist()
+        bx, by, bz = np.asarray(point_base, dtype=float).tolist()
+        point, normal, distance, kappa, directions = self.nearest((bx, by, bz))
+        return ClosestPoint(np.array(point), np.array(normal), distance, np.array(kappa), np.array(directions))
+
+    def nearest(self, point_base: Vec) -> Nearest:
+        """As ``closest``, in plain floats.
+
+        Args:
+            point_base: query point in the base frame, m.
+        """
+        bx, by, bz = point_base
         ox, oy, oz = self._origin
         x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
         bx, by, bz = bx - ox, by - oy, bz - oz
         px, py, pz, nx, ny, nz, distance, k1, k2, dx, dy, dz = self._foot(
             bx * x0 + by * x1 + bz * x2, bx * y0 + by * y1 + bz * y2, bx * z0 + by * z1 + bz * z2
         )
-        second = (ny * dz - nz * dy, nz * dx - nx * dz, nx * dy - ny * dx)
-        rows = np.array(((px, py, pz), (nx, ny, nz), (dx, dy, dz), second)).dot(self._rotation_t)
-        rows[0] += self._origin
-        return ClosestPoint(rows[0], rows[1], distance, np.array((k1, k2)), rows[2:])
+        n0, n1, n2 = nx * x0 + ny * y0 + nz * z0, nx * x1 + ny * y1 + nz * z1, nx * x2 + ny * y2 + nz * z2
+        d0, d1, d2 = dx * x0 + dy * y0 + dz * z0, dx * x1 + dy * y1 + dz * z1, dx * x2 + dy * y2 + dz * z2
+        return Nearest(
+            (
+                ox + px * x0 + py * y0 + pz * z0,
+                oy + px * x1 + py * y1 + pz * z1,
+                oz + px * x2 + py * y2 + pz * z2,
+            ),
+            (n0, n1, n2),
+            distance,
+            (k1, k2),
+            ((d0, d1, d2), (n1 * d2 - n2 * d1, n2 * d0 - n0 * d2, n0 * d1 - n1 * d0)),
+        )
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
         """Where a ball touches the surface if that is not its closest point alone.

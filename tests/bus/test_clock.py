@@ -60,3 +60,13 @@ def test_a_signal_that_raises_ends_the_sleep_and_another_does_not() -> None:
 
     with alarm(interrupt, 0.001), pytest.raises(KeyboardInterrupt):
         clock.sleep_until_ns(clock.now_ns() + 3600 * 10**9)
+
+
+def test_a_time_that_is_past_asks_nothing_of_the_kernel() -> None:
+    clock = MonotonicClock()
+    asked: list[object] = []
+    clock._clock_nanosleep = lambda *request: asked.append(request) or 0
+    clock.sleep_until_ns(clock.now_ns())
+    assert not asked
+    clock.sleep_until_ns(clock.now_ns() + 10_000_000)
+    assert len(asked) == 1

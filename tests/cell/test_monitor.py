@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
+import can
 import numpy as np
 import pytest
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe import api
 from canprobe.bus.candump import read_candump
 from canprobe.cell.monitor import Monitor
 from canprobe.cell.monitor_text import image_lines, lines, screen
@@ -68,7 +71,8 @@ def test_load_and_sync(recorded, in_hold):
     assert 0 < view.sync_jitter_us[1] < 135  # a SYNC waits for the frame on the wire
     last = [f for f in frames if t_ns + 1_000_000 - 1_000_000_000 <= f[2] <= t_ns + 1_000_000]
     assert view.frames_per_s == pytest.approx(len(last), abs=1)
-    assert 0.2 < view.load < result.plan.traffic.load
+    (load,) = view.load.values()
+    assert 0.2 < load < result.plan.traffic.load
 
 
 def test_jitter_is_that_of_the_syncs(recorded, in_hold):
@@ -110,6 +114,40 @@ def test_the_image_is_the_right_way_round():
     rows = list(image_lines(taxels))
     assert len(rows) == 16 and rows[2] == "  " + " " * 10 + "██" + " " * 20
     assert all(not row.strip() for i, row in enumerate(rows) if i != 2)
+
+
+def on_two_buses():
+    scene = load_scene("press")
+    return replace(scene, sensor=replace(scene.sensor, channel="can1"))
+
+
+def test_two_buses_are_heard_as_one_cell():
+    """SYNC goes out on both and counts once; each bus has its own load."""
+    monitor = Monitor(canprobe.plan(on_two_buses()))
+    for k in range(400):
+        sync = [(0x080, bytes([k % 240 + 1]), k * 2_500_000)]
+        monitor.push([*sync, (0x705, b"\x05", k * 2_500_000 + 1000)], "can0")
+        monitor.push(sync, "can1")
+    monitor.push([(0x710, b"\x05", 999_000_000)], "can1")
+    view = monitor.view(1_000_000_000)
+    assert view.sync_hz == 400 and view.frames_per_s == 1201 and view.sync_jitter_us == (0.0, 0.0)
+    assert view.load == {"can0": 0.044, "can1": 0.022055}, "47 bits of a frame, and 8 of its byte"
+    assert {n.node_id for n in view.nodes if n.state == "OPERATIONAL"} == {5, 16}
+    assert "can0+can1" in next(lines(view)) and "load can0  4.4 %, can1  2.2 %" in next(lines(view))
+
+
+def test_the_command_listens_to_both_buses(capsys):
+    """On python-can's own bus, which ends at the process: the heartbeats are waiting when the monitor opens."""
+    buses = {name: can.Bus(interface="virtual", channel=name) for name in ("left", "right")}
+    heard = iter(api.monitor(on_two_buses(), interface="virtual", channel="left", sensor_channel="right"))
+    next(heard)
+    for name, node_id in (("left", 4), ("right", 16)):
+        buses[name].send(can.Message(arbitration_id=0x700 + node_id, data=b"\x05", is_extended_id=False))
+    view = next(heard)
+    heard.close()
+    for bus in buses.values():
+        bus.shutdown()
+    assert {n.node_id for n in view.nodes if n.state == "OPERATIONAL"} == {4, 16}
 
 
 def test_nothing_heard_is_said_so():

@@ -12,8 +12,9 @@ import pytest
 
 import canprobe
 from canprobe import api
+from canprobe.bus.interrupts import Terminated
 from canprobe.cli import COMMANDS, main
-from canprobe.cli.interrupts import Terminated, termination_interrupts
+from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar
 from canprobe.cli.parser import channel, node_ids
 from canprobe.eds import eds_path

@@ -6,10 +6,13 @@ import signal
 
 import pytest
 
-from canprobe.cli.interrupts import Terminated, interrupts_held, termination_interrupts
+from canprobe.bus.interrupts import Terminated
+from canprobe.cli.interrupts import interrupts_held, termination_interrupts
 
 
-@pytest.mark.parametrize(("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated)])
+@pytest.mark.parametrize(
+    ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signal.SIGHUP, Terminated)]
+)
 def test_an_interrupt_waits_for_the_end_of_the_block(number, kind):
     done = []
     before = [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)]

@@ -183,6 +183,14 @@ def test_cia402_606c_velocity_and_6077_torque(drive, plant):
     assert bytes.fromhex(master.sync()[-1][1])[6:] == (-250).to_bytes(2, "little", signed=True)
 
 
+@pytest.mark.parametrize(("at", "told"), [(0.4, 0), (0.6, 1), (12.7, 13), (-0.4, 0), (-0.6, -1), (-12.7, -13)])
+def test_the_encoder_tells_the_nearest_whole_count_of_a_motor_that_is_between_them(drive, plant, at, told):
+    master = Master(drive)
+    plant.stuck, plant.counts[0] = True, at
+    assert position(master.sync()) == told
+    assert plant.motor_counts(0) == at
+
+
 @pytest.mark.parametrize(
     "quick_stop",
     [(6, 0x6085, S.QUICK_STOP_ACTIVE), (2, 0x6085, S.SWITCH_ON_DISABLED), (1, 0x6084, S.SWITCH_ON_DISABLED)],

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +14,10 @@ import pytest
 
 import canprobe
 from canprobe.bus.candump import read_candump
+from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
-from canprobe.errors import NodeError
+from canprobe.errors import NodeError, SafetyStop
 from canprobe.session import Session
 
 MS = 1_000_000
@@ -62,7 +65,28 @@ def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.Mo
     """A drive is not heard for four cycles of the scan; the task is not asked in those that hold."""
     run_with([Fault(FaultKind.DROP, 3, 2700 * MS, 11 * MS)], "press", tmp_path, monkeypatch, 1.0)
     summary = read_json(tmp_path / "summary.json")
-    assert summary["completed"] and any(fault.endswith("hold") for fault in summary["faults"])
+    assert summary["completed"] and any(": hold, at " in fault for fault in summary["faults"])
     with np.load(tmp_path / "log.npz") as log:
         assert np.isnan(log["force_n"][len(log["t_s"]) // 2 : -10]).any(), "it did hold in the scan"
     assert 0.0 < summary["contact"]["force_measured_rms_error_n"] < 0.2
+
+
+def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "log.npz").write_text("of an earlier run")
+
+    def full(path: Path, **_: Any) -> None:
+        path.write_bytes(b"PK, and no more")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "savez_compressed", full)
+    monkeypatch.setattr("canprobe.cell.cell.Cell.run", lambda *_: (_ for _ in ()).throw(SafetyStop("stopped")))
+    assert main(["run", "free", "--out", str(tmp_path)]) == 1
+    told = capsys.readouterr().err.splitlines()
+    assert told == [
+        "canprobe: stopped",
+        f"canprobe: {tmp_path}: not all results could be written: No space left on device",
+    ]
+    assert read_json(tmp_path / "summary.json")["stop_reason"] == "stopped"
+    assert not (tmp_path / "log.npz").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from itertools import count
 from struct import pack, unpack
 
@@ -9,6 +10,8 @@ import numpy as np
 import pytest
 from injected import HOLD_CYCLE, Injected, altered, send
 
+from canprobe.bus.interrupts import Terminated
+from canprobe.bus.port import ControllerState
 from canprobe.cell.lift_off import WAY
 from canprobe.cell.measurement import Command
 from canprobe.emulator.faults import FaultKind
@@ -46,7 +49,7 @@ def test_the_probe_is_taken_off(what):
     assert run.session.truth["force"][-1] == 0.0
     back, aside = lifted(run)
     assert 0.95 * WAY < back < 1.2 * WAY and aside < 0.05 * WAY, "without a sensor the task begins to retreat by itself"
-    assert any(fault.endswith(": lift off") for fault in run.session.cell.faults)
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
     if what.startswith("joint"):
         motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.counts.T
         lost = int(what.split()[1]) - 1
@@ -75,11 +78,89 @@ def pressed_on(run, told):
 def test_a_drive_that_tells_what_cannot_be_may_be_moving():
     change = lambda d: d[:2] + pack("<i", unpack("<i", d[2:6])[0] + 2000) + d[6:]  # noqa: E731
     run = Injected("press", HOLD_CYCLE, lambda r: altered(r.nodes[2], 0x182, change))
-    pressed_on(run, "the probe stays where it is")
+    pressed_on(run, "no lift-off: a drive may be moving")
 
 
 def test_with_another_master_nothing_moves():
-    pressed_on(Injected("press", HOLD_CYCLE, lambda r: send(r, (SYNC_ID, b""))), "another master")
+    run = Injected("press", HOLD_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
+    pressed_on(run, "another master")
+    (told,) = (fault for fault in run.session.cell.faults if "left pressing" in fault)
+    assert 1.8 < float(told.split(" N")[0].split()[-1]) < 2.2 and "free it before the next run" in told
+
+
+def test_after_bus_off_nothing_can_be_sent():
+    def off(run):
+        run.session.cell._port.state = ControllerState.BUS_OFF
+
+    pressed_on(Injected("press", HOLD_CYCLE, off), "left pressing")
+
+
+def interrupted(number):
+    return lambda run: signal.raise_signal(number)
+
+
+def failing(_):
+    raise ZeroDivisionError
+
+
+LEFT = {
+    "Ctrl-C": (interrupted(signal.SIGINT), KeyboardInterrupt),
+    "SIGTERM": (interrupted(signal.SIGTERM), Terminated),
+    "the terminal is closed": (interrupted(signal.SIGHUP), Terminated),
+    "the controller fails": (failing, ZeroDivisionError),
+}
+
+
+@pytest.mark.parametrize("what", LEFT)
+def test_whoever_ends_the_run_the_probe_is_taken_off(what):
+    action, kind = LEFT[what]
+    run = Injected("press", HOLD_CYCLE, action)
+    run.assert_within("interrupt").assert_drives_off()
+    assert type(run.error) is kind
+    assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
+    assert not any("left pressing" in fault for fault in run.session.cell.faults)
+    assert run.session.truth["force"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.truth["force"][-1] == 0.0
+    back, aside = lifted(run)
+    assert 0.95 * WAY < back < 1.05 * WAY and aside < 0.05 * WAY
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_nobody_need_listen():
+    """`canprobe up SCENE 2>&1 | tee FILE`: Ctrl-C ends tee first, and each line said from then on is an error."""
+
+    class Unheard(Injected):
+        def _say(self, text):
+            super()._say(text)
+            if self.injected_ns is not None:
+                raise BrokenPipeError
+
+    run = Unheard("press", HOLD_CYCLE, interrupted(signal.SIGINT))
+    assert isinstance(run.error, KeyboardInterrupt)
+    run.assert_drives_off()
+    assert run.session.truth["force"][-1] == 0.0
+    assert {node.node.core.state for node in run.nodes.values()} == {NmtState.PRE_OPERATIONAL}
+    assert any("BrokenPipeError" in fault for fault in run.session.cell.faults)
+
+
+def test_a_second_interrupt_stops_at_once():
+    class Hurried(Injected):
+        def record(self, row):
+            self.rows += 1
+            if self.rows == 20:
+                signal.raise_signal(signal.SIGINT)
+
+        def _say(self, text):
+            super()._say(text)
+            if text.startswith("lift off"):
+                self.rows = 0
+                self.session.cell.log.add = self.record
+
+    run = Hurried("press", HOLD_CYCLE, interrupted(signal.SIGINT))
+    assert isinstance(run.error, KeyboardInterrupt)
+    run.assert_drives_off()
+    back, _ = lifted(run)
+    assert 0.2 * WAY < back < 0.5 * WAY, "20 of 128 cycles, the fast ones"
 
 
 def test_a_way_back_on_which_the_force_grows_ends():

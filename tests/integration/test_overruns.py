@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,19 @@ def test_overruns_are_counted_and_the_rate_is_the_true_one(stalled: tuple[Sessio
     lost = 2 * cycle["overruns"]  # the stall swallows the rest of its own period and two more
     assert cycle["rate_hz"] == pytest.approx(400.0 * cycle["cycles"] / (cycle["cycles"] + lost), rel=0.01)
     assert cycle["missed_pdos"] == 0
+
+
+def test_the_nodes_say_that_sync_was_late_and_it_is_told_in_one_line(stalled: tuple[Session, Stalls]) -> None:
+    """1.5 periods (1006h) after a SYNC its absence is an EMCY 8100h; the next SYNC ends that error (1001h)."""
+    session, controller = stalled
+    overruns = summarise(session, controller.task, {}, None)["cycle"]["overruns"]
+    (told,) = session.cell.faults
+    times = re.fullmatch(
+        r"nodes 1-6, 16: EMCY 8100h, communication, (\d+) times, first at [\d.]+ s, last at [\d.]+ s", told
+    )
+    assert times is not None and int(times[1]) == session.cell.supervisor.counts["emcy_communication"]
+    assert overruns / 2 <= int(times[1]) / 7 <= overruns, "the inhibit time (1015h) lets a node send ten a second"
+    assert session.world is not None and not any(node.dictionary.number(0x1001) for node in session.world.nodes)
 
 
 def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Stalls]) -> None:

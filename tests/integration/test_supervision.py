@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from dataclasses import replace
 from pathlib import Path
 from struct import pack, unpack
@@ -67,7 +68,8 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    assert run.session.cell.faults == ["node 4: EMCY 8210h, PDO not processed due to length error"]
+    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {FREE_CYCLE * 0.0025:.2f} s"
+    assert run.session.cell.faults == [told]
 
 
 def test_another_master():
@@ -202,6 +204,7 @@ def test_error_passive_holds_until_it_is_over():
 def test_error_passive_for_long_makes_the_probe_retreat():
     run = Injected("press", HOLD_CYCLE, passive, until=1500)
     assert "error-passive for 1.0 s" in str(run.error)
+    run.assert_within("error_passive_long")
     assert run.session.truth["force"][-1] == 0.0
 
 
@@ -271,6 +274,7 @@ class Late(Injected):
 def test_the_overrun_budget_makes_the_probe_retreat():
     run = Late("press", HOLD_CYCLE, lambda _: None, until=1000)
     assert "of the last second's cycles came more than half a period late" in str(run.error)
+    run.assert_within("overruns")
     assert run.session.truth["force"][-1] == 0.0
 
 
@@ -464,6 +468,21 @@ def test_an_interrupt_or_an_exception(error):
     run = Injected("free", FREE_CYCLE, raise_it)
     run.assert_within("interrupt").assert_drives_off()
     assert isinstance(run.error, error)
+
+
+@pytest.mark.parametrize(("hung_ns", "waits"), [(20_000_000, True), (1_100_000_000, False)])
+def test_an_interrupt_does_not_wait_for_a_controller_that_hangs(hung_ns, waits):
+    reached = []
+
+    def hang(run):
+        clock = run.session.lockstep.clock
+        clock.sleep_until_ns(clock.now_ns() + hung_ns)
+        signal.raise_signal(signal.SIGINT)
+        reached.append(True)
+
+    run = Injected("free", FREE_CYCLE, hang, arm={"missed_syncs": 40})
+    run.assert_drives_off()
+    assert isinstance(run.error, KeyboardInterrupt) and bool(reached) is waits
 
 
 def test_the_drives_of_a_dead_master_stop_by_themselves():

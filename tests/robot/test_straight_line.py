@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.robot.straight_line import call, compiled, where
+from canprobe.robot.straight_line import call, compiled, matrix_product, where
 
 RNG = np.random.default_rng(0)
 
@@ -62,3 +62,11 @@ def test_long_expressions_are_cut_in_pieces():
         return [total]
 
     assert compiled("f", work, {}, a=2)((1.0, 1.0)) == pytest.approx(work((1.0, 1.0)))
+
+
+def test_a_product_with_a_matrix_leaves_zeros_out():
+    A = RNG.normal(size=(3, 4)) * np.array(((1, 0, 1, 0), (0, 1, 0, 0), (1, 1, 1, 1)))
+    x = RNG.normal(size=4)
+    f = matrix_product(A.tolist())
+    assert f(x.tolist()) == pytest.approx((A @ x).tolist(), rel=1e-14)
+    assert f.source.count("*") == np.count_nonzero(A)

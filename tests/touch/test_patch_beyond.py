@@ -11,10 +11,10 @@ from canprobe.emulator.tactile_image import follow, middle
 from canprobe.planning.cut_patch import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
 from canprobe.scene import ProbeSettings
 from canprobe.touch.patch import SIDE, PatchCalibration, compute_patch
-from canprobe.touch.patch_beyond import completed
+from canprobe.touch.patch_beyond import Continuation
 
 EXACT = PatchCalibration()
-PITCH, WEIGHTS = EXACT.pitch_m, EXACT.weights
+PITCH = EXACT.pitch_m
 FULL_PA = 100e3
 SOFT = 2.3e7  # N/m³: 4 kN/m at 2 N on the cylinder
 SHAPES = {"plane": (0.0, 0.0), "cylinder": (1 / 0.036, 0.0), "sphere": (20.0, 20.0)}
@@ -36,16 +36,21 @@ def seen(image, window):
     return shown
 
 
+def completed(pressure, window):
+    """With the highest pressure there is, as the patch knows it."""
+    return Continuation(EXACT.weights, FULL_PA).completed(pressure, window, float(pressure.max()))
+
+
 @pytest.mark.parametrize("window", [(4, 4, 8, 8), (5, 3, 8, 8), (6, 5, 6, 6), (3, 3, 10, 10)])
 def test_a_quadratic_is_carried_on_exactly(window):
     whole = paraboloid()
     assert seen(whole, window).sum() < 0.99 * whole.sum()
-    np.testing.assert_allclose(completed(seen(whole, window), window, WEIGHTS, FULL_PA), whole, atol=1e-6 * FULL_PA)
+    np.testing.assert_allclose(completed(seen(whole, window), window), whole, atol=1e-6 * FULL_PA)
 
 
 def test_saturated_taxels_do_not_flatten_it():
     whole, window = paraboloid(peak=130e3), (4, 4, 8, 8)
-    found = completed(seen(np.minimum(whole, FULL_PA), window), window, WEIGHTS, FULL_PA)
+    found = completed(seen(np.minimum(whole, FULL_PA), window), window)
     outside = seen(np.ones_like(whole), window) == 0.0
     np.testing.assert_allclose(found[outside], whole[outside], atol=1e-6 * FULL_PA)
     assert found[~outside].max() == FULL_PA, "what was seen stays"
@@ -62,7 +67,7 @@ def test_saturated_taxels_do_not_flatten_it():
     ],
 )
 def test_what_is_no_patch_is_left_alone(pressure):
-    assert completed(pressure, (4, 4, 8, 8), WEIGHTS, FULL_PA) is pressure
+    assert completed(pressure, (4, 4, 8, 8)) is pressure
 
 
 def test_a_patch_that_the_window_holds_is_the_same_with_and_without_it():

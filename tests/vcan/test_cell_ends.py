@@ -31,6 +31,10 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
         assert len(truth["t_s"]) >= cycles
         steps = np.abs(np.diff(truth["q"], axis=0)).max(axis=1)
         assert steps[-1] < 0.3 * steps.max(), "the arm comes to rest"
+        if name == "cylinder":
+            assert truth["force"].max() > 1.0, "it was in contact"
+            assert truth["force"][-1] == 0.0, "and was taken off"
+            assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
 def test_up_ends_with_an_interrupt(bench: Any) -> None:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import numpy.typing as npt
 
-from canprobe.emulator.plant.equations import ArmEquations
+from canprobe.emulator.plant.equations import ArmEquations, State
 from canprobe.emulator.plant.held_step import held_rosenbrock2
 from canprobe.emulator.plant.integrators import STEPS, rosenbrock2
 from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.reference import Reference
+from canprobe.emulator.plant.reference import NEVER, Reference
 from canprobe.robot.actuation import (
     CONTINUOUS_TORQUE_NM,
     COULOMB_NM,
@@ -57,23 +58,22 @@ class DynamicArm:
         self.equations = equations
         self.t_ns = 0
         self._stepping, self._step = stepping, STEPS[stepping.method]
-        if self._step is rosenbrock2:
-            self._step = held_rosenbrock2
-        self._scale = counts_per_radian(model)
-        self._scales: list[float] = self._scale.tolist()
+        scale = counts_per_radian(model)
+        self._scales: list[float] = scale.tolist()
         counts = joints_to_counts(model, q0)
         self._references = [Reference(c) for c in counts.tolist()]
-        self._y = equations.resting(counts / self._scale)
+        self._y: State = equations.resting(counts / scale).tolist()
         self._y_ns = 0
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
-        self._now: tuple[int, Array] | None = None
-        self._torques: tuple[Array, list[float]] | None = None
+        self._now: tuple[int, State] | None = None
+        self._torques: tuple[State, list[float]] | None = None
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Give one motor a ramp, see ``IdealArm.set_ramp``."""
-        self._advance_to(self.t_ns)
+        if self._y_ns < self.t_ns:
+            self._advance_to(self.t_ns)
         self._references[axis].add((t0_ns, t1_ns, start_counts, end_counts), self.t_ns)
         self._bend_ns = self._y_ns
         self._torques = None  # the state now is what it is, whatever the reference does from now on
@@ -89,7 +89,8 @@ class DynamicArm:
     def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Positions (counts) and rates (counts/s) of the six motors now."""
         y = self._state()
-        return tuple((y[:6] * self._scale).tolist()), tuple((y[6:12] * self._scale).tolist())
+        positions = tuple([x * scale for x, scale in zip(y[:6], self._scales, strict=True)])
+        return positions, tuple([v * scale for v, scale in zip(y[6:12], self._scales, strict=True)])
 
     @property
     def q(self) -> Array:
@@ -107,8 +108,7 @@ class DynamicArm:
         Args:
             axis: 0 to 5.
         """
-        position: float = self._state().item(axis)
-        return position * self._scales[axis]
+        return self._state()[axis] * self._scales[axis]
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
@@ -133,9 +133,7 @@ class DynamicArm:
         """
         self._advance_to(self.t_ns)
         rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
-        self.equations.loops.set_loop(
-            axis, rated * limit_permille, speed / float(self._scale[axis]), rated * torque_permille
-        )
+        self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
         self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
@@ -146,12 +144,12 @@ class DynamicArm:
         """
         inertia, rated = REFLECTED_INERTIA[axis], CONTINUOUS_TORQUE_NM[axis]
         return MotorDynamics(
-            gain=1e-3 * rated * float(self._scale[axis]) / inertia,
+            gain=1e-3 * rated * self._scales[axis] / inertia,
             coulomb=1000.0 * COULOMB_NM[axis] / rated,
             damping=VISCOUS_NMS[axis] / inertia,
         )
 
-    def _state(self) -> Array:
+    def _state(self) -> State:
         """State now."""
         if self._now is None or self._now[0] != self.t_ns:
             self._advance_to(self.t_ns, keep=False)
@@ -174,14 +172,22 @@ class DynamicArm:
 
     def _bend(self) -> None:
         """Some reference changes its slope here."""
-        rows = [r.at(self._y_ns) for r in self._references]
-        theta = [x / scale for (x, _), scale in zip(rows, self._scales, strict=True)]
-        slope = [v / scale for (_, v), scale in zip(rows, self._scales, strict=True)]
-        self.equations.loops.set_reference(1e-9 * self._y_ns, theta, slope)
-        self._bend_ns = min(r.next_bend(self._y_ns) for r in self._references)
+        now_ns, theta, slope = self._y_ns, [], []
+        self._bend_ns = NEVER
+        for reference, scale in zip(self._references, self._scales, strict=True):
+            x, v = reference.at(now_ns)
+            theta.append(x / scale)
+            slope.append(v / scale)
+            bend_ns = reference.next_bend(now_ns)
+            self._bend_ns = min(self._bend_ns, bend_ns)
+        self.equations.loops.set_reference(1e-9 * now_ns, theta, slope)
 
-    def _stepped(self, end_ns: int) -> Array:
+    def _stepped(self, end_ns: int) -> State:
+        y, equations, t, h = self._y, self.equations, 1e-9 * self._y_ns, 1e-9 * (end_ns - self._y_ns)
         if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
-            self.equations.hold(self._y)
+            equations.hold_at(y[:6], y[6:12])
             self._hold_ns = self._y_ns
-        return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
+        if self._step is rosenbrock2:
+            return held_rosenbrock2(equations, t, y, h)
+        stepped: list[float] = self._step(equations, t, np.array(y), h).tolist()
+        return stepped

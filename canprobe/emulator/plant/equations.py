@@ -7,7 +7,7 @@ coordinates. Mass matrix, bias (gravity, Coriolis) and the geometry of the conta
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import tanh
 
@@ -21,7 +21,9 @@ from canprobe.robot.actuation import REFLECTED_INERTIA, STICTION_RATE, joints_pe
 from canprobe.robot.dynamics import RigidBody, dense
 from canprobe.robot.puma260 import Array
 
-Touching = Callable[[list[float]], Contact | None]
+State = Sequence[float]
+"""(18,) plain floats."""
+Touching = Callable[[State], Contact | None]
 """Motor angles (6,), rad -> the contact near there, None where nothing is near."""
 _AT_REST = (0.0,) * 6
 
@@ -86,10 +88,19 @@ class ArmEquations:
             y: (18,) state.
         """
         state: list[float] = y.tolist()
+        self.hold_at(state[:6], state[6:12])
+
+    def hold_at(self, theta: State, rate: State) -> None:
+        """As ``hold``, in plain floats.
+
+        Args:
+            theta: (6,) motor angles, rad.
+            rate: (6,) rad/s.
+        """
         if self.effects.links:
-            self._take(self._driven.lower_terms(state[:6], state[6:12] if self.effects.coriolis else _AT_REST))
+            self._take(self._driven.lower_terms(theta, rate if self.effects.coriolis else _AT_REST))
         if self.effects.contact:
-            self.contact = self._touching(state[:6])
+            self.contact = self._touching(theta)
 
     def _take(self, terms: tuple[float, ...]) -> None:
         self.lower_mass, self.bias = terms[:21], terms[21:]
@@ -111,14 +122,14 @@ class ArmEquations:
         bias = self._driven.gravity(theta) if self.effects.links else np.zeros(6)
         return np.concatenate((theta, np.zeros(6), bias))
 
-    def torque(self, t: float, y: Array) -> list[float]:
+    def torque(self, t: float, y: State) -> list[float]:
         """(6,) torque of the motors, motor coordinates, N m.
 
         Args:
             t: s.
             y: (18,) state.
         """
-        return self.loops.drives(t, y.tolist())[2]
+        return self.loops.drives(t, y)[2]
 
     def rate(self, t: float, y: Array) -> Array:
         """f(t, y)."""

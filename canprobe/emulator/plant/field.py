@@ -17,11 +17,14 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 Vec = tuple[float, float, float]
+Directions = tuple[tuple[float, float], tuple[float, float]] | Array
+"""(2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction."""
 
 SIDE = 16
 PITCH_M = 0.0254 / SIDE
 _MARGIN = 2
 """Taxels of pressure beyond the array's edge that still blur into it."""
+_NOTHING = np.array(0.0)
 
 
 def pad_direction(u: float, v: float, radius: float) -> Vec:
@@ -107,9 +110,9 @@ class PressureField:
         u, v = np.meshgrid(axis, axis)
         arc = np.hypot(u, v) / radius_m
         sinc = np.sinc(arc / np.pi)
-        # Directions of the samples; and the area of a pad cell on the sphere over du dv.
-        self._samples = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc), sinc))
-        self._directions, self._area = self._samples[:3], self._samples[3]
+        # Directions of the samples; 1; and the area of a pad cell on the sphere over du dv.
+        self._samples = np.stack((sinc * u / radius_m, sinc * v / radius_m, np.cos(arc), np.ones_like(arc), sinc))
+        self._directions, self._area = self._samples[:3], self._samples[4]
         self._rows = _averaging_matrix(samples, blur_pitch)
         self._columns = np.ascontiguousarray(self._rows.T)
 
@@ -141,7 +144,7 @@ class PressureField:
         return means
 
     def mean_pressure(
-        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Array
+        self, uv: tuple[float, float], depth: float, kappa: tuple[float, float], directions_pad: Directions
     ) -> Array:
         """Taxel means of ``depth - probe height - object height`` where positive.
 
@@ -149,7 +152,7 @@ class PressureField:
             uv: contact point on the pad, m.
             depth: indentation, m.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: (2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction.
+            directions_pad: of the contact on the pad.
 
         Returns:
             (16, 16) layer compression, m, times taxel area over pitch^2; times k it is force over pitch^2, Pa.
@@ -157,7 +160,8 @@ class PressureField:
         if depth <= 0.0:
             return np.zeros((SIDE, SIDE))
         radius = self.radius
-        (m11, m12), (m21, m22) = directions_pad.tolist()
+        given = directions_pad.tolist() if isinstance(directions_pad, np.ndarray) else directions_pad
+        (m11, m12), (m21, m22) = given
         a, b = _half_axis(depth, kappa[0], radius), _half_axis(depth, kappa[1], radius)
         r0, r1 = self._span(uv[1], hypot(a * m12, b * m22))
         c0, c1 = self._span(uv[0], hypot(a * m11, b * m21))
@@ -165,24 +169,23 @@ class PressureField:
             return np.zeros((SIDE, SIDE))
         d = pad_direction(uv[0], uv[1], radius)
         (x0, x1, x2), (y0, y1, y2) = pad_basis(d)
-        frame = np.array(
-            (
-                d,
-                (m11 * x0 + m12 * y0, m11 * x1 + m12 * y1, m11 * x2 + m12 * y2),
-                (m21 * x0 + m22 * y0, m21 * x1 + m22 * y1, m21 * x2 + m22 * y2),
-            )
-        )
-        samples = self._samples[:, r0:r1, c0:c1].reshape(4, -1)
-        squeeze, *across = frame.dot(samples[:3])  # along the contact's direction, and along the principal ones
-        # Probe height above its lowest point: R (1 - s.d), exact; object height from its principal curvatures.
-        squeeze *= radius
-        for curvature, way in zip(kappa, across, strict=True):
+        # Depth less the probe's height above its lowest point, R (1 - s.d), which is exact; roots of the object's
+        # heights along its principal directions.
+        rows = [(radius * d[0], radius * d[1], radius * d[2], depth - radius)]
+        for curvature, mx, my in ((kappa[0], m11, m12), (kappa[1], m21, m22)):
             if curvature:
-                height = np.square(way, out=way)
-                height *= 0.5 * curvature * radius * radius
+                root = radius * sqrt(0.5 * abs(curvature))
+                a, b = root * mx, root * my
+                rows.append((a * x0 + b * y0, a * x1 + b * y1, a * x2 + b * y2, 0.0))
+        samples = self._samples[:, r0:r1, c0:c1].reshape(5, -1)
+        squeeze, *across = np.array(rows).dot(samples[:4])
+        for curvature, height in zip(filter(None, kappa), across, strict=True):
+            np.square(height, out=height)
+            if curvature > 0.0:
                 squeeze -= height
-        squeeze += depth - radius
-        np.maximum(squeeze, 0.0, out=squeeze)
-        squeeze *= samples[3]
+            else:
+                squeeze += height
+        np.maximum(squeeze, _NOTHING, out=squeeze)
+        squeeze *= samples[4]
         means: Array = self._rows[:, r0:r1].dot(squeeze.reshape(r1 - r0, -1)).dot(self._columns[c0:c1])
         return means

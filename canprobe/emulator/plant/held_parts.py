@@ -1,4 +1,4 @@
-"""What the step in straight-line code is made of, in symbols: a motor, a touch, and a 6 x 6 system."""
+"""What the step in straight-line code is made of, in symbols: a motor's loop, a touch, and a 6 x 6 system."""
 
 from __future__ import annotations
 
@@ -26,66 +26,84 @@ class Motor(NamedTuple):
     viscous: Value
     coulomb: Value
 
-    def drive(self, kp: Value, t: Value, state: Row) -> tuple[Value, Value, Value]:
-        """Velocity error, torque asked for and torque given; of angle, rate and integrator."""
-        x, v, s = state
-        error = kp * (self.start + self.slope * t - x) + self.ahead - v
-        asked = self.gain * error + s + self.fed
+    def limited(self, asked: Value) -> Value:
+        """Torque given for the torque asked for."""
         low = where("<", asked, -self.limit, -self.limit, asked)
-        return error, asked, where(">", asked, self.limit, self.limit, low)
+        return where(">", asked, self.limit, self.limit, low)
 
     def drag(self, v: Value) -> tuple[Value, Value]:
         """Friction, and its slope by the rate."""
-        bent = call("tanh", v / STICTION_RATE)
-        steep = self.coulomb / STICTION_RATE * (1.0 - bent * bent)
+        bent = call("tanh", v * (1.0 / STICTION_RATE))
+        steep = self.coulomb * (1.0 / STICTION_RATE) * (1.0 - bent * bent)
         return self.viscous * v + self.coulomb * bent, self.viscous + steep
 
 
-class Pressing(NamedTuple):
-    """What a touch does at a state.
+class Meeting(NamedTuple):
+    """How the probe moves at the touch: depth, speed along the normal, and along the two tangents."""
 
-    Push (6), elastic force, factor of damping, slip along s and t, its square, friction per slip, force per depth.
-    """
-
-    push: Row
-    elastic: Value
-    factor: Value
+    depth: Value
+    away: Value
     along: Value
     across: Value
-    square: Value
+
+
+class Forces(NamedTuple):
+    """What a touch does: elastic force, factor of its damping, force, friction per slip, slip's square."""
+
+    elastic: Value
+    factor: Value
+    force: Value
     drag: Value
-    spring: Value
+    square: Value
 
 
 class Touch:
     """One touch, see ``pushing.OneTouch``."""
 
-    def __init__(self, n: Row, s: Row, t: Row, law: Row) -> None:
-        self.n, self.s, self.t = n, s, t
+    def __init__(self, n: Row, s: Row, t: Row, plane: Row, law: Row) -> None:
+        self.n, self.s, self.t, self.plane = n, s, t, plane
         self.offset, self.coefficient, self.damping, self.friction = law
 
-    def press(self, theta: Row, v: Row) -> Pressing:
-        """Forces at a state."""
-        depth = self.offset - dot(self.n, theta)
-        elastic = where(">", depth, 0.0, self.coefficient * depth * depth, 0.0)
-        factor = 1.0 - self.damping * dot(self.n, v)
-        factor = where(">", factor, 0.0, factor, 0.0)
-        force, along, across = elastic * factor, dot(self.s, v), dot(self.t, v)
-        square = along * along + across * across + SLIP_M_S**2
-        drag = self.friction * force / call("sqrt", square)
-        a, b = drag * along, drag * across
-        push = [force * x - a * y - b * z for x, y, z in zip(self.n, self.s, self.t, strict=True)]
-        spring = where(">", depth, 0.0, 2.0 * self.coefficient * depth * factor, 0.0)
-        return Pressing(push, elastic, factor, along, across, square, drag, spring)
+    def meeting(self, theta: Row, v: Row) -> Meeting:
+        """Of a state."""
+        return Meeting(self.offset - dot(self.n, theta), dot(self.n, v), dot(self.s, v), dot(self.t, v))
 
-    def stiffen(self, inner: list[list[Value]], p: Pressing, g: Value) -> None:
-        """Add what the touch does to the lower half of the system for the rates."""
-        normal = g * where(">", p.factor, 0.0, self.damping * p.elastic, 0.0) + g * g * p.spring
-        rubbed = g * p.drag
-        slip = [p.along * x + p.across * y for x, y in zip(self.s, self.t, strict=True)]
-        for i, j in LOWER:
-            held = self.s[i] * self.s[j] + self.t[i] * self.t[j] - slip[i] * (slip[j] / p.square)
-            inner[i][j] = inner[i][j] + (normal * self.n[i]) * self.n[j] + rubbed * held
+    def forces(self, m: Meeting) -> Forces:
+        """Of a meeting."""
+        elastic = where(">", m.depth, 0.0, self.coefficient * m.depth * m.depth, 0.0)
+        factor = 1.0 - self.damping * m.away
+        factor = where(">", factor, 0.0, factor, 0.0)
+        square = m.along * m.along + m.across * m.across + SLIP_M_S**2
+        force = elastic * factor
+        return Forces(elastic, factor, force, self.friction * force / call("sqrt", square), square)
+
+    def spring(self, m: Meeting, f: Forces) -> Value:
+        """Force per depth."""
+        return where(">", m.depth, 0.0, 2.0 * self.coefficient * m.depth * f.factor, 0.0)
+
+    def damper(self, f: Forces) -> Value:
+        """Force per speed along the normal."""
+        return where(">", f.factor, 0.0, self.damping * f.elastic, 0.0)
+
+    def slip(self, m: Meeting) -> list[Value]:
+        """Slip per motor, times the slip."""
+        return [m.along * x + m.across * y for x, y in zip(self.s, self.t, strict=True)]
+
+    def stiffness(self, normal: Value, rubbing: Value, slip: Row, square: Value) -> list[Value]:
+        """What the touch adds to the system, entries ``LOWER``.
+
+        Args:
+            normal: factor of n n'.
+            rubbing: factor of s s' + t t' less what acts along the slip.
+            slip: see ``slip``.
+            square: of the slip.
+        """
+        pressed, ratio = [normal * x for x in self.n], rubbing / square
+        slipped = [ratio * x for x in slip]
+        return [
+            pressed[i] * self.n[j] + rubbing * both - slipped[i] * slip[j]
+            for (i, j), both in zip(LOWER, self.plane, strict=True)
+        ]
 
 
 class System:
@@ -99,7 +117,7 @@ class System:
         columns: list[list[Value]] = [[0.0] * 6 for _ in range(6)]  # of L D
         self._inverse: list[Value] = []
         for j in range(6):
-            before = [self._inverse[k] * columns[j][k] for k in range(j)]
+            before = [columns[j][k] * self._inverse[k] for k in range(j)]
             for i in range(j, 6):
                 columns[i][j] = lower[i][j] - dot(columns[i][:j], before)
             self._inverse.append(1.0 / columns[j][j])
@@ -116,10 +134,9 @@ class System:
         return x
 
 
-def symmetric_times(lower: Row, x: Row) -> list[Value]:
-    """Product of a symmetric matrix, entries ``LOWER``, with a vector."""
-    entries = dict(zip(LOWER, lower, strict=True))
-    return [dot([entries[max(i, j), min(i, j)] for j in range(6)], x) for i in range(6)]
+def plus(a: Row, b: Row, share: Value = 1.0) -> list[Value]:
+    """a + share b."""
+    return [x + share * y for x, y in zip(a, b, strict=True)]
 
 
 def dot(a: Row, b: Row) -> Value:

@@ -1,7 +1,9 @@
 """The default step of the dynamic arm in straight-line code: ``rosenbrock2`` on held dynamics with at most one touch.
 
-The same numbers as ``integrators.rosenbrock2`` on ``ArmEquations``, but for rounding, at a third of the time. The rows
-of the rates are multiplied by the mass matrix on both sides, so that its inverse is never needed.
+The same numbers as ``integrators.rosenbrock2`` on ``ArmEquations``, but for rounding, at a seventh of the time. The
+rows of the rates are multiplied by the mass matrix on both sides, so that its inverse is never needed; the rates of
+angles and integrators are eliminated, which leaves a 6 x 6 system for the accelerations. What the mass matrix does to
+the first stage's accelerations is known from that stage's right-hand side.
 """
 
 from __future__ import annotations
@@ -12,37 +14,46 @@ from functools import cache
 
 import numpy as np
 
-from canprobe.emulator.plant.equations import ArmEquations
-from canprobe.emulator.plant.held_parts import Motor, Row, System, Touch, dot, symmetric_times
-from canprobe.emulator.plant.integrators import GAMMA, Problem, rosenbrock2
+from canprobe.emulator.plant.equations import ArmEquations, State
+from canprobe.emulator.plant.held_parts import Forces, Meeting, Motor, Row, System, Touch, dot, plus
+from canprobe.emulator.plant.integrators import GAMMA, rosenbrock2
 from canprobe.emulator.plant.pushing import OneTouch
 from canprobe.robot.dynamics import LOWER
-from canprobe.robot.puma260 import Array
 from canprobe.robot.straight_line import Value, compiled, where
 
 _LOOPS = ("start", "slope", "ahead", "fed", "gain", "integral", "limit", "viscous", "coulomb")
 
 
-def held_rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
-    """``integrators.rosenbrock2``; what is not a held arm with at most one touch takes that one."""
-    touch = problem.contact if isinstance(problem, ArmEquations) else None
-    if not isinstance(problem, ArmEquations) or not problem.held or not isinstance(touch, OneTouch | None):
-        return rosenbrock2(problem, t, y, h)
-    loops = problem.loops
+def held_rosenbrock2(equations: ArmEquations, t: float, y: State, h: float) -> State:
+    """``integrators.rosenbrock2``; what is not held, or touches in several places, takes that one.
+
+    Args:
+        equations: of the arm.
+        t: s.
+        y: (18,) state.
+        h: length of the step, s.
+
+    Returns:
+        (18,) state after the step.
+    """
+    touch, loops = equations.contact, equations.loops
+    if not equations.held or (touch is not None and not isinstance(touch, OneTouch)):
+        stepped: list[float] = rosenbrock2(equations, t, np.array(y), h).tolist()
+        return stepped
     known: tuple[Sequence[float], ...] = (
-        y.tolist(), (t, h), problem.lower_mass, problem.bias, (loops.position, loops.unwind),
+        y, (t, h), equations.lower_mass, equations.bias, (loops.position, loops.unwind),
         loops.start, loops.slope, loops.ahead, loops.fed, loops.gain, loops.integral, loops.limit,
         loops.viscous, loops.coulomb,
     )  # fmt: skip
     if touch is not None:
-        known = *known, touch.n, touch.s, touch.t, touch.law
-    return np.array(_step(touch is not None)(*known))
+        known = *known, touch.n, touch.s, touch.t, touch.plane, touch.law
+    return _step(touch is not None)(*known)
 
 
 @cache
 def _step(touching: bool) -> Callable[..., tuple[float, ...]]:
     """The step, compiled once; its arguments are those of ``_rosenbrock2``."""
-    touch = {"n": 6, "s": 6, "t": 6, "law": 4} if touching else {}
+    touch = {"n": 6, "s": 6, "t": 6, "plane": 21, "law": 4} if touching else {}
     functions = {"tanh": math.tanh, "sqrt": math.sqrt}
     arguments = {"y": 18, "time": 2, "mass": 21, "bias": 6, "gains": 2, **dict.fromkeys(_LOOPS, 6), **touch}
     return compiled("held_step", _rosenbrock2, functions, **arguments)
@@ -50,79 +61,125 @@ def _step(touching: bool) -> Callable[..., tuple[float, ...]]:
 
 def _rosenbrock2(*, y: Row, time: Row, mass: Row, bias: Row, gains: Row, **known: Row) -> list[Value]:
     """One step; time: of its start, and its length; gains: position loop and unwinding; known: loops and touch."""
-    t, step = time
-    touch = Touch(known["n"], known["s"], known["t"], known["law"]) if "law" in known else None
-    motors = [Motor(*(known[name][i] for name in _LOOPS)) for i in range(6)]
-    stage = _Stage(motors, touch, mass, bias, gains)
-    solve, pull, wind = stage.linearised(t, y, GAMMA * step)
-    net, wound = stage.rates(t, y)
-    k1 = solve([*y[6:12], *_plus(net, pull), *_plus(wound, wind)])
-    net, wound = stage.rates(t + step, [x + step * k for x, k in zip(y, k1, strict=True)])
-    later = [x + step * k for x, k in zip(y[6:12], k1[6:12], strict=True)]
-    carried = [*k1[:6], *symmetric_times(mass, k1[6:12]), *k1[12:]]
-    rates = [*later, *_plus(net, pull, -1.0), *_plus(wound, wind, -1.0)]
-    k2 = solve(_plus(rates, carried, -2.0))
-    long, short = 1.5 * step, 0.5 * step
-    return [x + long * a + short * b for x, a, b in zip(y, k1, k2, strict=True)]
+    t, h = time
+    g = GAMMA * h
+    drives = [
+        _Drive(Motor(*(known[name][i] for name in _LOOPS)), gains, t, g, (y[i], y[i + 6], y[i + 12])) for i in range(6)
+    ]
+    names = ("n", "s", "t", "plane", "law")
+    touch = _Touching(Touch(*(known[name] for name in names)), y, h, g) if "law" in known else None
+    inner: list[list[Value]] = [[0.0] * 6 for _ in range(6)]
+    for (i, j), entry in zip(LOWER, plus(mass, touch.stiffness) if touch else mass, strict=True):
+        inner[i][j] = entry + drives[i].resistance if i == j else entry
+    system = System(inner)
+    first = [d.torque - b for d, b in zip(drives, bias, strict=True)]
+    first = touch.pushed(first) if touch else first
+    w1 = system.solve(first)
+    for d, w in zip(drives, w1, strict=True):
+        d.go(w, h)
+    second = [d.later_torque - b - 2.0 * x for d, b, x in zip(drives, bias, first, strict=True)]
+    second = touch.pushed_later(second, w1) if touch else second
+    stepped = [d.end(w, h) for d, w in zip(drives, system.solve(second), strict=True)]
+    return [value for part in zip(*stepped, strict=True) for value in part]
 
 
-class _Stage:
-    """The equations in symbols; rows of the rates multiplied by the mass matrix."""
+class _Drive:
+    """One motor through a step: what it adds to the system, and its three rates in both stages.
 
-    def __init__(self, motors: list[Motor], touch: Touch | None, mass: Row, bias: Row, gains: Row) -> None:
-        self.motors, self.touch, self.mass, self.bias = motors, touch, mass, bias
-        self.kp, self.unwind = gains
+    With f' the rates at the end of the first stage and r = f' - 2 k1 - g f_t, each system (I - g J) k = r is
+    eliminated down to the acceleration. At its limit the torque depends on nothing, and the integrator runs to it with
+    the rate of unwinding (``loops``: ``integral = unwind gain``).
+    """
 
-    def rates(self, t: Value, y: Row) -> tuple[list[Value], list[Value]]:
-        """Net torques, and rates of the integrators."""
-        push = self.touch.press(y[:6], y[6:12]).push if self.touch else (0.0,) * 6
-        net, wound = [], []
-        for motor, b, pushed, *state in zip(self.motors, self.bias, push, y[:6], y[6:12], y[12:], strict=True):
-            error, asked, given = motor.drive(self.kp, t, state)
-            net.append(given - b - motor.drag(state[1])[0] + pushed)
-            wound.append(motor.integral * error - self.unwind * (asked - given))
-        return net, wound
+    def __init__(self, motor: Motor, gains: Row, t: Value, g: Value, state: Row) -> None:
+        self.motor, (self.kp, self.unwind), self.g = motor, gains, g
+        self.x, self.v, self.s = state
+        self.error = self.kp * (motor.start + motor.slope * t - self.x) + motor.ahead - self.v
+        self.asked = motor.gain * self.error + (self.s + motor.fed)
+        self.given = motor.limited(self.asked)
+        self.reach = g * self.kp
+        self.stiff = motor.gain + g * motor.integral
+        self.behind = motor.slope - self.v
+        pull = self.stiff * (self.error + self.reach * self.behind) + (self.s + motor.fed)
+        drag, steep = motor.drag(self.v)
+        self.torque = self._free(pull, self.given) - drag
+        self.resistance = self._free((g + g * self.reach) * self.stiff, 0.0) + g * steep
 
-    def linearised(self, t: Value, y: Row, g: Value) -> tuple[Callable[[Row], list[Value]], Row, Row]:
-        """Solver of (I - g J) x = r, and g times the slopes by time of net torques and integrators.
+    def _free(self, yes: Value, no: Value) -> Value:
+        """Whether the torque was within its limit at the start of the step."""
+        return where("==", self.asked, self.given, yes, no)
 
-        By elimination as in ``ArmEquations.linearised``, whose names these are.
+    def _wound(self, w: Value) -> Value:
+        """What an acceleration takes from the integrator."""
+        return (self.g + self.g * self.reach) * w
+
+    def go(self, w: Value, h: Value) -> None:
+        """The first stage's rates; then all that the second stage asks.
+
+        Args:
+            w: acceleration of the first stage.
+            h: length of the step.
         """
-        kp, touch = self.kp, self.touch
-        inner: list[list[Value]] = [[0.0] * 6 for _ in range(6)]
-        for (i, j), m in zip(LOWER, self.mass, strict=True):
-            inner[i][j] = m
-        spring: Value = 0.0
-        if touch:
-            pressing = touch.press(y[:6], y[6:12])
-            touch.stiffen(inner, pressing, g)
-            spring = g * pressing.spring
-        leak, fed, back, first_back, by_theta, pull, wind = ([0.0] * 6 for _ in range(7))
-        for i, (motor, *state) in enumerate(zip(self.motors, y[:6], y[6:12], y[12:], strict=True)):
-            _, asked, given = motor.drive(kp, t, state)
-            gain, free = where("==", asked, given, motor.gain, 0.0), where("==", asked, given, 1.0, 0.0)
-            held = where("==", asked, given, 0.0, self.unwind)
-            by_error = motor.integral - held * motor.gain
-            leak[i] = 1.0 / (1.0 + g * held)
-            fed[i] = g * free * leak[i]
-            back[i], first_back[i] = g * (1.0 + g * kp) * by_error, g * kp * by_error
-            by_theta[i] = -(g * kp * gain)
-            pull[i], wind[i] = g * kp * motor.slope * gain, g * kp * motor.slope * by_error
-            inner[i][i] += fed[i] * back[i] + g * (gain + motor.drag(state[1])[1]) - g * by_theta[i]
-        system = System(inner)
+        motor, g = self.motor, self.g
+        unwound = self.unwind * (self.given - (self.s + motor.fed)) / (1.0 + g * self.unwind)
+        self.w = w
+        self.a = self.v + g * w
+        self.b = self._free(motor.integral * (self.error + self.reach * self.behind - self._wound(w)), unwound)
+        moved = h * (self.kp * (motor.slope - self.a) - w)
+        error, asked = self.error + moved, self.asked + motor.gain * moved + h * self.b
+        given = motor.limited(asked)
+        self.r1 = (h - 2.0 * g) * w - self.v
+        slope = self.reach * motor.slope
+        self.r3 = motor.integral * error - self.unwind * (asked - given) - 2.0 * self.b
+        self.r3 = self.r3 - self._free(slope * motor.integral, 0.0)
+        pull = g * self.r3 - slope * motor.gain - self.reach * self.stiff * self.r1
+        self.later_torque = given - motor.drag(self.v + h * w)[0] + self._free(pull, 0.0) + 2.0 * self.resistance * w
 
-        def solve(r: Row) -> list[Value]:
-            first = r[:6]
-            third = [c - b * a for c, b, a in zip(r[12:], first_back, first, strict=True)]
-            torque = [x + b * a + f * c for x, b, a, f, c in zip(r[6:12], by_theta, first, fed, third, strict=True)]
-            if touch:
-                torque = _plus(torque, touch.n, -(spring * dot(touch.n, first)))
-            rates = system.solve(torque)
-            angles = _plus(first, rates, g)
-            return [*angles, *rates, *(f * (c - b * v) for f, c, b, v in zip(leak, third, back, rates, strict=True))]
+    def end(self, w: Value, h: Value) -> tuple[Value, Value, Value]:
+        """State after the step.
 
-        return solve, pull, wind
+        Args:
+            w: acceleration of the second stage.
+            h: length of the step.
+        """
+        long, short = 1.5 * h, 0.5 * h
+        wound = self.r3 - self.motor.integral * (self.reach * self.r1 + self._wound(w))
+        b = self._free(wound, self.r3 / (1.0 + self.g * self.unwind))
+        return (
+            self.x + long * self.a + short * (self.r1 + self.g * w),
+            self.v + long * self.w + short * w,
+            self.s + long * self.b + short * b,
+        )
 
 
-def _plus(a: Row, b: Row, share: Value = 1.0) -> list[Value]:
-    return [x + share * y for x, y in zip(a, b, strict=True)]
+class _Touching:
+    """A touch through a step: what it adds to the system, and its push in both stages."""
+
+    def __init__(self, touch: Touch, y: Row, h: Value, g: Value) -> None:
+        self.touch, self.h, self.g = touch, h, g
+        self.now = touch.meeting(y[:6], y[6:12])
+        self.forces = forces = touch.forces(self.now)
+        spring = touch.spring(self.now, forces)
+        self.spring, self.normal = g * spring, g * touch.damper(forces) + g * g * spring
+        self.rubbing, self.slip = g * forces.drag, touch.slip(self.now)
+        self.stiffness = touch.stiffness(self.normal, self.rubbing, self.slip, forces.square)
+
+    def pushed(self, torque: Row) -> list[Value]:
+        """The first stage's right-hand side with the push."""
+        normal = self.forces.force - self.spring * self.now.away
+        return plus(plus(torque, self.touch.n, normal), self.slip, -self.forces.drag)
+
+    def pushed_later(self, torque: Row, w: Row) -> list[Value]:
+        """The second stage's, with the push there and twice what the matrix does to the first stage's w."""
+        touch, now, h, g = self.touch, self.now, self.h, self.g
+        away, along, across = dot(touch.n, w), dot(touch.s, w), dot(touch.t, w)
+        later = Meeting(
+            now.depth - h * (now.away + g * away), now.away + h * away, now.along + h * along, now.across + h * across
+        )
+        there: Forces = touch.forces(later)
+        r1 = (h - 2.0 * g) * away - now.away
+        mean = (now.along * along + now.across * across) / self.forces.square
+        twice = 2.0 * self.rubbing
+        torque = plus(torque, touch.n, there.force + 2.0 * self.normal * away - self.spring * r1)
+        torque = plus(torque, touch.s, twice * (along - mean * now.along) - there.drag * later.along)
+        return plus(torque, touch.t, twice * (across - mean * now.across) - there.drag * later.across)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache
 from math import pi, sqrt
 
@@ -11,9 +11,10 @@ import numpy as np
 from canprobe.emulator.plant.pushing import Contact, OneTouch, Rubbing
 from canprobe.emulator.plant.pushing_many import ManyTouches
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, NEAR_M, force_laws
+from canprobe.robot.dynamics import LOWER
 from canprobe.robot.kinematics import Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.puma260 import Array, PumaModel
-from canprobe.robot.straight_line import Value, compiled
+from canprobe.robot.straight_line import Value, compiled, matrix_product
 from canprobe.touch.objects import ObjectShape, Touches
 
 
@@ -49,42 +50,43 @@ class Neighbourhood:
         self._tool: Vec = tuple(T_flange_probe[:3, 3].tolist())
         self._base: Vec = tuple(base_offset.tolist())
         self._back: tuple[float, ...] = tuple(joints_per_motor.ravel().tolist())
-        self._shares = [[(j, g) for j, g in enumerate(row) if g] for row in joints_per_motor.tolist()]
+        self._joints = matrix_product(joints_per_motor.tolist())
         self._rows = _rows_for(tuple(float(g != 0.0) for g in self._back))
 
-    def __call__(self, theta: list[float]) -> Contact | None:
+    def __call__(self, theta: Sequence[float]) -> Contact | None:
         """Contact held at a posture of the motors; None where the object is farther than a cycle's way.
 
         Args:
             theta: (6,) motor coordinates, rad.
         """
-        c = chain(self.model, [sum(g * theta[j] for j, g in row) for row in self._shares])
+        c = chain(self.model, self._joints(theta))
         x, y, z = self._base
         at = point_on_flange(c, self._tool)  # of the arm's own base
         centre = at[0] + x, at[1] + y, at[2] + z
-        foot = self.shape.closest(centre)
+        foot = self.shape.nearest(centre)
         depth = self.radius - foot.distance
         if depth < -NEAR_M:
             return None
         touches = self.shape.touches(centre, self.radius + NEAR_M)
         if touches is not None:
             return self._many(theta, touches)
-        least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa.tolist()
+        least, (k1, k2) = LEAST_CURVATURE / self.radius, foot.kappa
         A, B = 0.5 * max(least, 1.0 / self.radius + k1), 0.5 * max(least, 1.0 / self.radius + k2)
         # The probe's point that touches lies by an arm -n r off its centre.
-        normal, tangents, arm = foot.normal.tolist(), foot.directions.ravel().tolist(), max(depth, 0.0) - self.radius
+        normal, (d1, d2), arm = foot.normal, foot.directions, max(depth, 0.0) - self.radius
         touched = at[0] + arm * normal[0], at[1] + arm * normal[1], at[2] + arm * normal[2]
         x6, y6, z6 = point_jacobian(c, touched)
-        rows = self._rows(x6, y6, z6, normal, tangents, self._back)
+        rows = self._rows(x6, y6, z6, normal, (*d1, *d2), self._back)
         return OneTouch(
             theta,
             depth,
-            (rows[:6], rows[6:12], rows[12:]),
-            pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)),
-            self.rubbing,
+            (rows[:6], rows[6:12], rows[12:18]),
+            rows[18:],
+            coefficient=pi * self.stiffness_n_m3 / (2.0 * sqrt(A * B)),
+            rubbing=self.rubbing,
         )
 
-    def _many(self, theta: list[float], touches: Touches) -> Contact:
+    def _many(self, theta: Sequence[float], touches: Touches) -> Contact:
         """Several places at once."""
         back = self._joints_per_motor
         J = forward_jacobian(self.model, back @ theta, self._T_flange_probe)[1] @ back
@@ -101,7 +103,8 @@ class Neighbourhood:
 
 @cache
 def _rows_for(back: tuple[float, ...]) -> Callable[..., tuple[float, ...]]:
-    """(18,) velocities along three directions per motor rate, of (6,) velocities along x, y and z per joint rate."""
+    """(18,) velocities along three directions n, s and t per motor rate, then the (21,) entries of s s' + t t'; of (6,)
+    velocities along x, y and z per joint rate."""
     return compiled("touch_rows", _touch_rows, {}, x=6, y=6, z=6, normal=3, tangents=6, back=back)
 
 
@@ -112,4 +115,4 @@ def _touch_rows(
     for a, b, c in (normal, tangents[:3], tangents[3:]):
         joints = [a * u + b * v + c * w for u, v, w in zip(x, y, z, strict=True)]
         rows += [sum((joints[i] * back[6 * i + j] for i in range(6)), 0.0) for j in range(6)]
-    return rows
+    return [*rows, *(rows[6 + i] * rows[6 + j] + rows[12 + i] * rows[12 + j] for i, j in LOWER)]

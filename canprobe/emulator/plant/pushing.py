@@ -69,6 +69,7 @@ class OneTouch:
         depth: indentation there, m; negative for a gap.
         rows: velocity of the touched point of the probe per motor rate, (6,) each: along the object's outward normal
             and along two tangents, m.
+        plane: (21,) entries ``LOWER`` of s s' + t t', m^2.
         coefficient: force is ``coefficient depth^2``, N/m^2.
         rubbing: damping and friction.
 
@@ -77,8 +78,17 @@ class OneTouch:
         law: offset of the depth, coefficient, factor of damping, friction.
     """
 
-    def __init__(self, theta: Six, depth: float, rows: tuple[Six, Six, Six], coefficient: float, rubbing: Rubbing):
-        self.n, self.s, self.t = rows
+    def __init__(
+        self,
+        theta: Six,
+        depth: float,
+        rows: tuple[Six, Six, Six],
+        plane: Sequence[float],
+        *,
+        coefficient: float,
+        rubbing: Rubbing,
+    ) -> None:
+        (self.n, self.s, self.t), self.plane = rows, plane
         self.law = depth + _dot(self.n, theta), coefficient, 1.5 * rubbing.damping_s_m, rubbing.friction
 
     @property

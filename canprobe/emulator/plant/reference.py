@@ -28,6 +28,10 @@ class Reference:
             ramp: not before the ramps that act already.
             now_ns: the present time.
         """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:
+            self._ramps = [last, ramp]
+            return
         start = max(ramp[0], now_ns)
         kept: Sequence[Ramp] = [r for r in self._ramps if r[0] < start or r[0] < 0]
         past = [r for r in kept if r[0] <= now_ns]
@@ -39,7 +43,9 @@ class Reference:
         Args:
             t_ns: not before the last ramp that began.
         """
-        t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
         if t_ns >= t1:
             return end, 0.0
         slope = (end - start) / (t1 - t0)
@@ -51,4 +57,10 @@ class Reference:
         Args:
             t_ns: ns.
         """
-        return min((t for r in self._ramps for t in r[:2] if t > t_ns), default=NEVER)
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend

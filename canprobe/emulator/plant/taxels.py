@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.emulator.plant.field import SIDE, PressureField
+from canprobe.emulator.plant.field import SIDE, Directions, PressureField
 
 Array = npt.NDArray[np.float64]
 Image = npt.NDArray[np.uint8] | npt.NDArray[np.float64]
@@ -24,6 +24,9 @@ _CREEP_TIMES_S = (0.3, 3.0, 30.0, 300.0)
 _SATURATION_KNEE = 1.25
 _FULL_SCALE = 255
 """Counts of full scale, whatever the ADC resolves."""
+_NOISE_IMAGES = 8
+"""How many images' noise is drawn at once."""
+_ONE = np.array(1.0)  # a number that is an array already costs a ufunc less
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,12 +116,18 @@ class TaxelArray:
         self.field = PressureField(radius_m, blur_pitch=config.blur_pitch, samples=config.samples)
         self.gains = 1.0 + config.gain_error * rng.uniform(-1.0, 1.0, (SIDE, SIDE))
         self._scale = self.gains * (stiffness_n_m3 / config.full_scale_pa)
+        half = 0.5 * config.hysteresis
+        self._edges = np.array([[[1.0 + half]], [[1.0 - half]]])
         self._loop = np.zeros((SIDE, SIDE))
-        self._creep = np.zeros((len(_CREEP_TIMES_S), SIDE * SIDE))
-        self._decay: dict[int, Array] = {}
+        # Rows: the relaxations, and the image that drives them; and where the next ones are put.
+        self._creep, self._next = np.zeros((2, len(_CREEP_TIMES_S) + 1, SIDE * SIDE))
+        self._relaxed: dict[int, Array] = {}
         self._t_s: float | None = None
         others = (np.ones((SIDE, SIDE)) - np.eye(SIDE)) / (SIDE - 1)
-        self._mix = (1.0 - config.crosstalk) * np.eye(SIDE) + config.crosstalk * others
+        self._columns = (1.0 - config.crosstalk) * np.eye(SIDE) + config.crosstalk * others
+        self._rows = self._columns * float(config.adc_max)
+        self._noise: list[Array] = []
+        self._readings = _readings(config)
         self._has_dead = bool(config.dead)
         self._dead = tuple(np.array(config.dead, dtype=np.intp).reshape(-1, 2).T)
 
@@ -127,7 +136,7 @@ class TaxelArray:
         uv: tuple[float, float],
         depth: float,
         kappa: tuple[float, float],
-        directions_pad: Array,
+        directions_pad: Directions,
         t_s: float,
         *,
         pressure_factor: float = 1.0,
@@ -138,7 +147,7 @@ class TaxelArray:
             uv: contact point on the pad, m.
             depth: indentation, m; <= 0 is no contact.
             kappa: principal curvatures of the object, 1/m, larger first.
-            directions_pad: (2, 2) rows: principal directions in the basis ``pad_basis`` of the contact direction.
+            directions_pad: of the contact on the pad.
             t_s: time of the sample, s, not before the previous one.
             pressure_factor: of the layer's damping.
 
@@ -165,65 +174,78 @@ class TaxelArray:
             y *= pressure_factor
         y = self._remember(_saturate(y) if self.config.saturation else y, t_s)
         if self.config.crosstalk > 0.0:
-            y = self._mix.dot(y).dot(self._mix)
-        return self._convert(y)
+            return self._convert(self._rows.dot(y).dot(self._columns))
+        return self._convert(y * float(self.config.adc_max))
 
     def _remember(self, y: Array, t_s: float) -> Array:
         """Hysteresis, then creep."""
-        half = 0.5 * self.config.hysteresis
-        if half > 0.0:
+        if self.config.hysteresis > 0.0:
             # Play with proportional edges (generalised Prandtl-Ishlinskii): the output rests until the input has
             # crossed the loop; loading reads x (1 - h/2), unloading x (1 + h/2), whatever the rate.
-            loop = np.minimum(self._loop, (1.0 + half) * y)
-            y = np.maximum(loop, (1.0 - half) * y)
-            self._loop = y
+            high, low = self._edges * y
+            y = self._loop = np.maximum(np.minimum(self._loop, high, out=high), low, out=low)
         dt = 0.0 if self._t_s is None else t_s - self._t_s
         self._t_s = t_s
         if self.config.creep_per_decade > 0.0:
-            # Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
-            creep, flat = self._creep, y.reshape(-1)
-            creep -= flat
-            creep *= self._decay_of(dt)
-            creep += flat
-            crept: Array = np.add.reduce(creep).reshape(SIDE, SIDE)
-            crept *= self.config.creep_per_decade
-            crept += y
+            self._creep[-1] = y.reshape(-1)
+            self._creep, self._next = np.dot(self._relaxed_by(dt), self._creep, out=self._next), self._creep
+            crept: Array = self._creep[-1].reshape(SIDE, SIDE)
             return crept
         return y
 
-    def _decay_of(self, dt: float) -> Array:
-        dt_ns = round(1e9 * dt)
-        decay = self._decay.get(dt_ns)
-        if decay is None:
-            if len(self._decay) > 64:
-                self._decay.clear()
-            decay = self._decay[dt_ns] = np.array([[exp(-1e-9 * dt_ns / tau)] for tau in _CREEP_TIMES_S])
-        return decay
+    def _relaxed_by(self, dt: float) -> Array:
+        """(5, 5) what becomes of relaxations and image in a time: the relaxations then, and the crept image.
 
-    def _convert(self, y: Array) -> Image:
+        Sum of relaxations a decade apart: c per decade for a step, linear, superposes under moving loads.
+        """
+        dt_ns = round(1e9 * dt)
+        matrix = self._relaxed.get(dt_ns)
+        if matrix is None:
+            if len(self._relaxed) > 64:
+                self._relaxed.clear()
+            matrix = np.zeros((len(_CREEP_TIMES_S) + 1,) * 2)
+            for i, tau in enumerate(_CREEP_TIMES_S):
+                matrix[i, i] = exp(-1e-9 * dt_ns / tau)
+                matrix[i, -1] = 1.0 - matrix[i, i]
+            matrix[-1] = self.config.creep_per_decade * matrix[:-1].sum(axis=0)
+            matrix[-1, -1] += 1.0
+            self._relaxed[dt_ns] = matrix
+        return matrix
+
+    def _convert(self, counts: Array) -> Image:
         """Noise, ADC, threshold, dead taxels."""
-        top = self.config.adc_max
-        counts = y * top
         if self.config.noise > 0.0:
-            noise = self._rng.standard_normal((SIDE, SIDE))
-            noise *= self.config.noise * top
-            counts += noise
-        counts += 0.5  # the conversion below cuts off
-        np.maximum(counts, 0.0, out=counts)
-        np.minimum(counts, top + 0.5, out=counts)
-        read: npt.NDArray[Any] = counts.astype(np.uint8 if top == _FULL_SCALE else np.uint16)
-        read *= read >= self.config.adc_threshold
+            counts += self._drawn()
+        else:
+            counts += 0.5
+        read = self._readings.take(counts.astype(np.intp), mode="clip")
         if self._has_dead:
             read[self._dead] = 0
-        return read if top == _FULL_SCALE else read * float(_FULL_SCALE) / top
+        return read
+
+    def _drawn(self) -> Array:
+        """(16, 16) noise of one image in counts, and the half count that makes cutting off rounding."""
+        if not self._noise:
+            noise = self._rng.standard_normal((_NOISE_IMAGES, SIDE, SIDE))
+            noise *= self.config.noise * self.config.adc_max
+            noise += 0.5
+            self._noise = [*noise[::-1]]
+        return self._noise.pop()
+
+
+def _readings(config: TaxelConfig) -> npt.NDArray[Any]:
+    """What is read at each count of the ADC, in counts of 255 at full scale; 0 below the threshold."""
+    counts = np.arange(config.adc_max + 1)
+    counts[counts < config.adc_threshold] = 0
+    return counts.astype(np.uint8) if config.adc_max == _FULL_SCALE else counts * float(_FULL_SCALE) / config.adc_max
 
 
 def _saturate(x: Array) -> Array:
     """Power-law knee, exponent 4: 0.2 % low at half of full scale, 8 % at full scale, then flat; in place."""
     fourth = x * (1.0 / _SATURATION_KNEE)
-    fourth *= fourth
-    fourth *= fourth
-    fourth += 1.0
+    np.square(fourth, out=fourth)
+    np.square(fourth, out=fourth)
+    fourth += _ONE
     np.sqrt(fourth, out=fourth)
     x /= np.sqrt(fourth, out=fourth)
     return x

@@ -6,8 +6,8 @@ and only when somebody asks. Contact pushes the dynamic arm back, not the ideal 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from math import cos, pi, sin
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,20 +15,21 @@ import numpy as np
 from canprobe.emulator.plant.arm import IdealArm
 from canprobe.emulator.plant.arms import make_arm
 from canprobe.emulator.plant.config import PlantConfig
-from canprobe.emulator.plant.contact import NO_CONTACT, Contact, depth_for_force, elastic_contact
-from canprobe.emulator.plant.field import SIDE, Vec, pad_basis, pad_coordinates
+from canprobe.emulator.plant.contact import NO_CONTACT, Contact, elastic_contact
+from canprobe.emulator.plant.field import SIDE, Vec, pad_coordinates
 from canprobe.emulator.plant.motor import MotorDynamics
+from canprobe.emulator.plant.probe import PressedProbe, Probe, in_pad, turned
 from canprobe.emulator.plant.resting import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import Image, TaxelArray
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import chain, point_on_flange, point_velocity
-from canprobe.robot.puma260 import Array, counts_to_joints
-from canprobe.touch.objects import ClosestPoint, Touches
+from canprobe.robot.puma260 import Array
+from canprobe.robot.straight_line import matrix_product
+from canprobe.touch.objects import Nearest, Touches
 
 if TYPE_CHECKING:
     from canprobe.emulator.plant.dynamic_arm import DynamicArm
 
-Axes = tuple[Vec, Vec, Vec]
 Truth = dict[str, float | bool | Array]
 
 
@@ -45,38 +46,6 @@ class PlantState(NamedTuple):
     rates: tuple[float, ...]
 
 
-@dataclass(slots=True, eq=False)
-class _Probe:
-    """Probe sphere now: centre, axes (columns x, y, z = pole) and velocity of the centre, base frame."""
-
-    centre: Vec
-    axes: Axes
-    velocity: Vec
-
-
-class _PressedProbe:
-    """Probe without an arm, pole against the object's normal at its origin."""
-
-    def __init__(self, config: PlantConfig) -> None:
-        assert config.object is not None
-        pose = config.object.T_base_object
-        x, n = pose[:3, 0], pose[:3, 2]
-        self._origin, self._normal = pose[:3, 3], n
-        self._axes = (tuple(x.tolist()), tuple(np.cross(-n, x).tolist()), tuple((-n).tolist()))
-        c = config.object.closest(self._origin)
-        self._mean = depth_for_force(
-            config.press.force_n, (float(c.kappa[0]), float(c.kappa[1])), config.radius_m, config.stiffness_n_m3
-        )
-        self._radius, self._press = config.radius_m, config.press
-
-    def at(self, t_s: float) -> _Probe:
-        rate = 2 * pi * self._press.frequency_hz
-        depth = self._mean * (1.0 + self._press.swing * sin(rate * t_s))
-        speed = -self._mean * self._press.swing * rate * cos(rate * t_s)
-        centre, velocity = self._origin + (self._radius - depth) * self._normal, speed * self._normal
-        return _Probe(tuple(centre.tolist()), self._axes, tuple(velocity.tolist()))
-
-
 class Plant:
     """Arm, probe, object and array.
 
@@ -90,12 +59,12 @@ class Plant:
         self.config = config
         self.t_ns = 0
         self.arm: IdealArm | DynamicArm | None = None
-        self._pressed: _PressedProbe | None = None
+        self._pressed: PressedProbe | None = None
         if config.model is not None:
             self.arm = make_arm(config)
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
-            self._pressed = _PressedProbe(config)
+            self._pressed = PressedProbe(config)
         self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
         self.array: TaxelArray | None = None
         if config.taxels is not None:
@@ -106,6 +75,7 @@ class Plant:
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
+        self._joints = _at_rest if config.model is None else matrix_product(config.model.joints_per_count.tolist())
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
 
@@ -198,7 +168,7 @@ class Plant:
         s = self._solution() if state is None else self._solve(state)
         if self.array is None or s.depth <= 0.0:
             return np.zeros((SIDE, SIDE))
-        field, directions = self.array.field, _in_pad(s.foot, s.probe, s.direction)
+        field, directions = self.array.field, in_pad(s.foot, s.probe, s.direction)
         means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
         return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
 
@@ -210,7 +180,7 @@ class Plant:
             s.pad_uv,
             s.depth,
             s.kappa,
-            _in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else np.eye(2),
+            in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else ((1.0, 0.0), (0.0, 1.0)),
             1e-9 * self.t_ns,
             pressure_factor=s.contact.damping_factor,
         )
@@ -237,17 +207,17 @@ class Plant:
         """
         s = self._solution() if state is None else self._solve(state)
         return {
-            "q": s.q,
+            "q": np.array(s.q),
             "probe_centre": np.array(s.probe.centre),
             "pole": np.array(s.probe.axes[2]),
             "force": s.contact.force,
             "depth": s.depth,
             "depth_rate": s.depth_rate,
-            "contact_point": s.foot.point,
-            "contact_normal": s.foot.normal,
-            "kappa": s.foot.kappa,
-            "direction1": s.foot.directions[0],
-            "direction2": s.foot.directions[1],
+            "contact_point": np.array(s.foot.point),
+            "contact_normal": np.array(s.foot.normal),
+            "kappa": np.array(s.foot.kappa),
+            "direction1": np.array(s.foot.directions[0]),
+            "direction2": np.array(s.foot.directions[1]),
             "pad_uv": np.array(s.pad_uv),
             "in_contact": s.depth > 0.0,
         }
@@ -257,29 +227,28 @@ class Plant:
             self._solved = self._solve(self.state())
         return self._solved
 
-    def _probe(self, t_ns: int, q: Array, qd: Array) -> _Probe:
+    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
         if self._pressed is not None:
             return self._pressed.at(1e-9 * t_ns)
         if self.arm is None:
-            return _Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+            return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = chain(self.arm.model, q)
         centre = point_on_flange(c, self._tool_origin)
-        axes = (c.x, c.y, c.z) if self._tool_axes is None else _turned((c.x, c.y, c.z), self._tool_axes)
+        axes = (c.x, c.y, c.z) if self._tool_axes is None else turned((c.x, c.y, c.z), self._tool_axes)
         b0, b1, b2 = self._base
-        return _Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
+        return Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
 
     def _solve(self, state: PlantState) -> _Solution:
-        config, q, qd = self.config, np.zeros(6), np.zeros(6)
-        if config.model is not None:
-            q, qd = counts_to_joints(config.model, state.counts), counts_to_joints(config.model, state.rates)
+        config = self.config
+        q, qd = self._joints(state.counts), self._joints(state.rates)
         probe = self._probe(state.t_ns, q, qd)
         if config.object is None:
             return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
-        foot = config.object.closest(probe.centre)
-        nx, ny, nz = foot.normal.tolist()
+        foot = config.object.nearest(probe.centre)
+        nx, ny, nz = foot.normal
         vx, vy, vz = probe.velocity
         depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
-        k1, k2 = foot.kappa.tolist()
+        k1, k2 = foot.kappa
         touches = config.object.touches(probe.centre, config.radius_m)
         contact = elastic_contact(
             depth,
@@ -297,7 +266,7 @@ class Plant:
         uv = pad_coordinates(d, config.radius_m)
         return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
 
-    def _resting(self, touches: Touches, probe: _Probe) -> Contact:
+    def _resting(self, touches: Touches, probe: Probe) -> Contact:
         """Several places at once, as one contact with the resultant force; it has no patch of its own."""
         config = self.config
         rates = -(touches.normals @ np.array(probe.velocity))
@@ -305,25 +274,18 @@ class Plant:
         return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
 
 
-def _turned(axes: Axes, R: Array) -> Axes:
-    """Columns of ``[axes] R``."""
-    x, y, z = (R.T @ np.array(axes)).tolist()
-    return tuple(x), tuple(y), tuple(z)
-
-
-def _in_pad(foot: ClosestPoint, probe: _Probe, d: Vec) -> Array:
-    """(2, 2) principal directions in the transported pad basis at the contact direction."""
-    rows: Array = foot.directions.dot(np.array(probe.axes).T).dot(np.array(pad_basis(d)).T)
-    return rows
+def _at_rest(motors: Sequence[float]) -> tuple[float, ...]:
+    """Joints without an arm."""
+    return (0.0,) * 6
 
 
 @dataclass(slots=True, eq=False)
 class _Solution:
     """Contact at one instant."""
 
-    q: Array
-    probe: _Probe
-    foot: ClosestPoint
+    q: tuple[float, ...]
+    probe: Probe
+    foot: Nearest
     depth: float
     depth_rate: float
     contact: Contact
@@ -334,7 +296,8 @@ class _Solution:
 
 
 _POLE = (0.0, 0.0, 1.0)
-_NOWHERE = ClosestPoint(np.zeros(3), np.zeros(3), 0.0, np.zeros(2), np.zeros((2, 3)))
+_ORIGIN = (0.0, 0.0, 0.0)
+_NOWHERE = Nearest(_ORIGIN, _ORIGIN, 0.0, (0.0, 0.0), (_ORIGIN, _ORIGIN))
 
 
 def _refuse_tight_hollow(config: PlantConfig) -> None:

@@ -34,6 +34,10 @@ def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=DynamicSettings(**dynamics))
 
 
+def state(arm):
+    return np.array(arm._y)
+
+
 def ramps(arm, cycles=60, counts=0.5, extra=lambda t: None):
     """Every motor on a ramp of its own for a while, then at rest: positions in the middle of each cycle."""
     start, seen = arm.motors()[0], []
@@ -88,8 +92,8 @@ def test_the_push_of_the_object_is_the_force_through_the_jacobian():
     arm, truth = make_arm(c), Plant(c).truth()
     free = make_arm(replace(c, object=None))
     for a in (arm, free):
-        a.equations.hold(a._y)
-    pushed = arm.equations.rate(0.0, arm._y) - free.equations.rate(0.0, free._y)
+        a.equations.hold(state(a))
+    pushed = arm.equations.rate(0.0, state(arm)) - free.equations.rate(0.0, state(free))
     mass, _ = arm.equations.mass()
     J = forward_jacobian(UPENN, c.q0, TOOL)[1][:3]
     expected = np.linalg.inv(motors_per_joint()).T @ J.T @ (truth["force"] * truth["contact_normal"])
@@ -97,10 +101,24 @@ def test_the_push_of_the_object_is_the_force_through_the_jacobian():
     assert truth["force"] > 1.9
 
 
+@pytest.mark.parametrize("rate", [0.3, -0.3, 0.004])
+def test_motors_and_gears_rub_as_published(rate):
+    """Viscous and Coulomb friction of each axis, scaled from the PUMA 560's; tanh turns the sign over 0.01 rad/s."""
+    viscous, coulomb = (0.32, 0.52, 0.22, 0.023, 0.023, 0.012), (2.2, 1.1, 0.57, 0.10, 0.083, 0.064)
+    c = config(shape=None)
+    y = state(make_arm(c)) + np.repeat((0.0, rate, 0.0), 6)
+    rough, smooth = make_equations(c), make_equations(c, Effects(friction=False))
+    for e in (rough, smooth):
+        e.hold(y)
+    drag = rough.mass()[0] @ (rough.rate(0.0, y) - smooth.rate(0.0, y))[6:12]
+    expected = np.array(viscous) * rate + np.array(coulomb) * np.tanh(rate / 0.01)
+    assert drag == pytest.approx(-expected, rel=1e-9)
+
+
 def test_friction_drags_against_the_sliding_and_never_feeds_it():
     c = config()
     arm, smooth = make_arm(c), make_arm(replace(c, dynamics=replace(c.dynamics, friction=0.0)))
-    y = arm._y.copy()
+    y = state(arm)
     y[6:9] = 0.02, -0.03, 0.05
     for a in (arm, smooth):
         a.equations.hold(y)
@@ -116,7 +134,7 @@ def test_friction_drags_against_the_sliding_and_never_feeds_it():
 def test_jacobian_is_the_slope_and_the_shifted_solver_solves():
     c = config()
     arm = make_arm(c)
-    e, y = arm.equations, arm._y.copy()
+    e, y = arm.equations, state(arm)
     y[6:12] = 0.004, -0.006, 0.01, 0.02, -0.03, 0.01
     y[14] += 20.0  # one motor at its torque limit
     e.hold(y)
@@ -139,16 +157,18 @@ def test_the_step_in_straight_line_code_is_the_general_step(effects, torque):
     c, rng = config(velocity_feed_forward=0.5), np.random.default_rng(1)
     e = make_equations(c, effects)
     for _ in range(5):
-        y = make_arm(c)._y + rng.normal(size=18) * np.repeat((1e-5, 0.02, 0.5), 6)
+        y = state(make_arm(c)) + rng.normal(size=18) * np.repeat((1e-5, 0.02, 0.5), 6)
         y[14] += torque
         e.hold(y)
         e.loops.set_reference(0.3, (y[:6] + rng.normal(size=6) * 1e-4).tolist(), rng.normal(size=6).tolist())
         e.loops.set_loop(1, 5.0, 0.1, -0.7)
         new = rosenbrock2(e, 0.31, y, 625e-6)
         change = np.abs(new - y)
-        assert np.abs(held_rosenbrock2(e, 0.31, y, 625e-6) - new).max() < 1e-10 * change.max()
+        assert np.abs(held_rosenbrock2(e, 0.31, y.tolist(), 625e-6) - new).max() < 1e-10 * change.max()
         away = y - np.concatenate((0.01 * e.contact.rows[0], np.zeros(12))) if e.contact is not None else y
-        assert held_rosenbrock2(e, 0.31, away, 625e-6) == pytest.approx(rosenbrock2(e, 0.31, away, 625e-6), abs=1e-10)
+        assert held_rosenbrock2(e, 0.31, away.tolist(), 625e-6) == pytest.approx(
+            rosenbrock2(e, 0.31, away, 625e-6), abs=1e-10
+        )
 
 
 def test_torque_ends_at_its_limit_and_the_motor_arrives_all_the_same():

@@ -15,7 +15,8 @@ from canprobe.emulator.plant.pushing import OneTouch
 from canprobe.emulator.plant.resting import force_laws, total_force
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS
 from canprobe.emulator.plant.world import Plant
-from canprobe.robot.kinematics import tool_z_offset
+from canprobe.robot.actuation import joints_per_motor
+from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.puma260 import UPENN, joints_to_counts
 from canprobe.robot.touching import start_posture
 from canprobe.touch.bowl import LIP_M
@@ -127,7 +128,7 @@ def bounced(config, steps=700, h=4e-4, speed=0.05):
     e = equations_of(config)
     theta = joints_to_counts(UPENN, config.q0) / np.diag(UPENN.counts)
     e.hold(e.resting(theta))
-    away = e.contact.rows[0] if isinstance(e.contact, OneTouch) else e.contact._normal.sum(axis=0)
+    away = e.contact.rows[0] if isinstance(e.contact, OneTouch) else e.contact._normal.mean(axis=0)
     v = -e.mass()[1] @ away
     v *= speed / abs(float(away @ v))
     y = np.concatenate((theta, v, np.zeros(6)))
@@ -149,12 +150,14 @@ def bounced(config, steps=700, h=4e-4, speed=0.05):
     return before, kinetic(y)
 
 
-@pytest.mark.parametrize("kind", ["plane", "cylinder", "torus", "wave"])
+@pytest.mark.parametrize("kind", [*OBJECTS, "tight bowl"])
 def test_a_bounce_creates_no_energy_and_without_damping_loses_none(kind):
-    shape = make_object(kind, T_base_object=POSE, **OBJECTS[kind])
-    before, after = bounced(arm_over(shape, depth=0.0, damping_s_m=0.0))
+    shape, point = TIGHT_BOWL, POINT + np.array((0.0, 0.0, RESTS_AT - R))
+    if kind in OBJECTS:
+        shape, point = make_object(kind, T_base_object=POSE, **OBJECTS[kind]), POINT
+    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=0.0))
     assert after == pytest.approx(before, rel=5e-3)
-    before, after = bounced(arm_over(shape, depth=0.0, damping_s_m=5.0))
+    before, after = bounced(arm_over(shape, depth=0.0, point=point, damping_s_m=5.0))
     assert 0.5 * before < after < 0.97 * before
 
 
@@ -162,6 +165,88 @@ def test_a_bounce_with_rubbing_loses_energy():
     before, after = bounced(arm_over(make_object("cylinder", T_base_object=POSE, radius=0.036), depth=0.0, friction=0.3,
                                      damping_s_m=0.0))  # fmt: skip
     assert after < before
+
+
+def places(shape, centre):
+    """Normals, and elastic forces of all touches of the probe."""
+    found = shape.touches(centre, R)
+    if found is None:
+        foot = shape.closest(centre)
+        kappa = float(foot.kappa[0]), float(foot.kappa[1])
+        return [(foot.normal, elastic_contact(R - foot.distance, kappa, R, K).force, R - foot.distance)]
+    coefficient, exponent = force_laws(found, R, K)
+    depth = np.maximum(R - found.distances, 0.0)
+    return list(zip(found.normals, coefficient * depth**exponent, depth, strict=True))
+
+
+@pytest.mark.parametrize(("kind", "height"), [("cylinder", 0.0), ("saddle", 0.0), ("tight bowl", RESTS_AT - R)])
+def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, height):
+    """Each touch: elastic force, its damping against the speed there, friction against the slip there."""
+    shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
+    config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((2e-4, 1e-4, height)), damping_s_m=5.0)
+    e, back = make_equations(config), joints_per_motor()
+    theta = np.linalg.solve(back, config.q0)
+    rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
+    e.hold(e.resting(theta))
+    centre = (forward(UPENN, config.q0) @ TOOL)[:3, 3]
+    expected = np.zeros(6)
+    for normal, elastic, depth in places(shape, centre):
+        on_flange = np.linalg.solve(forward(UPENN, config.q0), (*(centre - (R - depth) * normal), 1.0))
+        step = 1e-6 * np.eye(6)
+        J = np.array([
+            (forward(UPENN, back @ (theta + d)) @ on_flange - forward(UPENN, back @ (theta - d)) @ on_flange)[:3] / 2e-6
+            for d in step
+        ]).T  # fmt: skip
+        v = J @ rate
+        force = elastic * max(0.0, 1.0 - 1.5 * 5.0 * (normal @ v))
+        slip = v - (normal @ v) * normal
+        expected += J.T @ (force * normal - 0.3 * force * slip / math.sqrt(slip @ slip + 1e-6))
+    push = e.contact.push(theta.tolist(), rate.tolist())
+    assert push == pytest.approx(expected, rel=2e-5, abs=2e-5 * np.abs(expected).max())
+    assert np.abs(expected).max() > 0.1
+
+
+@pytest.mark.parametrize(("kind", "height"), [("cylinder", 0.0), ("tight bowl", RESTS_AT - R)])
+def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
+    shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
+    config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((0.0, 0.0, height)), damping_s_m=5.0)
+    e, back = make_equations(config), joints_per_motor()
+    theta = np.linalg.solve(back, config.q0)
+    e.hold(e.resting(theta))
+    up = np.linalg.solve(forward_jacobian(UPENN, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    assert not e.contact.push(theta.tolist(), up.tolist()).any()
+    assert np.abs(e.contact.push(theta.tolist(), (0.01 * up).tolist())).max() > 0.1
+
+
+def test_slopes_of_several_touches_are_those_of_their_push():
+    top = POINT + np.array((2e-4, 1e-4, RESTS_AT - R))
+    e = make_equations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
+    theta = joints_to_counts(UPENN, arm_over(TIGHT_BOWL, 3e-4, point=top).q0) / np.diag(UPENN.counts)
+    rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
+    e.hold(e.resting(theta))
+
+    def push(*state):
+        return e.contact.push(*(x.tolist() for x in state))
+
+    found = e.contact.slopes(theta.tolist(), rate.tolist())
+    for given, at in (
+        (found.by_theta, lambda d: push(theta + d, rate)),
+        (found.by_rate, lambda d: push(theta, rate + d)),
+    ):
+        slope = np.array([(at(d) - at(-d)) / 2e-6 for d in 1e-6 * np.eye(6)]).T
+        assert -found.rows.T @ given @ found.rows == pytest.approx(slope, abs=1e-4 * np.abs(slope).max())
+
+
+@pytest.mark.parametrize("speed", [-0.05, 0.05])
+def test_a_plant_on_a_lip_presses_harder_while_it_sinks(speed):
+    config = arm_over(TIGHT_BOWL, 3e-4, point=POINT + np.array((0.0, 0.0, RESTS_AT - R)), damping_s_m=2.0)
+    plant = Plant(config)
+    still = plant.state()
+    J = forward_jacobian(UPENN, config.q0, TOOL)[1]
+    rates = joints_to_counts(UPENN, np.linalg.solve(J, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
+    force = plant.truth(still._replace(rates=tuple(rates.tolist())))["force"]
+    upward = TIGHT_BOWL.touches(plant.truth(still)["probe_centre"], R).normals[0, 2]
+    assert force == pytest.approx(plant.truth(still)["force"] * (1.0 - 1.5 * 2.0 * upward * speed), rel=1e-9)
 
 
 def test_the_plant_rests_a_large_probe_on_a_bowl():

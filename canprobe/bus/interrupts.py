@@ -1,0 +1,71 @@
+"""Ctrl-C, SIGTERM and SIGHUP taken between two cycles, where the cell can still act, instead of anywhere in one."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable
+from types import FrameType, TracebackType
+
+TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
+"""What ends a process from outside: a service that is stopped, a terminal that is closed."""
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM or SIGHUP, raised like Ctrl-C where the program stands."""
+
+
+def raise_terminated(_number: int, _frame: FrameType | None) -> None:
+    """The handler of both."""
+    raise Terminated
+
+
+class Interrupts:
+    """Within the block the first interrupt waits until it is taken; a second one is raised where the program stands.
+
+    So is the first where ``stuck`` says that nobody will come to take it. Ignored signals stay ignored (as `nohup` has
+    it), one that would end the process raises `Terminated`, and outside a main thread nothing changes.
+
+    Args:
+        stuck: whether the program is held up somewhere.
+    """
+
+    def __init__(self, stuck: Callable[[], bool] = lambda: False) -> None:
+        self._stuck = stuck
+        self._before: dict[int, Callable[[int, FrameType | None], object]] = {}
+        self._restore: dict[int, object] = {}
+        self._came = False
+        self._waiting: int | None = None
+
+    def __enter__(self) -> Interrupts:
+        for number in (signal.SIGINT, *TERMINATIONS):
+            before = signal.getsignal(number)
+            handler = raise_terminated if before is signal.SIG_DFL and number in TERMINATIONS else before
+            if not callable(handler):
+                continue
+            try:
+                signal.signal(number, self._note)
+            except ValueError:  # not the main thread: signals are not ours to receive
+                break
+            self._before[number], self._restore[number] = handler, before
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        for number, before in self._restore.items():
+            signal.signal(number, before)  # type: ignore[arg-type]  # as getsignal gave it
+        if error is None:
+            self.take()
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        first, self._came, self._waiting = not self._came, True, None
+        if first and not self._stuck():
+            self._waiting = number
+        else:
+            self._before[number](number, frame)
+
+    def take(self) -> None:
+        """Give what waits to who would have had it without us, which raises it as a rule; nothing where none waits."""
+        if self._waiting is not None:
+            number, self._waiting = self._waiting, None
+            self._before[number](number, None)

@@ -1,0 +1,90 @@
+"""What went wrong in a run and was lived with: one line a kind, however often it happened."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from itertools import count, groupby
+
+from canprobe.errors import CanprobeError, NodeError
+
+KINDS_KEPT = 100
+"""Kinds that are told apart; a node that says something else each time must not fill the memory."""
+OTHERS = "more of other kinds"
+
+
+@dataclass(slots=True)
+class _Kind:
+    """One thing that happens again and again."""
+
+    what: str
+    nodes: set[int] = field(default_factory=set)
+    times: int = 0
+    first_s: float | None = None
+    last_s: float | None = None
+
+    def __str__(self) -> str:
+        who = f"{nodes_text(self.nodes)}: " if self.nodes else ""
+        return f"{who}{self.what}" + self._how_often() + self._when()
+
+    def _how_often(self) -> str:
+        return f", {self.times} times" if self.times > 1 else ""
+
+    def _when(self) -> str:
+        if self.first_s is None or self.last_s is None:
+            return ""
+        if self.times == 1:
+            return f", {_time_text(self.first_s)}"
+        return f", first {_time_text(self.first_s)}, last {_time_text(self.last_s)}"
+
+
+class Notes:
+    """Counts what it is told by kind, in the order of the first of each. What is counted here in short stands frame by
+    frame in ``bus.log``."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[str, _Kind] = {}
+
+    def __len__(self) -> int:
+        """How many kinds there are."""
+        return len(self._kinds)
+
+    def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:
+        """It happened, once more.
+
+        Args:
+            what: names the kind; nothing in it may change from one time to the next.
+            node_id: the node that it happened to.
+            t_s: seconds since the first SYNC.
+        """
+        if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
+            what = OTHERS
+        kind = self._kinds.setdefault(what, _Kind(what))
+        kind.times += 1
+        if node_id is not None:
+            kind.nodes.add(node_id)
+        if t_s is not None:
+            kind.first_s = t_s if kind.first_s is None else kind.first_s
+            kind.last_s = t_s
+
+    def add_error(self, error: CanprobeError, then: str, t_s: float) -> None:
+        """The cell found an error, and ``then`` did something about it."""
+        reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
+        self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
+
+    def lines(self) -> list[str]:
+        """A line for each kind."""
+        return [str(kind) for kind in self._kinds.values()]
+
+
+def nodes_text(node_ids: Iterable[int]) -> str:
+    """Nodes in words, neighbours joined: ``nodes 1-6, 16``."""
+    ids = sorted(node_ids)
+    steps = count()
+    runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]
+    parts = [part for run in runs for part in ([f"{run[0]}-{run[-1]}"] if len(run) > 2 else map(str, run))]
+    return f"node{'s' * (len(ids) > 1)} {', '.join(parts)}"
+
+
+def _time_text(t_s: float) -> str:
+    return f"at {t_s:.2f} s" if t_s >= 0 else "before the first SYNC"
