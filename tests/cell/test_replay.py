@@ -118,7 +118,7 @@ def test_lost_lines_are_counted_and_cost_little(motion_run, copy_of):
         rng = random.Random(3)
         middle = len(lines) * 4 // 5
         for i, line in enumerate(lines):
-            if can_id_of(line) in DRIVES and rng.random() < 0.005:
+            if can_id_of(line) in DRIVES and rng.random() < 0.01:
                 lost["tpdo"] += 1
             elif can_id_of(line) == "514" and i > middle and not lost["taxels"]:
                 lost["taxels"] += 1
