@@ -39,7 +39,7 @@ def draw_pipeline(rows: Sequence[dict[str, Any]], path: Path) -> None:
     left.set_title("coverage", loc="left", fontsize=10)
     right.set_title("error over stated σ", loc="left", fontsize=10)
     for axes in (left, right):
-        axes.set_xticks(range(len(scenes)), scenes)
+        axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right", rotation_mode="anchor")
         axes.set_xlim(-0.6, len(scenes) - 0.4)
         axes.grid(color=FAINT, linewidth=0.6, axis="y")
         for side in ("top", "right"):
