@@ -35,7 +35,8 @@ def draw_pipeline(rows: Sequence[dict[str, Any]], path: Path) -> None:
             y = [r[f"z_rms_{entry}"] for r in mine]
             right.scatter(x + 0.07 * (i - 1), y, s=18, marker="osD"[i], color=COLOURS[group], zorder=3)
     left.set_ylim(min(0.8, *(r["coverage"] - 0.02 for r in rows)), 1.01)
-    right.set_ylim(0.0, 1.1 * max(1.2, *(r[f"z_rms_{entry}"] for r in rows for entry in ("K11", "K12", "K22"))))
+    right.set_yscale("log")
+    right.yaxis.set_major_formatter("{x:g}")
     left.set_title("coverage", loc="left", fontsize=10)
     right.set_title("error over stated σ", loc="left", fontsize=10)
     for axes in (left, right):
