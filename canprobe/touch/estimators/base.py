@@ -48,13 +48,11 @@ DOUBTS_OF = 160
 
 
 class Estimator(Protocol):
-    """Local shape from a stream of contacts.
+    """Local shape from a stream of contacts."""
 
-    Attributes:
-        dropped: samples that were not used.
-    """
-
-    dropped: Dropped
+    @property
+    def dropped(self) -> Dropped:
+        """Samples that were not used."""
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact; a sample that cannot be used is dropped and counted, never an error."""

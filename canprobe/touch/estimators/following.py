@@ -39,7 +39,7 @@ class FollowingEstimator:
     """
 
     def __init__(self, inner: Estimator, memory_m: float) -> None:
-        self.inner = inner
+        self._inner = inner
         self._memory = memory_m
         self._past: deque[tuple[float, Array]] = deque()
         self._place: Array | None = None
@@ -48,25 +48,21 @@ class FollowingEstimator:
     @property
     def dropped(self) -> Dropped:
         """Samples that were not used."""
-        return self.inner.dropped
-
-    @dropped.setter
-    def dropped(self, dropped: Dropped) -> None:
-        self.inner.dropped = dropped
+        return self._inner.dropped
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
-        self.inner.add(sample)
+        self._inner.add(sample)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
-        self.inner.reset()
+        self._inner.reset()
         self._past.clear()
         self._place = None
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
-        answer = self.inner.estimate()
+        answer = self._inner.estimate()
         if answer is None or answer.rank < 3:
             return answer
         if self._place is not None:

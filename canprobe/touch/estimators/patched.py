@@ -29,10 +29,6 @@ class PatchedEstimator:
         """Samples that were not used, by neither sensor."""
         return self._motion.dropped
 
-    @dropped.setter
-    def dropped(self, dropped: Dropped) -> None:
-        self._motion.dropped = dropped
-
     def add(self, sample: ContactSample) -> None:
         """Take one contact with its moments."""
         before = self._motion.dropped.total
