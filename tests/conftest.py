@@ -31,7 +31,12 @@ import standstill
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import InterfaceError
 
-hypothesis.settings.register_profile("canprobe", deadline=None, print_blob=True)  # no test asserts time
+hypothesis.settings.register_profile(
+    "canprobe",
+    deadline=None,  # no test asserts time
+    print_blob=True,
+    derandomize="CI" in os.environ,  # the search for new examples is for the desk; a change is judged by the same ones
+)
 hypothesis.settings.load_profile("canprobe")
 
 _CHANNEL = "vcan0"

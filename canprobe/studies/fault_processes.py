@@ -209,7 +209,8 @@ class _Run:
                 self.failures.append(f"node {node_id} is {state.name} after the stop")
             if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
                 self.failures.append(f"node {node_id} moves after the stop")
-        return ", ".join(sorted({state.name for state in states.values()}))
+        codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
+        return ", ".join(sorted({_told(state, codes.get(node_id)) for node_id, state in states.items()}))
 
     def _answers(self) -> bool:
         try:
@@ -255,6 +256,10 @@ def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generat
         keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
     except SdoCommunicationError:
         return
+
+
+def _told(state: DriveState, code: int | None) -> str:
+    return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
 
 
 def _signed(value: int) -> int:

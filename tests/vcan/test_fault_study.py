@@ -7,6 +7,7 @@ import json
 import pytest
 
 from canprobe.cli import main
+from canprobe.protocol.emcy import FOLLOWING_ERROR
 from canprobe.studies.fault_processes import ProcessFault
 
 pytestmark = pytest.mark.vcan
@@ -20,6 +21,8 @@ def test_the_quick_campaign_kills_each_process_once(tmp_path, capsys):
     assert {row["failures"] for row in rows.values()} == {""}
     assert rows["master killed"]["status"] == -9
     assert all(row["status"] in (1, 3) for name, row in rows.items() if name != "master killed")
-    # nodes that outlive their master have stopped by themselves; they go with their interface
-    assert rows["master killed"]["drives"] == "SWITCH_ON_DISABLED"
+    # nodes that outlive their master have stopped by themselves; they go with their interface. Where the guest stood
+    # still for longer than 6066h, one of them has found a following error, which takes its power just as well
+    states = set(rows["master killed"]["drives"].split(", "))
+    assert states <= {"SWITCH_ON_DISABLED", f"FAULT {FOLLOWING_ERROR:04X}h"}
     assert rows["nodes killed"]["drives"] == "gone"
