@@ -34,7 +34,9 @@ SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
 NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 
-TOUCHING = Only("kind", ("scan", "press", "calibrate"))
+TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
+"""Tasks that touch an object."""
+TOUCHING = Only("kind", TOUCH_KINDS)
 SCANNING = Only("kind", ("scan",))
 CALIBRATING = Only("kind", ("calibrate",))
 FREE = Only("kind", ("free",))
@@ -202,6 +204,7 @@ class LimitSettings:
     """`[limits]`: where the cell is stopped for safety."""
 
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
+    preload_max_n: Annotated[float, Range(0, 50)] = 0.15  # felt before the run, which the array's tare takes for zero
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
     joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period

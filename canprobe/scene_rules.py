@@ -7,6 +7,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from canprobe.scene import TOUCH_KINDS
+
 SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
     # section: (need, why). need: "must" be given, "default" when left out, "may" be given, "never"
     "scan": {
@@ -79,13 +81,13 @@ def _duplicate_node(arm_ids: tuple[int, ...] | None, sensor_id: int | None) -> s
 
 
 def _object_missing(kind: str, sensor: bool | None, obj: object) -> str | None:
-    if kind not in ("scan", "press", "calibrate") or not sensor or obj is not None:
+    if kind not in TOUCH_KINDS or not sensor or obj is not None:
         return None
     return "missing: an emulated sensor touches nothing without an [object]; describe the true object"
 
 
 def _half_emulated(kind: str, arm: bool | None, sensor: bool | None) -> str | None:
-    if kind not in ("scan", "press", "calibrate") or arm is None or sensor is None or arm is False or sensor is True:
+    if kind not in TOUCH_KINDS or arm is None or sensor is None or arm is False or sensor is True:
         return None
     return "expected true: a real sensor cannot feel what an emulated arm touches; emulate both, or only the sensor"
 
@@ -132,7 +134,7 @@ def _torus_radii(kind: str | None, ring: float | None, tube: float | None) -> st
 
 
 def _force_target(kind: str, force: float | None, limit: float | None) -> str | None:
-    if kind not in ("scan", "press", "calibrate") or force is None or limit is None or force < limit:
+    if kind not in TOUCH_KINDS or force is None or limit is None or force < limit:
         return None
     return f"expected less than limits.force_max_n = {limit:g}, got {force:g}"
 

@@ -32,7 +32,7 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
-FREE_IT = "free it before the next run, which takes for zero what the array feels at its beginning"
+FREE_IT = "free it; a run does not begin while the array feels a force"
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
 TOUCHING_N = 0.15

@@ -39,6 +39,17 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
     return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{words}{_held_up(seen)}")
 
 
+def preloaded(seen: Seen) -> SafetyStop | None:
+    """The array felt something before the run could have touched anything."""
+    if seen.preload <= seen.limits.preload_max:
+        return None
+    return SafetyStop(
+        f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
+        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, the array's"
+        " offsets are larger than that"
+    )
+
+
 def _held_up(seen: Seen) -> str:
     """Why the drives stopped by themselves, where that is known: the master was kept from its cycle for too long."""
     patience_ns = seen.limits.missed_cycles * seen.limits.period_ns

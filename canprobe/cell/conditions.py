@@ -225,6 +225,17 @@ CONDITIONS: tuple[Condition, ...] = (
     ),
     # the touch and the arm
     Condition(
+        "preload",
+        "probe pressed before the run",
+        "more than `limits.preload_max_n` (0.15 N) in an image of the bring-up, whose tare takes it for zero",
+        Reaction.STOP,
+        None,
+        "free the probe; for an array with larger offsets a larger limit",
+        "no drive is enabled",
+        check=checks.preloaded,
+        enabling=True,
+    ),
+    Condition(
         "force",
         "measured force above `limits.force_max_n`",
         "every tactile frame",

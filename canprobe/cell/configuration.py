@@ -32,6 +32,7 @@ from canprobe.planning.wire_bits import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.puma260 import MODELS, Array, PumaModel
+from canprobe.scene import TOUCH_KINDS
 
 INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
@@ -158,7 +159,7 @@ def _sensor_writes(plan: Plan, dictionary: Any) -> list[Write]:
     if sensor.mode == "window" and has_window_size(dictionary):
         writes.append(Write(WINDOW_SIZE, 0, int(sensor.window)))
     # nothing touches the array yet; a listening cell knows no such moment
-    if plan.scene.task.kind in ("scan", "press", "calibrate"):
+    if plan.scene.task.kind in TOUCH_KINDS:
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes
 

@@ -14,7 +14,7 @@ from canprobe.cell.supervision import Limits, Vector
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, Plan
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS, PumaModel
-from canprobe.scene import LimitSettings, ProbeSettings, Scene
+from canprobe.scene import TOUCH_KINDS, LimitSettings, ProbeSettings, Scene
 from canprobe.scene_geometry import T_flange_probe
 
 if TYPE_CHECKING:
@@ -36,6 +36,7 @@ def limits_of(plan: Plan) -> Limits:
         tactile_cycles=round(ratio),
         tactile_timeout=math.ceil(TACTILE_TIMEOUT_PERIODS * ratio),
         force_max=scene.limits.force_max_n,
+        preload_max=scene.limits.preload_max_n if scene.task.kind in TOUCH_KINDS else math.inf,
         regain=scene.task.regain_mm * 1e-3,
         late_share=scene.limits.late_cycles_max_percent / 100,
     )

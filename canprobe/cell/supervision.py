@@ -6,6 +6,7 @@ README prints it (`canprobe.cell.supervision_text`). What a check needs is in `S
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -50,6 +51,7 @@ class Limits:
         hidden_ns: with a saturated array, and no other knowledge of the force, after which it may be above the limit.
         regain: way towards the object on which a scan looks for a lost contact, m; 0: it does not.
         force_max: N.
+        preload_max: force before a run, N, above which it does not begin; infinite where the array is not tared.
         late_share: of the last second's cycles that may be overruns.
         hold_ns: longest hold.
         joint_low, joint_high: range of the joint targets (6,), rad; None without an arm.
@@ -70,6 +72,7 @@ class Limits:
     hidden_ns: int = 20_000_000
     regain: float = 0.0
     force_max: float = 5.0
+    preload_max: float = math.inf
     late_share: float = 0.8
     hold_ns: int = 1_000_000_000
     joint_low: Vector | None = None
@@ -104,6 +107,7 @@ class Seen:
         speeding: what a joint did that no joint can do; None where all is well.
         slowed: targets so far that were too far away for one cycle.
         restarts: of a diverging estimator so far.
+        preload: highest force in the images before the drives are enabled, N.
         log_failure: why frames are no longer written down; None while they are.
     """
 
@@ -122,6 +126,7 @@ class Seen:
     speeding: str | None = None
     slowed: int = 0
     restarts: int = 0
+    preload: float = 0.0
     log_failure: str | None = None
 
 

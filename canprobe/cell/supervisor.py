@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,6 +52,7 @@ class Supervisor:
         self._force = 0.0
         self._sample: TactileSample | None = None
         self._hidden = HiddenForce()
+        self._untouched = math.isfinite(seen.limits.preload_max)
         self._joints = JointGuard(seen.limits)
         period_ns = seen.limits.period_ns
         self._late = deque((t_ns, 0) for t_ns in range(-SECOND_NS, 0, period_ns))  # before its first it was in time
@@ -82,6 +84,9 @@ class Supervisor:
         seen.controller_state, seen.log_failure = controller_state, log_failure
         seen.speeding = self._joints.measure(measurement)
         self._sample = measurement.tactile or self._sample
+        if self._untouched:
+            self._untouched = not measurement.enabled
+            seen.preload = max(seen.preload, self.felt())
         counts = [count(seen) for count in self._counters]
         if counts != self._counted:
             self._note(counts, measurement.cycle)

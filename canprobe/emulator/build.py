@@ -23,7 +23,7 @@ from canprobe.protocol.lss import UNCONFIGURED
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS, Array, PumaModel
 from canprobe.robot.touching import start_posture
-from canprobe.scene import PlantSettings, ProbeSettings, Scene
+from canprobe.scene import TOUCH_KINDS, PlantSettings, ProbeSettings, Scene
 from canprobe.scene_geometry import T_flange_probe, approach_normal, true_object
 
 PARKED_ABOVE_MM = 5.0
@@ -152,7 +152,7 @@ def _first_posture(scene: Scene) -> Array:
     """Joint angles (6,), rad, at power on: above the start point of a touch, else as the scene says."""
     assert scene.arm is not None
     given = np.radians(scene.arm.start_deg)
-    if scene.probe is None or scene.task.kind not in ("scan", "press", "calibrate"):
+    if scene.probe is None or scene.task.kind not in TOUCH_KINDS:
         return given
     return start_posture(
         MODELS[scene.arm.model],

@@ -12,11 +12,9 @@ from __future__ import annotations
 import math
 
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene import ProbeSettings, Scene
+from canprobe.scene import TOUCH_KINDS, ProbeSettings, Scene
 
 PITCH_M = 1.5875e-3
-PRESSING = ("scan", "press", "calibrate")
-"""Kinds of task with a force to hold."""
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
 
@@ -40,7 +38,7 @@ def taxels_needed(force_n: float, probe: ProbeSettings) -> float:
 
 def window_choices(scene: Scene) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason; without a force to hold the largest first."""
-    if scene.probe is None or scene.task.kind not in PRESSING:
+    if scene.probe is None or scene.task.kind not in TOUCH_KINDS:
         return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(WINDOWS))
     force, needed = scene.task.force_n, taxels_needed(scene.task.force_n, scene.probe)
     patch = (

@@ -12,9 +12,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from canprobe.planning.contact_window import FOLLOWING_TAXELS, PITCH_M, PRESSING, patch_radius_m
+from canprobe.planning.contact_window import FOLLOWING_TAXELS, PITCH_M, patch_radius_m
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene import ProbeSettings, Scene
+from canprobe.scene import TOUCH_KINDS, ProbeSettings, Scene
 
 TOLERATED = 0.05
 """Share of the force that a window may miss without a warning; the array itself errs by as much."""
@@ -78,7 +78,7 @@ class CutPatch:
 def cut_patch(scene: Scene) -> CutPatch | None:
     """What the window of a scene misses; None where it feels nearly all of the force, or nothing is pressed."""
     sensor, probe, task = scene.sensor, scene.probe, scene.task
-    if sensor is None or sensor.mode != "window" or probe is None or task.kind not in PRESSING:
+    if sensor is None or sensor.mode != "window" or probe is None or task.kind not in TOUCH_KINDS:
         return None
     side, most = int(sensor.window), scene.limits.force_max_n
     share = measured_share(task.force_n, probe, side)

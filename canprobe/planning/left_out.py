@@ -6,9 +6,9 @@ import importlib.util
 from collections.abc import Callable
 
 from canprobe.planning.bridges import bridge_outputs
-from canprobe.planning.contact_window import PRESSING, patch_across_taxels
+from canprobe.planning.contact_window import patch_across_taxels
 from canprobe.planning.cut_patch import measured_share
-from canprobe.scene import Scene
+from canprobe.scene import TOUCH_KINDS, Scene
 
 _Reason = Callable[[Scene], str | None]
 
@@ -31,7 +31,7 @@ def _by_window(scene: Scene) -> str:
     assert scene.sensor is not None
     side = scene.sensor.window
     name = f"the {side}×{side} window round the contact"
-    if scene.probe is None or scene.task.kind not in PRESSING or isinstance(side, str):
+    if scene.probe is None or scene.task.kind not in TOUCH_KINDS or isinstance(side, str):
         return f"{name} is sent"
     if side >= patch_across_taxels(scene.task.force_n, scene.probe):
         return f"{name} holds the patch"
