@@ -14,8 +14,8 @@ from numpy.typing import ArrayLike
 
 SIGMA_ROOT = 0.03
 """Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
-MOST_SCATTER = 0.1
-"""RMS distance from the line, √N, above which it is none: three times the noise."""
+MOST_SCATTER = 3.3
+"""RMS distance from the line over the noise above which it is none."""
 LEAST_FORCE_N = 0.1
 """Below it threshold and noise of the array bend the line."""
 LEAST_SAMPLES = 6
@@ -24,10 +24,17 @@ LEAST_SAMPLES = 6
 class PushFit:
     """Straight line of √F over the push, from running means (Welford): constant time and memory.
 
+    Both have errors, and on a stiff contact a micrometre of the push is a large force. The line is that of the root on
+    the push as it was measured, which errors make flatter: it is to tell the force where the encoders say the probe is.
+
     Example: `fit.add(push, force)` for every tactile frame of a touch; `fit.slope` once `fit.certain(0.1)`.
+
+    Args:
+        push_sigma: standard deviation of a push, m, independent from sample to sample.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, push_sigma: float = 0.0) -> None:
+        self._push_variance = push_sigma * push_sigma
         self._n = 0
         self._push = self._root = 0.0  # means
         self._spread = self._joint = self._root_spread = 0.0  # sums of products about them
@@ -64,14 +71,14 @@ class PushFit:
     @property
     def sigma(self) -> float:
         """Its standard deviation, √N per m; infinite where there is no slope."""
-        return SIGMA_ROOT / math.sqrt(self._spread) if self._determined else math.inf
+        return self._noise / math.sqrt(self._spread) if self._determined else math.inf
 
     def certain(self, share: float) -> bool:
         """Whether the slope is positive, known to this share of itself (1σ), and the samples lie on the line.
 
         A sensor that sends nonsense has a slope too; its samples are off the line.
         """
-        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER * self._noise
 
     @property
     def scatter(self) -> float:
@@ -79,6 +86,11 @@ class PushFit:
         if not self._determined:
             return math.inf
         return math.sqrt(max(self._root_spread - self._joint**2 / self._spread, 0.0) / (self._n - 2))
+
+    @property
+    def _noise(self) -> float:
+        """Of a sample about the line, √N: that of the root and that of the push, seen along the slope."""
+        return math.sqrt(SIGMA_ROOT**2 + self.slope**2 * self._push_variance)
 
     @property
     def _determined(self) -> bool:

@@ -14,14 +14,22 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    ("share", "rms_percent", "most_n"),
-    [(0.181, 10.0, 3.0), (4.5, 10.0, 3.0), (18.0, 20.0, 3.5)],
-    ids=["4 kN/m", "20 kN/m", "40 kN/m"],
+    ("share", "fidelity", "rms_percent", "most_n"),
+    [
+        (0.181, "ideal", 10.0, 3.0),
+        (4.5, "ideal", 10.0, 3.0),
+        (18.0, "ideal", 20.0, 3.5),
+        (18.0, "dynamic", 20.0, 3.5),
+    ],
+    ids=["4 kN/m", "20 kN/m", "40 kN/m", "40 kN/m, dynamic arm"],
 )
-def test_force_is_kept_without_retuning(share, rms_percent, most_n):
-    """Up to 20 kN/m there is no overshoot above 1.5 of the target, approach included."""
+def test_force_is_kept_without_retuning(share, fidelity, rms_percent, most_n):
+    """Up to 20 kN/m there is no overshoot above 1.5 of the target, approach included.
+
+    At 40 kN/m one count of an encoder is up to 1.1 N, which must not make the stiffness that is felt a doubtful one.
+    """
     scene = canprobe.load_scene("cylinder")
-    plant = replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL)
+    plant = replace(scene.plant or PlantSettings(), stiffness_n_m3=share * NOMINAL, fidelity=fidelity)
     assert scene.shape is not None
     scene = replace(scene, plant=plant, shape=replace(scene.shape, also=()))
     result = canprobe.run(scene, files=False, duration_s=2.0)

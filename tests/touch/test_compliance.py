@@ -67,6 +67,32 @@ def test_nonsense_has_a_slope_and_is_not_believed():
     assert not fit.certain(10.0)
 
 
+def test_a_stiff_touch_is_believed_as_far_as_the_encoders_tell_the_push():
+    """Rounded to counts of 30 µm, the push of a 40 kN/m touch is off by half a newton: no nonsense, and known as that."""
+    rng = np.random.default_rng(5)
+    stiffness, sigma = 18 * 1.27e8, 30e-6 / math.sqrt(12.0)
+    depths = np.tile(np.linspace(0.03e-3, 0.1e-3, 30), 3)
+    fits = PushFit(), PushFit(push_sigma=sigma)
+    for depth in depths:
+        force = force_at(depth, stiffness, (1 / 0.036, 0.0))
+        measured = depth + rng.uniform(-15e-6, 15e-6)
+        for fit in fits:
+            fit.add(measured, force)
+    exact, rounded = fits
+    assert exact.slope == rounded.slope and exact.sigma < rounded.sigma / 3
+    assert not exact.certain(0.12) and rounded.certain(0.12)
+    true = math.sqrt(force_at(1.0, stiffness, (1 / 0.036, 0.0)))
+    flatter = 1.0 / (1.0 + sigma**2 / np.var(depths))
+    assert rounded.slope == pytest.approx(flatter * true, rel=0.05)
+
+
+def test_nonsense_is_none_either_where_the_push_is_rounded():
+    rng, fit = np.random.default_rng(3), PushFit(push_sigma=9e-6)
+    for depth in np.linspace(0.1e-3, 0.5e-3, 100):
+        fit.add(depth, rng.uniform(0.1, 6.0))
+    assert not fit.certain(10.0)
+
+
 def test_its_standard_deviation_covers_a_force_known_to_six_percent():
     depths = np.linspace(0.15e-3, 0.42e-3, 60)
     true = pushed(1.27e8, (0.0, 0.0), depths).slope

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from canprobe.cell.measurement import Measurement, TactileSample
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import PumaModel
+from canprobe.robot.resolution import count_sigma
 from canprobe.touch.compliance import stiffness_from_slope
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force
 from canprobe.touch.pad_lag import Lag, PadLag
@@ -44,6 +45,11 @@ class JointHistory:
         """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""
         self._times.append(t_ns)
         self._joints.append(q)
+
+    @property
+    def newest(self) -> Vector:
+        """Joint angles (6,), rad, that were added last."""
+        return self._joints[-1]
 
     def at(self, t_ns: int) -> Vector | None:
         """Joint angles (6,), rad, at ``t_ns``, linear between SYNCs; None outside the history."""
@@ -114,6 +120,10 @@ class ContactSensing:
             return None
         self.patch = patch_of(measurement.tactile, self._calibration)
         return self.patch
+
+    def position_sigma(self, direction: Vector) -> float:
+        """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
+        return count_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
     def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
         """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.

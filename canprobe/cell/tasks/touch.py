@@ -158,6 +158,7 @@ class TouchTask(ProbingTask):
         centre = contact.p_base + contact.n_base * (self.sensing.radius - self.sensing.depth(contact.force_n))
         if self._push_from is None:
             self._push_from = centre, contact.n_base
+            self._push = PushFit(self.sensing.position_sigma(contact.n_base))
         first, normal = self._push_from
         self._push.add(float(normal @ (first - centre)), contact.force_n)
         if self._push.certain(CERTAIN):
