@@ -68,7 +68,7 @@ def test_nonsense_has_a_slope_and_is_not_believed():
 
 
 def test_a_stiff_touch_is_believed_as_far_as_the_encoders_tell_the_push():
-    """Rounded to counts of 30 µm, the push of a 40 kN/m touch is off by half a newton: no nonsense, but less certain."""
+    """Rounded to counts of 30 µm, the push of a 40 kN/m touch is off by half a newton: less certain, no nonsense."""
     rng = np.random.default_rng(5)
     stiffness, sigma = 18 * 1.27e8, 30e-6 / math.sqrt(12.0)
     depths = np.tile(np.linspace(0.03e-3, 0.1e-3, 30), 3)
