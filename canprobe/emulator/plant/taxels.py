@@ -39,7 +39,7 @@ class TaxelConfig:
         gain_error: half-width of the uniform spread of taxel gains, fixed for the life of the array.
         saturation: whether the response bends off: ``x (1 + (x / 1.25)^4)^(-1/4)``, x in full scales.
         hysteresis: width of the loop relative to the signal.
-        creep_per_decade: growth of the reading under constant load per decade of time, from 0.1 s to 1000 s.
+        creep_per_decade: growth of the reading under constant load per decade of time, from 0.1 s to 180 s.
         crosstalk: share of a taxel's signal that spreads evenly over its row, and again over its column.
         noise: standard deviation per sample, in full scales.
         threshold: readings below this share of full scale become 0.

@@ -119,6 +119,25 @@ def test_adaptive_error_follows_its_tolerance():
     assert errors[2] < 1e-4
 
 
+def test_adaptive_is_of_second_order_in_the_parts_it_takes():
+    class Counted(Spring):
+        parts = 0
+
+        def linearised(self, *args):
+            self.parts += 1
+            return super().linearised(*args)
+
+    problem = Counted(25.0, 1.0, cubic=5.0)
+    exact = reference(problem)
+    logs = []
+    for rtol in np.geomspace(1e-3, 1e-6, 7):
+        problem.parts = 0
+        y = run(lambda *a, r=rtol: adaptive(*a, rtol=r, atol=r), problem, 4)
+        logs.append((math.log(problem.parts), math.log(np.linalg.norm(y - exact))))
+    parts, errors = np.array(logs).T
+    assert np.polyfit(parts, errors, 1)[0] == pytest.approx(-2.0, abs=0.15)
+
+
 def test_adaptive_gives_up_instead_of_hanging():
     class Broken(Spring):
         def rate(self, t, y):
