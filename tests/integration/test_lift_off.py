@@ -85,7 +85,7 @@ def test_with_another_master_nothing_moves():
     run = Injected("press", HOLD_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
     pressed_on(run, "another master")
     (told,) = (fault for fault in run.session.cell.faults if "left pressing" in fault)
-    assert 1.8 < float(told.split(" N")[0].split()[-1]) < 2.2 and "free it before the next run" in told
+    assert 1.8 < float(told.split(" N")[0].split()[-1]) < 2.2 and "free it; a run does not begin" in told
 
 
 def test_after_bus_off_nothing_can_be_sent():
