@@ -209,6 +209,16 @@ def force_hidden(contact: Contact) -> SafetyStop | None:
     )
 
 
+def off_pad(contact: Contact) -> SafetyStop | None:
+    """The contact has been running off the array for so long that the force may be above the limit."""
+    if contact.off_pad_s * 1e9 <= contact.limits.hidden_ns:
+        return None
+    return SafetyStop(
+        f"the contact runs off the edge of the array: the true force is above the {contact.force:.1f} N measured; let"
+        " the pad follow the surface (a smaller task.rolling_share or task.speed_mm_s), or take a smaller probe"
+    )
+
+
 def sensor_stale(contact: Contact) -> SafetyStop | None:
     """No tactile sample for too long."""
     age = contact.tactile_age

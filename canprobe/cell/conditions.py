@@ -256,6 +256,16 @@ CONDITIONS: tuple[Condition, ...] = (
         touch=True,
     ),
     Condition(
+        "off_pad",
+        "contact that runs off the array",
+        "highest pressure at the array's edge for 20 ms, as the force beyond it is not felt",
+        Reaction.RETREAT,
+        lambda limits: limits.hidden_ns + _sample(limits),
+        "a smaller `task.rolling_share`, speed or probe",
+        check=checks.off_pad,
+        touch=True,
+    ),
+    Condition(
         "contact_lost",
         "contact lost in a hold",
         "below a tenth of `task.force_n`, at least 0.075 N, for 30 ms",

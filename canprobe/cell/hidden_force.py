@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class HiddenForce:
-    """Times an unbroken run of saturated samples.
+    """Times an unbroken run of samples whose force is only a lower bound.
 
     Attributes:
         hidden_s: how long the run is, s; 0 outside one.
@@ -16,14 +16,14 @@ class HiddenForce:
         self.hidden_s = 0.0
         self._since_ns: int | None = None
 
-    def add(self, saturated: bool, t_ns: int) -> None:
+    def add(self, hidden: bool, t_ns: int) -> None:
         """Take one sample.
 
         Args:
-            saturated: its force is only a lower bound, and nothing else tells the true one.
+            hidden: its force is only a lower bound, and nothing else tells the true one.
             t_ns: when it was taken.
         """
-        if not saturated:
+        if not hidden:
             self._since_ns, self.hidden_s = None, 0.0
         elif self._since_ns is None:
             self._since_ns = t_ns

@@ -48,7 +48,8 @@ class Limits:
         tactile_cycles: between two tactile frames.
         tactile_timeout: cycles without a tactile sample.
         lost_ns: without contact force in a touch after which the contact is lost.
-        hidden_ns: with a saturated array, and no other knowledge of the force, after which it may be above the limit.
+        hidden_ns: with a saturated array, and no other knowledge of the force, or with a contact that runs off it,
+            after which the force may be above the limit.
         regain: way towards the object on which a scan looks for a lost contact, m; 0: it does not.
         force_max: N.
         preload_max: force before a run, N, above which it does not begin; infinite where the array is not tared.
@@ -141,6 +142,7 @@ class Contact:
             without a sensor.
         lost_s: how long the force has been below that of a contact, where there must be one.
         hidden_s: how long the array has been saturated while nothing else tells the force.
+        off_pad_s: how long a good part of the contact has been beyond the array's edge.
         path: the touch is a scan, which may look for a contact that it has lost.
         searched: how far it has gone towards the object since, m.
         limit: what a joint or the workspace forbids; None where all is well.
@@ -151,6 +153,7 @@ class Contact:
     tactile_age: int | None
     lost_s: float = 0.0
     hidden_s: float = 0.0
+    off_pad_s: float = 0.0
     path: bool = False
     searched: float = 0.0
     limit: str | None = None

@@ -19,6 +19,8 @@ from canprobe.errors import CanprobeError
 if TYPE_CHECKING:
     from canprobe.touch.patch import Patch
 
+LEAST_FORCE_N = 0.075
+"""Below it an image tells nothing about where the contact is."""
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
 SECOND_NS = 1_000_000_000
@@ -51,7 +53,7 @@ class Supervisor:
         self._patch_from = patch_from
         self._force = 0.0
         self._sample: TactileSample | None = None
-        self._hidden = HiddenForce()
+        self._hidden, self._off_pad = HiddenForce(), HiddenForce()
         self._untouched = math.isfinite(seen.limits.preload_max)
         self._joints = JointGuard(seen.limits)
         period_ns = seen.limits.period_ns
@@ -136,8 +138,16 @@ class Supervisor:
             patch = self._patch_from(measurement.tactile)
             self._force = patch.force
             self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
-        hidden_s = self._hidden.hidden_s
-        return touch_finding(Contact(self.seen.limits, self._force, measurement.tactile_age, hidden_s=hidden_s))
+            self._off_pad.add(patch.off_pad and patch.force > LEAST_FORCE_N, measurement.tactile.t_sample_ns)
+        return touch_finding(
+            Contact(
+                self.seen.limits,
+                self._force,
+                measurement.tactile_age,
+                hidden_s=self._hidden.hidden_s,
+                off_pad_s=self._off_pad.hidden_s,
+            )
+        )
 
     def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
         """The command that may be sent: a target too far away is approached, one out of bounds is left out."""

@@ -28,6 +28,11 @@ SIDE = 16
 Window = tuple[int, int, int, int]
 """First row, first column, rows, columns."""
 
+OFF_PAD = 0.95
+"""Pressure at the pad's edge over the highest from which the contact runs off: a paraboloid has lost a sixth."""
+OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
+"""The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
+has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
 _TOO_FEW = 4
 _FULL: Window = (0, 0, SIDE, SIDE)
 
@@ -66,6 +71,8 @@ class Patch(NamedTuple):
         cut_by_pad: the patch reaches the pad's edge.
         too_few: fewer than four active taxels: no moments to speak of.
         dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`patch_mending`).
+        off_pad: the pressure is highest at the pad's edge, so that a good part of the contact, a fifth or all but a
+            rim of it, lies beyond: the force is only a lower bound.
     """
 
     force: float
@@ -81,6 +88,7 @@ class Patch(NamedTuple):
     cut_by_pad: bool
     too_few: bool
     dead: int = 0
+    off_pad: bool = False
 
     @property
     def good(self) -> bool:
@@ -190,6 +198,7 @@ def compute_patch(
         cut_by_window=at_window > 0.0,
         cut_by_pad=at_pad > 0.0,
         dead=dead,
+        off_pad=at_pad >= OFF_PAD * peak_pa,
     )
 
 
@@ -203,6 +212,7 @@ def _patch(
     cut_by_window: bool,
     cut_by_pad: bool,
     dead: int = 0,
+    off_pad: bool = False,
 ) -> Patch:
     total = moments[0]
     if n_active == 0 or total <= 0.0:
@@ -225,6 +235,7 @@ def _patch(
         cut_by_pad=cut_by_pad,
         too_few=n_active < _TOO_FEW,
         dead=dead,
+        off_pad=off_pad,
     )
 
 
@@ -244,7 +255,8 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
     """Patch from moments that the sensor node computed itself.
 
     The node's force is its plain sum of pressure times area; the calibration's gains are applied here. Cuts cannot be
-    seen; `cut_by_pad` is set where two standard deviations reach past the pad.
+    seen; `cut_by_pad` is set where two standard deviations reach past the pad, `off_pad` where `OFF_PAD_SIGMAS` do or
+    the centroid lies in the last row of taxels.
 
     Args:
         features: force in N, row and column in taxels, variances in taxels², peak in counts.
@@ -252,11 +264,11 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
     """
     row, col = features.row - (SIDE - 1) / 2, features.col - (SIDE - 1) / 2
     total = max(features.force_n, 0.0)
-    reach = SIDE / 2
-    cut_by_pad = (
-        abs(row) + 2.0 * math.sqrt(max(features.var_rr, 0.0)) > reach
-        or abs(col) + 2.0 * math.sqrt(max(features.var_cc, 0.0)) > reach
-    )
+    reach = 0.5 * SIDE
+    axes = ((abs(row), features.var_rr), (abs(col), features.var_cc))
+    cut_by_pad = any(c + 2.0 * math.sqrt(max(var, 0.0)) > reach for c, var in axes)
+    reached = max(c + OFF_PAD_SIGMAS * math.sqrt(max(var, 0.0) + 1.0 / 12.0) for c, var in axes)
+    at_edge = max(abs(row), abs(col)) > reach - OFF_PAD_TAXELS
     moments = [1.0, col, row, features.var_cc + col * col, features.var_rc + row * col, features.var_rr + row * row]
     peak = min(max(int(features.peak), 0), 255)
     return _patch(
@@ -267,6 +279,7 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
         saturated=peak >= calibration.counts_max,
         cut_by_window=False,
         cut_by_pad=cut_by_pad,
+        off_pad=reached > reach or at_edge,
     )._replace(too_few=total <= 0.0)
 
 

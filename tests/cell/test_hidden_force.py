@@ -29,7 +29,11 @@ def supervisor(patches):
 
 
 def findings(saturated):
-    patches = [SimpleNamespace(force=2.0, saturated=one) for one in saturated]
+    patches = [SimpleNamespace(force=2.0, saturated=one, off_pad=False) for one in saturated]
+    return guarded(patches)
+
+
+def guarded(patches):
     guard = supervisor(patches)
     samples = [SimpleNamespace(cycle=k, t_sample_ns=k * PERIOD_NS) for k in range(len(patches))]
     return [guard.guard_contact(Measurement(2 * k, 0, tactile=s, tactile_age=2)) for k, s in enumerate(samples)]
@@ -45,3 +49,14 @@ def test_an_own_controller_is_guarded_against_it():
 
 def test_a_touch_that_saturates_now_and_then_goes_on():
     assert findings([True, True, True, True, False] * 6) == [None] * 30
+
+
+def test_nor_may_its_contact_run_off_the_array():
+    running_off = [SimpleNamespace(force=1.0, saturated=False, off_pad=k > 1) for k in range(8)]
+    found = guarded(running_off)
+    assert found[:7] == [None] * 7
+    assert found[7].condition.key == "off_pad" and found[7].condition.reaction is Reaction.RETREAT
+    assert "the true force is above the 1.0 N measured" in str(found[7].error)
+    assert guarded([SimpleNamespace(force=0.05, saturated=False, off_pad=True)] * 20) == [None] * 20, (
+        "no contact at all"
+    )

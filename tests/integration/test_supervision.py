@@ -560,7 +560,8 @@ def canprobe_lines(path):
 
 def test_every_row_is_tested_here():
     source = Path(__file__).read_text(encoding="utf-8")
-    source += Path(__file__).with_name("test_preload.py").read_text(encoding="utf-8")
+    for name in ("test_preload.py", "test_off_pad.py"):
+        source += Path(__file__).with_name(name).read_text(encoding="utf-8")
     special = {"error_passive": "error-passive: hold", "error_passive_long": "error-passive for 1.0 s"}
     special |= {"overruns": "overrun_budget", "estimator": 'counts["estimator"]', "force": 'BY_KEY["force"]'}
     special |= {key: f'BY_KEY["{key}"]' for key in ("contact_to_regain", "contact_not_regained", "force_hidden")}
@@ -568,6 +569,7 @@ def test_every_row_is_tested_here():
         "master_dead": 'BY_KEY["master_dead"]',
         "log": "test_a_full_disk",
         "preload": 'BY_KEY["preload"]',
+        "off_pad": 'BY_KEY["off_pad"]',
         "drive_late": 'BY_KEY["drive_late"]',
     }
     for condition in CONDITIONS:

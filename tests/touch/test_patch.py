@@ -83,14 +83,13 @@ def test_blur_variance_is_taken_off():
     assert plain.var_uv == less.var_uv
 
 
-def test_features_say_the_same_as_the_image():
-    image = press(1e-3, -2e-3, 5e-3, 4e-3, 0.4)
-    full = compute_patch(image, EXACT)
+def features_of(image):
+    """What a node computes of an image, written out."""
     p = image / 255 * 100e3 * PITCH**2
     row, col = np.mgrid[:16, :16]
     force = p.sum()
     r, q = (p * row).sum() / force, (p * col).sum() / force
-    features = SimpleNamespace(
+    return SimpleNamespace(
         force_n=force,
         row=r,
         col=q,
@@ -99,6 +98,30 @@ def test_features_say_the_same_as_the_image():
         var_cc=(p * (col - q) ** 2).sum() / force,
         peak=int(image.max()),
     )
+
+
+EDGE = 8 * PITCH
+
+
+@pytest.mark.parametrize("radius", [3e-3, 5e-3, 7e-3])
+@pytest.mark.parametrize("towards", [(1, 0), (-1, 0), (0, 1), (0, -1)])
+def test_a_contact_that_runs_off_the_pad_is_told(radius, towards):
+    """Not while all of it is on the pad, nor where a hundredth is lost; always from a third on."""
+    whole = math.pi * radius**2 * 80e3 / 2
+    for place in np.linspace(0.0, EDGE + 0.8 * radius, 40):
+        image = press(towards[0] * place, towards[1] * place, radius, radius)
+        seen, told = compute_patch(image, EXACT), patch_from_features(features_of(image), EXACT)
+        lost = 1.0 - told.force / whole
+        if place <= EDGE - radius or lost < 0.01:
+            assert not seen.off_pad and not told.off_pad
+        elif lost > 0.33:
+            assert seen.off_pad and told.off_pad
+
+
+def test_features_say_the_same_as_the_image():
+    image = press(1e-3, -2e-3, 5e-3, 4e-3, 0.4)
+    full = compute_patch(image, EXACT)
+    features = features_of(image)
     patch = patch_from_features(features, EXACT)
     assert patch.force == pytest.approx(full.force, rel=0.01)  # the node does not know the sphere
     assert (patch.u, patch.v) == pytest.approx((full.u, full.v), abs=0.02e-3)

@@ -120,7 +120,9 @@ class CalibrateTask(ProbingTask):
             return
         self._force = patch.force
         self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
-        contact = self.sensing.contact(measurement.tactile, patch) if patch.force > TOUCH_FORCE / 2 else None
+        touching = patch.force > TOUCH_FORCE / 2
+        self._off_pad.add(touching and patch.off_pad, measurement.tactile.t_sample_ns)
+        contact = self.sensing.contact(measurement.tactile, patch) if touching else None
         if contact is not None and self.phase in (Phase.APPROACH, Phase.SETTLE):
             self._push.add(self._pushed(contact.T_base_probe[:3, 3]), contact.force_n)
         if self.phase is Phase.SCAN:
@@ -133,8 +135,9 @@ class CalibrateTask(ProbingTask):
     def _watch(self, measurement: Measurement) -> None:
         if self.reason is not None or self.phase is Phase.DONE:
             return
-        hidden = self._hidden.hidden_s
-        finding = touch_finding(Contact(self._s.limits, self._force, measurement.tactile_age, hidden_s=hidden))
+        hidden, off_pad = self._hidden.hidden_s, self._off_pad.hidden_s
+        age = measurement.tactile_age
+        finding = touch_finding(Contact(self._s.limits, self._force, age, hidden_s=hidden, off_pad_s=off_pad))
         if finding is not None:
             self.retreat(str(finding.error))
 

@@ -50,7 +50,7 @@ class ProbingTask:
         self._last_ns: int | None = None
         self._t = 0.0
         self._force = 0.0
-        self._hidden = HiddenForce()
+        self._hidden, self._off_pad = HiddenForce(), HiddenForce()
         self._columns: dict[str, float | Vector] = {}
 
     @property

@@ -133,8 +133,10 @@ class TouchTask(ProbingTask):
         self._hidden.add(not felt, measurement.tactile.t_sample_ns)
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
+        touching = patch.force > self._s.touch_force / 2
+        self._off_pad.add(touching and patch.off_pad, measurement.tactile.t_sample_ns)
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
-        contact = self.sensing.contact(measurement.tactile, patch) if patch.force > self._s.touch_force / 2 else None
+        contact = self.sensing.contact(measurement.tactile, patch) if touching else None
         if contact is not None and self._sample_t is not None and contact.t_s <= self._sample_t:
             self.sensing.dropped += 1  # it says that it is older than the one before
             contact = None
@@ -203,6 +205,7 @@ class TouchTask(ProbingTask):
                 measurement.tactile_age,
                 self._lost,
                 hidden_s=self._hidden.hidden_s,
+                off_pad_s=self._off_pad.hidden_s,
                 path=self._s.speed > 0 and self._scan_start is not None,
                 searched=self.losses[-1].searched if self._search is not None else 0.0,
             )
