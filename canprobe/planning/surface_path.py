@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.planning.contact_window import PITCH_M
+from canprobe.protocol.tactile import SIDE
 from canprobe.scene import Scene
 from canprobe.scene_geometry import approach_normal, scan_axes, true_object
 from canprobe.touch.objects import PlacedShape
@@ -61,7 +63,9 @@ def surface_path(scene: Scene, samples: int = SAMPLES) -> tuple[SurfacePath | No
             return None, [_left_object(point)]
         contacts.append(shape.closest(point + height * down))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
-    return SurfacePath(points, normals, shape.tightest_concave_radius(points)), []
+    path = SurfacePath(points, normals, shape.tightest_concave_radius(points))
+    beside = _beside(scene, shape, path, start, down)
+    return (path, []) if beside is None else (None, [beside])
 
 
 def _shape(scene: Scene, problems: list[str]) -> PlacedShape | None:
@@ -110,6 +114,31 @@ def _missed(scene: Scene, miss: float | None) -> str:
         f"{where}: the object lies {abs(1e3 * miss):.1f} mm {'above' if miss > 0 else 'below'} along the approach, "
         f"searched from {scene.task.clearance_mm:g} mm above to {scene.task.search_mm:g} mm below; move one of them"
     )
+
+
+def _beside(scene: Scene, shape: PlacedShape, path: SurfacePath, start: Array, up: Array) -> str | None:
+    """Why the probe, before or at its first touch, meets the object where there is no array; None where all is well.
+
+    A hollow that is tighter than the probe is refused as that.
+    """
+    if scene.probe is None or path.hollow_radius <= scene.probe.radius_mm * 1e-3:
+        return None
+    radius, clearance = scene.probe.radius_mm * 1e-3, scene.task.clearance_mm * 1e-3
+    nearest = shape.closest(start + (clearance + radius) * up)
+    tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))
+    mend = f"turn task.approach_normal by {math.degrees(tilt):.0f} deg to the object's normal, or move one of them"
+    if nearest.distance <= radius:
+        deep = 1e3 * (radius - nearest.distance)
+        return (
+            f"task.clearance_mm = {scene.task.clearance_mm:g}: the probe would be {deep:.1f} mm in the object before"
+            f" its approach, {math.degrees(tilt):.0f} deg beside it; {mend}"
+        )
+    if radius * tilt > 0.5 * SIDE * PITCH_M:
+        return (
+            f"task.approach_normal: the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the"
+            f" array, which reaches {500 * SIDE * PITCH_M:.1f} mm and would not feel it; {mend}"
+        )
+    return None
 
 
 def _left_object(point: Array) -> str:

@@ -143,3 +143,24 @@ def test_all_reasons_come_at_once(cylinder):
     problems = reasons(change(scene, arm={"start_deg": (200.0, 65.0, 15.0, 0.0, 100.0, 0.0)}))
     for word in ("worst-case load", "leaves the object", "arm.start_deg"):
         assert any(word in problem for problem in problems)
+
+
+def tilted(scene, degrees, clearance_mm=3.0):
+    plane = ObjectSettings("plane", rotation_deg=(degrees, 0.0, 0.0))
+    small = change(scene, task={"length_mm": 6.0, "width_mm": 3.0, "clearance_mm": clearance_mm})
+    return dataclasses.replace(small, object=plane)
+
+
+def test_a_first_touch_beside_the_array_is_refused(cylinder):
+    """A probe of 40 mm meets a tilted plane 40 mm · tilt beside its pole; the array ends at 12.7 mm, 18.2 degrees."""
+    assert make_plan(tilted(cylinder, 17.9))
+    (problem,) = reasons(tilted(cylinder, 18.5))
+    assert "would be 12.9 mm beside the middle of the array, which reaches 12.7 mm" in problem
+    assert "turn task.approach_normal by 18 deg" in problem or "turn task.approach_normal by 19 deg" in problem
+
+
+def test_a_probe_that_would_be_in_the_object_before_its_approach_is_refused(cylinder):
+    (problem,) = reasons(tilted(cylinder, 25.0))
+    deep = 40.0 - 43.0 * math.cos(math.radians(25.0))
+    assert f"the probe would be {deep:.1f} mm in the object before its approach, 25 deg beside it" in problem
+    assert "first touch would be" in reasons(tilted(cylinder, 25.0, clearance_mm=6.0))[0]
