@@ -39,17 +39,6 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
     return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{words}{_held_up(seen)}")
 
 
-def preloaded(seen: Seen) -> SafetyStop | None:
-    """The array felt something before the run could have touched anything."""
-    if seen.preload <= seen.limits.preload_max:
-        return None
-    return SafetyStop(
-        f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
-        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, the array's"
-        " offsets are larger than that"
-    )
-
-
 def _held_up(seen: Seen) -> str:
     """Why the drives stopped by themselves, where that is known: the master was kept from its cycle for too long."""
     patience_ns = seen.limits.missed_cycles * seen.limits.period_ns
@@ -197,6 +186,17 @@ def force(contact: Contact) -> SafetyStop | None:
     if contact.force <= limit:
         return None
     return SafetyStop(f"measured force {contact.force:.2f} N above the limit of {limit:.2f} N")
+
+
+def preloaded(seen: Seen) -> SafetyStop | None:
+    """The array felt something before the run could have touched anything."""
+    if seen.preload <= seen.limits.preload_max:
+        return None
+    return SafetyStop(
+        f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
+        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, the array's"
+        " offsets are larger than that"
+    )
 
 
 def force_hidden(contact: Contact) -> SafetyStop | None:

@@ -27,6 +27,10 @@ def _sample(limits: Limits) -> int:
     return limits.cycles_to_feel * limits.period_ns
 
 
+def _hidden(limits: Limits) -> int:
+    return limits.hidden_ns + _sample(limits)
+
+
 def _lost(limits: Limits) -> int:
     return limits.lost_ns + _sample(limits) + ARRAY_RECOVERY_NS
 
@@ -250,7 +254,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "force that a saturated array does not tell",
         "saturated for 20 ms in a touch whose stiffness was not felt",
         Reaction.RETREAT,
-        lambda limits: limits.hidden_ns + _sample(limits),
+        _hidden,
         "a larger `sensor.full_scale_kpa`, or a smaller `task.force_n`",
         check=checks.force_hidden,
         touch=True,
@@ -260,7 +264,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "contact that runs off the array",
         "highest pressure at the array's edge for 20 ms, as the force beyond it is not felt",
         Reaction.RETREAT,
-        lambda limits: limits.hidden_ns + _sample(limits),
+        _hidden,
         "a smaller `task.rolling_share`, speed or probe",
         check=checks.off_pad,
         touch=True,

@@ -88,7 +88,8 @@ class Supervisor:
         self._sample = measurement.tactile or self._sample
         if self._untouched:
             self._untouched = not measurement.enabled
-            seen.preload = max(seen.preload, self.felt())
+            if measurement.tactile is not None:
+                seen.preload = max(seen.preload, self.felt())
         counts = [count(seen) for count in self._counters]
         if counts != self._counted:
             self._note(counts, measurement.cycle)
