@@ -29,6 +29,7 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Row4 = tuple[float, float, float, float]
+Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
@@ -58,8 +59,8 @@ class SceneInfo:
 class BusSettings:
     """`[bus]`: where the nodes are. `lockstep`, `socketcan` or any python-can interface."""
 
-    interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
-    channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
+    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    channel: Channel = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
     timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
     transmit_queue: TransmitQueue = "priority"  # what a node with several frames sends first; "fifo": the oldest
@@ -100,7 +101,7 @@ class SensorSettings:
     node_id: NodeId = 16
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
     emulated: bool = True
-    channel: Annotated[str | None, Pattern(r"\S+", "without spaces")] = None  # a bus of its own; "auto" as it fits
+    channel: Channel | None = None  # a bus of its own; "auto" as it fits
     mode: TactileModeName = "window"
     # taxels along the window that follows the contact; the full image is a mode of its own
     window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8

@@ -39,7 +39,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
     packaged = _packaged_files()
     path = packaged.get(name, Path(name))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
     except OSError as error:
         raise SceneError([_not_readable(name, error, packaged)]) from error
     except UnicodeDecodeError as error:

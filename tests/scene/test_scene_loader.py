@@ -253,3 +253,9 @@ def _section_class(name):
 def test_defaults_pass_their_own_checks():
     text = dump_scene(Scene(SceneInfo("test"), TaskSettings("free"), arm=ArmSettings(), plant=None))
     assert parse_scene(text).arm == ArmSettings()
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
+    path = tmp_path / "notepad.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + SCAN.replace("\n", "\r\n").encode())
+    assert load_scene(path) == parse_scene(SCAN)
