@@ -12,7 +12,7 @@ from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
-from canprobe.cell.log import CycleLog, LastRows, RunLog
+from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
@@ -85,7 +85,7 @@ class Cell:
         observers: Observers | None = None,
         rows_kept: int | None = None,
     ) -> None:
-        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self.log = RunLog(rows_kept)
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
