@@ -105,7 +105,7 @@ class SensorSettings:
     mode: TactileModeName = "window"
     # taxels along the window that follows the contact; the full image is a mode of its own
     window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
-    rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
+    rate_hz: Annotated[float, Range(1, 1000)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     serial_number: SerialNumber | None = None  # 1018h:04; None: any
 
@@ -207,7 +207,7 @@ class LimitSettings:
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15  # felt before the run, which the array's tare takes for zero
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
-    joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+    joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0  # of the model's speed limits
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
     workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
     workspace_max_mm: Vec3 | None = None

@@ -65,7 +65,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     """
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
     reader = _Reader(document, folder)
     scene = reader.read()
