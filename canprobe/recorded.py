@@ -105,8 +105,10 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
     """The candump file; and the run's folder where it is one.
 
     Raises:
-        UsageError: a folder without a log.
+        UsageError: nothing is there, or a folder without a log.
     """
+    if not log.exists():
+        raise UsageError(f"{log}: no such folder or file; expected the folder of a run, or a candump file")
     if not log.is_dir():
         return log, None
     path = log / "bus.log"

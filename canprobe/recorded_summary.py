@@ -164,6 +164,8 @@ def replay_text(summary: dict[str, Any]) -> str:
             how += f" ({targets['differing']} of {targets['compared']} targets differ)"
         if targets["lifted_s"] is not None:
             how += f"; lifted off at {targets['lifted_s']:.2f} s"
+    elif targets["parted_s"] is None and 2 * targets["differing"] < targets["compared"]:
+        how = "the scene's task drove, but not to its scan: every contact is fed to the estimators"
     elif targets["compared"]:
         since = "" if targets["parted_s"] is None else f" (since {targets['parted_s']:.2f} s)"
         how = f"another controller drove{since}: every contact is fed to the estimators"

@@ -55,6 +55,8 @@ def _draw(plan: Plan, path: Path) -> Path:
         from canprobe.studies.plan_figure import draw_plan
     except ImportError as error:
         raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
+    if not path.suffix:
+        path = path.with_suffix(".png")  # as matplotlib would do by itself, and tell nobody
     try:
         draw_plan(plan, path)
     except ValueError as error:  # matplotlib knows no such form
@@ -69,6 +71,8 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
 
+    if args.measured is not None and (args.export or args.figure is not None):
+        raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
     scene = load_scene(args.scene)
     try:
         plan = make_plan(opened(scene) if args.auto else scene)

@@ -11,6 +11,7 @@ import pytest
 from candump_lines import can_id_of, restamped, stamp_us
 
 import canprobe
+from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.cli import main
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
@@ -157,6 +158,18 @@ def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_ru
 
     result = canprobe.replay(copy_of(lockstep_run.out, bare))
     assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+
+
+def test_a_run_that_ended_before_its_scan_is_still_ours(lockstep_run, copy_of):
+    scan_s = lockstep_run.log["t_s"][np.argmax(lockstep_run.log["phase"] == Phase.SCAN)]
+
+    def until_the_scan(lines):
+        end_us = 1e6 * scan_s + next(stamp_us(line) for line in lines if can_id_of(line) == "080")
+        return [line for line in lines if stamp_us(line) < end_us]
+
+    result = canprobe.replay(copy_of(lockstep_run.out, until_the_scan))
+    assert result.summary["driven_by"] == "other" and result.summary["targets"]["differing"] == 0
+    assert "the scene's task drove, but not to its scan: every contact is fed" in result.text()
 
 
 def test_another_controllers_log(other_run, tmp_path):

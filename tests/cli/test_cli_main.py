@@ -93,6 +93,7 @@ def test_version(capsys):
         (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
         (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
         (["plan", "none.toml"], ("none.toml", "cannot be read")),
+        (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
         (["emulate", "cylinder"], ("--channel", "missing")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "6-1"], ("--nodes", "1-6,16")),
         (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "1,17"], ("no node [17]", "[1, 2, 3, 4, 5, 6, 16]")),

@@ -30,6 +30,11 @@ def test_what_is_wrong_is_told(tmp_path, capsys, files, words, message):
     assert all(line.startswith("canprobe: ") for line in err.splitlines())
 
 
+def test_a_log_that_does_not_exist(tmp_path, capsys):
+    assert main(["replay", str(tmp_path / "none")]) == 2
+    assert "none: no such folder or file; expected the folder of a run, or a candump file" in capsys.readouterr().err
+
+
 def test_every_node_that_is_missing_is_named(tmp_path, capsys):
     log = tmp_path / "candump.log"
     log.write_text(SYNCS)

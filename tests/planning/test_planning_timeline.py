@@ -91,6 +91,8 @@ def test_rows_for_a_terminal(plan):
 def test_the_command_draws_and_prints_it(tmp_path, capsys):
     assert main(["plan", "cylinder", "--figure", str(tmp_path / "plan.png")]) == 0
     assert (tmp_path / "plan.png").read_bytes().startswith(b"\x89PNG")
+    assert main(["plan", "cylinder", "--figure", str(tmp_path / "bare")]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == str(tmp_path / "bare.png") and (tmp_path / "bare.png").is_file()
     assert main(["plan", "cylinder", "--figure", str(tmp_path / "plan.xyz")]) == 2
     capsys.readouterr()
     assert main(["plan", "cylinder", "--json"]) == 0
