@@ -8,6 +8,7 @@ file"; lely-core's dcfgen.
 
 from __future__ import annotations
 
+import operator
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -231,7 +232,7 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
 def _integer(path: Path, name: str, keys: Mapping[str, Any], key: str) -> int | None:
     value = keys.get(key)
     try:
-        return None if value is None else int(value, 0) if isinstance(value, str) else int(value)
+        return None if value is None else int(value, 0) if isinstance(value, str) else operator.index(value)
     except (TypeError, ValueError):
         raise UsageError(f"{path}: {name}: {key}: expected an integer, got {value!r}") from None
 

@@ -122,10 +122,10 @@ def with_tool(scene: Scene, path: Path | str) -> Scene:
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError([f"{path}: not valid TOML: {error}"]) from error
     table = document.get("probe")
     if set(document) != {"probe"} or not isinstance(table, dict) or set(table) != set(KEYS):

@@ -144,6 +144,8 @@ def test_a_file_as_ros2_canopen_has_them_is_read(tmp_path):
         ("a: 3", "a: expected keys and values"),
         ("a: {node_id: 200, dcf: x.eds}", "a: node_id: expected 1 to 127, got 200"),
         ("a: {node_id: two, dcf: x.eds}", "a: node_id: expected an integer, got 'two'"),
+        ("a: {node_id: .inf, dcf: x.eds}", "a: node_id: expected an integer, got inf"),
+        ("a: {node_id: 2.5, dcf: x.eds}", r"a: node_id: expected an integer, got 2\.5"),
         ("a: {node_id: 2}", "a: dcf: expected the name"),
         ("a: {node_id: 2, dcf: y.eds}", "a: dcf: no file y.eds"),
         ("a: {node_id: 2, dcf: x.eds}\nb: {node_id: 2, dcf: x.eds}", "b: node_id: 2 is that of a too"),

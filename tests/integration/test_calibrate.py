@@ -91,6 +91,7 @@ def test_a_scan_with_a_wrong_tool_gets_better_by_it(calibrated):
         ("[probe]\ncentre_offset_mm = -1\ncentre_lateral_mm = [0, 0]\n", "probe.centre_offset_mm: expected"),
         ("[probe]\ncentre_offset_mm = 80\ncentre_lateral_mm = [0, nan]\n", "probe.centre_lateral_mm: expected"),
         ("[probe\n", "not valid TOML"),
+        (f"x = {'9' * 5000}", "not valid TOML"),
     ],
 )
 def test_a_file_that_is_no_calibration_is_refused(tmp_path, text, what):
