@@ -123,6 +123,10 @@ class PdoLayout:
     _pack: Callable[..., bytes] = field(init=False, repr=False, compare=False)
     _unpack: Callable[[bytes], tuple[int, ...]] = field(init=False, repr=False, compare=False)
 
+    def __reduce__(self) -> tuple[type[PdoLayout], tuple[object, ...]]:
+        """Pickled as it was made: what is compiled cannot go to another process, as results of runs do."""
+        return type(self), (self.cob_id, self.entries, self.transmission_type, self.fd)
+
     def __post_init__(self) -> None:
         entries = tuple(self.entries)
         bits = sum(entry.bits for entry in entries)

@@ -1,5 +1,6 @@
 """The whole cell on the lockstep bus: bring-up, run, and every way out leaves the drives disabled."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -269,3 +270,11 @@ def test_the_log_has_what_was_commanded_whatever_becomes_of_the_controllers_arra
     rows = np.isfinite(log["twice"][:, 0])
     assert np.array_equal(log["q_target_rad"][rows], sent)
     assert np.ptp(log["twice"][rows][:, 0]) == 29
+
+
+def test_the_result_of_a_run_can_come_from_another_process():
+    """As `multiprocessing` sends it, which is how many seeds are run side by side."""
+    result = canprobe.run(canprobe.load_scene("press"), files=False, duration_s=0.1)
+    other = pickle.loads(pickle.dumps(result))
+    assert other.summary == result.summary and other.plan == result.plan
+    assert np.array_equal(other.log["force_n"], result.log["force_n"], equal_nan=True)

@@ -1,5 +1,8 @@
 """PDO layouts against hand-packed bytes, and against an independent bit-string packer."""
 
+import copy
+import pickle
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -140,3 +143,9 @@ def test_a_long_pdo_is_filled_up_to_a_length_that_fd_has():
     assert bits.length == 64 and bits.unpack(bits.pack(*range(7), 1)) == (*range(7), 1)
     with pytest.raises(ProtocolError, match="at most 512"):
         PdoLayout(0x512, (*entries, PdoEntry(0x2005, 0, 1)), fd=True)
+
+
+@pytest.mark.parametrize(("layout", "values", "wire"), WIRE)
+def test_a_layout_goes_to_another_process_and_is_the_same_there(layout, values, wire):
+    for other in (pickle.loads(pickle.dumps(layout)), copy.deepcopy(layout)):
+        assert other == layout and other.pack(*values).hex() == wire
