@@ -13,10 +13,10 @@ from canprobe.cell.build import make_task
 from canprobe.cell.limits import limits_of
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.cell.logged_way_back import TARGET_TOLERANCE, LoggedWayBack, worst_count
+from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.cell.tasks.touch_settings import TOUCH_FORCE
 from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
 
