@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import zip_longest
 from pathlib import Path
@@ -50,6 +52,7 @@ def emulate(
         UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
+        OSError: `truth_path` or `store_folder` cannot be there; told before anything is served.
     """
     from canprobe.emulator.build import make_world
     from canprobe.planning import make_plan
@@ -61,6 +64,7 @@ def emulate(
     fast = data_bitrate(plan.scene.bus)
     way_out = "end that node, or name others with --nodes"
     busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
+    _make_places(truth_path, store_folder)
     with _free_port(interface, channel, bitrate, busy, way_out, data_bitrate=fast) as port:
         rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
@@ -106,6 +110,7 @@ def emulate_eds(
             not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
+        OSError: `store_folder` cannot be there.
     """
     from canprobe.eds import check_eds
     from canprobe.emulator.any_eds import make_eds_node
@@ -122,12 +127,23 @@ def emulate_eds(
         if warnings := len(reading.warnings):
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
     _check_addresses(nodes)
+    _make_places(None, store_folder)
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
         for node in nodes:
             if node.lss is not None:
                 node.lss.bitrate = bitrate
         _keep(nodes, store_folder)
         _serve(nodes, nodes, port, say=say, in_realtime=in_realtime)
+
+
+def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
+    """Where the files will go: what cannot be written at the end is told at the beginning."""
+    if store_folder is not None:
+        store_folder.mkdir(parents=True, exist_ok=True)
+    if truth_path is not None:
+        truth_path.parent.mkdir(parents=True, exist_ok=True)
+        if truth_path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(truth_path))
 
 
 @contextlib.contextmanager

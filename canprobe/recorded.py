@@ -50,11 +50,12 @@ class ReplayResult:
         return replay_text(self.summary)
 
     def save(self, path: Path | str) -> None:
-        """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file."""
+        """Write the estimates as columns, ``<method>_<column>``, into a compressed npz file, exactly that file."""
         columns: dict[str, Array] = {}
         for method, records in self.estimates.items():
             columns |= {f"{method}_{name}": values for name, values in estimate_columns(records).items()}
-        np.savez_compressed(path, allow_pickle=False, **columns)
+        with Path(path).open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **columns)
 
 
 def replay(

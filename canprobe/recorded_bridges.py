@@ -19,6 +19,7 @@ from canprobe.cell.log_cycles import LogCycles
 from canprobe.cell.measurement import Command, Measurement
 from canprobe.cell.observe import Observation
 from canprobe.cell.recording import Recording, read_recording
+from canprobe.npz_file import read_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import BRIDGES, check_bridges
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
@@ -168,14 +169,14 @@ def _columns(folder: Path | None) -> dict[int, dict[str, float | NDArray[np.floa
     """What the bridges use of the task's columns, by the time of the cycle, ns, where the run logged it."""
     if folder is None or not (folder / "log.npz").is_file():
         return {}
-    with np.load(folder / "log.npz", allow_pickle=False) as log:
-        names = [name for name in LOGGED if name in log]
-        times = np.round(log["t_s"] * 1e9).astype(np.int64).tolist()
-        rows = zip(*(log[name].tolist() for name in names), strict=True)
-        return {
-            t_ns: {name: value for name, value in zip(names, row, strict=True) if np.isfinite(value)}
-            for t_ns, row in zip(times, rows, strict=False)
-        }
+    log = read_npz(folder / "log.npz")
+    names = [name for name in LOGGED if name in log]
+    times = np.round(log["t_s"] * 1e9).astype(np.int64).tolist() if names else []
+    rows = zip(*(log[name].tolist() for name in names), strict=True)
+    return {
+        t_ns: {name: value for name, value in zip(names, row, strict=True) if np.isfinite(value)}
+        for t_ns, row in zip(times, rows, strict=False)
+    }
 
 
 def _frames_by_sync(path: Path, recording: Recording) -> Iterator[list[TimedFrame]]:

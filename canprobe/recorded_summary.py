@@ -14,6 +14,7 @@ from canprobe.cell.mapping import map_of_scan, summarise_map
 from canprobe.cell.recording import Recording
 from canprobe.cell.replay import TaskReplay
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.npz_file import read_npz
 from canprobe.planning import Plan
 from canprobe.results import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.touch.consistency import check_consistency
@@ -76,10 +77,7 @@ def _map_summary(plan: Plan, tracker: ShapeTracker) -> dict[str, Any] | None:
 
 
 def _arrays(path: Path) -> dict[str, Array]:
-    if not path.is_file():
-        return {}
-    with np.load(path, allow_pickle=False) as file:
-        return {name: file[name] for name in file.files}
+    return read_npz(path) if path.is_file() else {}
 
 
 def _targets(task: TaskReplay) -> dict[str, float | None]:

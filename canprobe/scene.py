@@ -29,6 +29,7 @@ Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Row4 = tuple[float, float, float, float]
+Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
@@ -58,8 +59,8 @@ class SceneInfo:
 class BusSettings:
     """`[bus]`: where the nodes are. `lockstep`, `socketcan` or any python-can interface."""
 
-    interface: Annotated[str, Pattern(r"[a-z0-9_]+", "such as lockstep, socketcan, pcan")] = "lockstep"
-    channel: Annotated[str, Pattern(r"\S+", "without spaces")] = "can0"
+    interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    channel: Channel = "can0"
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
     timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
     transmit_queue: TransmitQueue = "priority"  # what a node with several frames sends first; "fifo": the oldest
@@ -100,11 +101,11 @@ class SensorSettings:
     node_id: NodeId = 16
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
     emulated: bool = True
-    channel: Annotated[str | None, Pattern(r"\S+", "without spaces")] = None  # a bus of its own; "auto" as it fits
+    channel: Channel | None = None  # a bus of its own; "auto" as it fits
     mode: TactileModeName = "window"
     # taxels along the window that follows the contact; the full image is a mode of its own
     window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
-    rate_hz: Annotated[float, Range(0, 1000, open_low=True)] = 200.0
+    rate_hz: Annotated[float, Range(1, 1000)] = 200.0
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
     serial_number: SerialNumber | None = None  # 1018h:04; None: any
 
@@ -206,7 +207,7 @@ class LimitSettings:
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15  # felt before the run, which the array's tare takes for zero
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
-    joint_speed_share: Annotated[float, Range(0, 1, open_low=True)] = 1.0  # of the model's speed limits
+    joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0  # of the model's speed limits
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
     workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
     workspace_max_mm: Vec3 | None = None

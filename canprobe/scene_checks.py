@@ -180,7 +180,10 @@ def _converted_list(value: object, annotation: Any) -> tuple[Any, ...]:
 
 def _converted_scalar(value: object, kind: Any) -> Any:
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
+        try:
+            value = float(value)
+        except OverflowError:
+            raise MismatchError("a finite number") from None
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise MismatchError(expected(kind))
     if isinstance(value, float) and not math.isfinite(value):

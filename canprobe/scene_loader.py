@@ -21,7 +21,7 @@ from canprobe.scene_checks import MismatchError, Only, ScenePath, choices_of, co
 from canprobe.scene_rules import SECTIONS_OF_TASK, broken_rules
 from canprobe.scene_writer import dump_scene, toml_value
 
-__all__ = ["dump_scene", "load_scene", "packaged_scenes", "parse_scene"]
+__all__ = ["dump_scene", "load_scene", "packaged_scenes", "parse_scene", "scenes_folder"]
 
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 
@@ -39,12 +39,17 @@ def load_scene(name_or_path: str | Path) -> Scene:
     packaged = _packaged_files()
     path = packaged.get(name, Path(name))
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
     except OSError as error:
         raise SceneError([_not_readable(name, error, packaged)]) from error
     except UnicodeDecodeError as error:
         raise SceneError([f"{name}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
     return parse_scene(text, file=path.name if name in packaged else name, folder=path.parent)
+
+
+def scenes_folder() -> Path:
+    """Where the packaged scenes are, for a copy to change."""
+    return Path(str(resources.files("canprobe"))) / "scenes"
 
 
 def packaged_scenes() -> list[tuple[str, str]]:
@@ -65,7 +70,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     """
     try:
         document = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
     reader = _Reader(document, folder)
     scene = reader.read()
@@ -174,8 +179,7 @@ def _sections() -> Mapping[str, type[Any]]:
 
 
 def _packaged_files() -> dict[str, Path]:
-    folder = Path(str(resources.files("canprobe"))) / "scenes"
-    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+    return {path.stem: path for path in sorted(scenes_folder().glob("*.toml"))}
 
 
 def _not_readable(name: str, error: OSError, packaged: Mapping[str, Path]) -> str:

@@ -32,6 +32,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import BridgeSettings, Scene
+from canprobe.scene_values import need_scene, with_values
 from canprobe.session_bus import Sink, TrafficCounter, channel_routes, lockstep_bus, open_ports
 
 if TYPE_CHECKING:
@@ -59,18 +60,16 @@ def resolve_scene(
     sensor_channel: str | None = None,
     bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added."""
-    bus = replace(
-        scene.bus,
-        interface=scene.bus.interface if interface is None else interface,
-        channel=scene.bus.channel if channel is None else channel,
-        bitrate=scene.bus.bitrate if bitrate is None else bitrate,
-    )
-    info = scene.scene if seed is None else replace(scene.scene, seed=seed)
-    task = scene.task if duration_s is None else replace(scene.task, duration_s=duration_s)
-    sensor = scene.sensor
-    if sensor is not None and sensor_channel is not None:
-        sensor = replace(sensor, channel=sensor_channel)
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added.
+
+    Raises:
+        UsageError: this is no scene, or a value is none that its file could have.
+    """
+    need_scene(scene)
+    bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
+    info = with_values(scene.scene, seed=seed)
+    task = with_values(scene.task, duration_s=duration_s)
+    sensor = scene.sensor if scene.sensor is None else with_values(scene.sensor, channel=sensor_channel)
     return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
+from canprobe.npz_file import read_npz
 
 if TYPE_CHECKING:
     import pandas
@@ -100,7 +101,7 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     """
     source = Path(path)
     if source.suffix == ".npz":
-        return to_frame(_read_npz(source))
+        return to_frame(read_npz(source))
     columns, attrs = _read_parquet(source)
     return to_frame(columns, {name: value for name, value in attrs.items() if name != "units"})
 
@@ -111,7 +112,7 @@ def npz_to_parquet(npz: Path | str, parquet: Path | str, attrs: Mapping[str, Any
     Raises:
         UsageError: no such file, or the extra is missing.
     """
-    write_parquet(_read_npz(Path(npz)), parquet, attrs)
+    write_parquet(read_npz(Path(npz)), parquet, attrs)
 
 
 def parquet_to_npz(parquet: Path | str, npz: Path | str) -> None:
@@ -159,14 +160,6 @@ def _cells(columns: Mapping[str, NDArray[Any]]) -> list[_Cell]:
         for name, values in columns.items()
         for index in np.ndindex(*values.shape[1:])
     ]
-
-
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files}
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: expected an .npz of a run: {error}") from error
 
 
 def _read_parquet(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:

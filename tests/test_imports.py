@@ -52,6 +52,7 @@ COMPOSITION = {
     "recorded",
     "recorded_bridges",
     "recorded_summary",
+    "npz_file",
     "surface_file",
     "tables",
     "traffic_log",

@@ -1,6 +1,7 @@
 """Logs of a bus in any form that python-can writes and reads: BLF for Vector's tools, ASC, TRC; candump by our own.
 
-The suffix names the form: ``.blf``, ``.asc``, ``.trc``, and ``.log`` or anything unknown for candump.
+The suffix names the form: ``.blf``, ``.asc``, ``.trc``, and ``.log``, ``.txt`` or none for candump, as which a file of
+any other name is read too.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from canprobe.errors import UsageError
 _READERS: dict[str, Any] = {".asc": can.ASCReader, ".blf": can.BLFReader, ".trc": can.TRCReader}
 FOREIGN = tuple(_READERS)
 """Suffixes of the forms that python-can writes and reads for us."""
+_CANDUMP = (".log", ".txt", "")
 _STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFFFFFF
 
 
@@ -60,8 +62,11 @@ def convert_log(source: str | Path, target: Path) -> int:
         How many frames.
 
     Raises:
-        UsageError: source and target are one file, one of them cannot be opened, or the source is no log.
+        UsageError: source and target are one file, one of them cannot be opened, the source is no log, or the target's
+            suffix names no form.
     """
+    if target.suffix.lower() not in (*FOREIGN, *_CANDUMP):
+        raise UsageError(f"{target}: expected .log (candump), {', '.join(FOREIGN)}, got {target.suffix}")
     if target.exists() and target.samefile(source):
         raise UsageError(f"{target}: a log cannot be converted into itself")
     frames = read_log(source)

@@ -158,6 +158,9 @@ def _open(
         raise InterfaceError(f"{channel}: no interface {interface!r}: {error}; python-can has: {names}") from error
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
         raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}") from error
+    except Exception as error:  # where a driver's library is missing, python-can trips over anything
+        why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
+        raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
 
 
 def _filter(can_id: int, mask: int) -> dict[str, Any]:

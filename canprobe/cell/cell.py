@@ -6,6 +6,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
@@ -20,7 +22,7 @@ from canprobe.cell.supervision import TOUCH_FORCE, Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch, obeys
-from canprobe.errors import CanprobeError, NodeError, SafetyStop
+from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
@@ -175,11 +177,14 @@ class Cell:
             progress: called after each cycle.
 
         Raises:
+            UsageError: this is no controller, or it returned no `Command`.
             SafetyStop: the controller or the supervision stopped the cell.
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
         """
         step = controller.step if hasattr(controller, "step") else controller
+        if not callable(step):
+            raise UsageError(f"controller: expected a function or something with step(measurement), got {controller!r}")
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
         self._tracker = getattr(controller, "shape", None)
         self._enable(getattr(controller, "inspect", None))
@@ -199,10 +204,13 @@ class Cell:
                     return
 
     def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
-        """What the controller wants; an interrupt, or what it raises instead, ends the run off the object."""
+        """What the controller wants; an interrupt, or what it raises or gives instead, ends the run off the object."""
         try:
             interrupts.take()
-            return step(measurement)
+            command = step(measurement)
+            if not isinstance(command, Command) or not isinstance(command.columns, dict):
+                raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
+            return command
         except BaseException as error:
             self._lift_off(error)
             raise
@@ -351,8 +359,9 @@ class Cell:
             row["torque_permille"] = measurement.torque_permille
         if command is not None:
             if command.q_target is not None:
-                row["q_target_rad"] = command.q_target
-            row.update(command.columns)
+                row["q_target_rad"] = np.array(command.q_target)  # a copy: controllers of users write into theirs
+            for name, value in command.columns.items():
+                row[name] = value.copy() if isinstance(value, np.ndarray) else value
         self.log.add(row)
         if self._observers is not None and self.cycle is not None:
             self._observers.cycle(self.cycle.t_first_ns, measurement, command)

@@ -190,7 +190,9 @@ class DriveGroup:
     def joints(self) -> Vector:
         """Joint angles (6,), rad, at this SYNC; where a report is missing, carried on for a few cycles."""
         now_ns = self._deadline_ns
-        return counts_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
+        q = counts_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
+        q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
+        return q
 
     @property
     def states(self) -> tuple[DriveState, ...]:

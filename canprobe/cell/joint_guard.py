@@ -81,7 +81,10 @@ class JointGuard:
         limits = self._limits
         if not self._range or not self._speed:
             return GuardedTarget(q_target)
-        target = np.asarray(q_target, dtype=np.float64)
+        try:
+            target = np.asarray(q_target, dtype=np.float64)
+        except (TypeError, ValueError):
+            return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected 6 angles, rad")
         wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
         if not all(map(math.isfinite, wanted)):
             return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")

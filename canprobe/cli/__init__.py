@@ -7,6 +7,7 @@ needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -50,6 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
+    _prepare_streams()
     try:
         args = _parser(arguments).parse_args(arguments)
         status = int(args.run(args))
@@ -67,6 +69,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{where}{error.strerror or error}", 3)
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
+
+
+def _prepare_streams() -> None:
+    """Closed standard streams (`>&-`) take and give nothing; in an encoding that has no µ a ? stands in its place."""
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - as long as the process
+        elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+            stream.reconfigure(errors="replace")
 
 
 def _parser(arguments: Sequence[str]) -> Parser:

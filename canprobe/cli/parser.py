@@ -7,6 +7,7 @@ import difflib
 import math
 import re
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import NoReturn
 
 Commands = argparse._SubParsersAction
@@ -46,6 +47,7 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--bus",
         metavar="B",
+        type=word,
         help="lockstep, socketcan, any python-can interface, or config: what CAN_INTERFACE or python-can's files name",
     )
     parser.add_argument(
@@ -71,6 +73,18 @@ def add_bridge(parser: argparse.ArgumentParser) -> None:
 def add_json(parser: argparse.ArgumentParser) -> None:
     """--json: one document on stdout."""
     parser.add_argument("--json", action="store_true", help="print one JSON document")
+
+
+def word(text: str) -> str:
+    """An argument type: any text but none, which is what a shell makes of a variable that is not set."""
+    if not text:
+        raise argparse.ArgumentTypeError("expected a name, got ''")
+    return text
+
+
+def folder_path(text: str) -> Path:
+    """An argument type: a folder; not the current one for want of a name."""
+    return Path(word(text))
 
 
 def channel(text: str) -> tuple[str | None, str]:

@@ -11,7 +11,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Commands, Parser, add_json, add_scene, channel, number_of_32_bits, whole
+from canprobe.cli.parser import Commands, Parser, add_json, add_scene, channel, number_of_32_bits, whole, word
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
 
@@ -36,7 +36,10 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser("scan", help="list the nodes on a bus", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser, optional=True)
     parser.add_argument(
-        "--bus", metavar="B", help="any python-can interface [as CAN_INTERFACE or python-can's files say, or socketcan]"
+        "--bus",
+        metavar="B",
+        type=word,
+        help="any python-can interface [as CAN_INTERFACE or python-can's files say, or socketcan]",
     )
     parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="the channel [can0]")
     parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="[1000000]")

@@ -1,4 +1,4 @@
-"""`canprobe scenes`: the packaged scenes."""
+"""`canprobe scenes`: the packaged scenes, and where their files are."""
 
 from __future__ import annotations
 
@@ -21,12 +21,16 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print name and title of every packaged scene."""
-    from canprobe.scene_loader import packaged_scenes
+    """Print name and title of every packaged scene, and the folder of their files."""
+    from canprobe.scene_loader import packaged_scenes, scenes_folder
 
-    scenes = packaged_scenes()
+    scenes, folder = packaged_scenes(), scenes_folder()
     if args.json:
-        print_json([{"name": name, "title": title} for name, title in scenes])
+        paths = (str(folder / f"{name}.toml") for name, _ in scenes)
+        print_json(
+            [{"name": name, "title": title, "path": path} for (name, title), path in zip(scenes, paths, strict=True)]
+        )
     else:
         print_table(scenes)
+        print(f"in {folder}; copy one to change it")
     return 0

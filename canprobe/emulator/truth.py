@@ -72,5 +72,6 @@ class TruthRecorder:
         return columns
 
     def save(self, path: Path) -> None:
-        """Write the columns as a compressed npz file."""
-        np.savez_compressed(path, **self.arrays())  # type: ignore[arg-type]
+        """Write the columns as a compressed npz file, exactly that file: numpy would append `.npz` to a name."""
+        with path.open("wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **self.arrays())

@@ -31,6 +31,7 @@ from canprobe.planning.turning import plan_motion
 from canprobe.planning.warnings import plan_warnings
 from canprobe.planning.ways_out import ways_out
 from canprobe.scene import Scene
+from canprobe.scene_values import need_scene
 
 SYNC_COUNTER = 0x1019
 
@@ -45,8 +46,10 @@ def make_plan(scene: Scene) -> Plan:
         Nodes, PDOs, bus load, what is left out and why. Its scene has nothing open any more.
 
     Raises:
+        UsageError: this is no scene.
         PlanError: with every reason why the scene does not fit, its numbers and the ways out.
     """
+    need_scene(scene)
     devices, problems = _devices(scene)
     found = _choose(scene, devices) if not problems else None
     ways: list[str] = []

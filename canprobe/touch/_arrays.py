@@ -109,6 +109,8 @@ def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
         raise UsageError(f"{name}: expected numbers of shape {_spell(shape)}, got {values!r}") from error
     if len(array.shape) != len(shape) or any(e is not None and e != g for e, g in zip(shape, array.shape, strict=True)):
         raise UsageError(f"{name}: expected shape {_spell(shape)}, got {array.shape}")
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise UsageError(f"{name}: expected numbers, got masked ones; leave those rows out")
     if not np.isfinite(array).all():
         first = np.argwhere(~np.isfinite(array))[0].tolist()
         raise UsageError(f"{name}: expected finite numbers, got {array[tuple(first)]} at index {first}")

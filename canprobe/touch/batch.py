@@ -81,7 +81,7 @@ def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[A
     size = np.sqrt(np.einsum("ij,ij->i", n, n))
     worst = int(np.argmax(np.abs(size - 1.0)))
     if abs(size[worst] - 1.0) > 1e-6:
-        raise UsageError(f"normals: expected unit vectors, got length {size[worst]:.6g} at index {worst}")
+        raise UsageError(f"normals: expected unit vectors, got length {size[worst]:.9g} at index {worst}")
     if float((n @ n[-1]).min()) <= 0.0:
         raise UsageError("normals: expected all within 90° of the last (one side of a surface), got some beyond")
     return p, n

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike
 
-from canprobe.touch._arrays import Array, upper_root
+from canprobe.touch._arrays import Array, checked, upper_root
 from canprobe.touch.batch import checked_arrays, make_touches
 from canprobe.touch.noise import Correlation, make_noise, mixed
 from canprobe.touch.prior import Prior
@@ -52,7 +52,7 @@ def cramer_rao(
     """
     p, n = checked_arrays(points, normals, 1)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
-    surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(np.asarray(S, dtype=np.float64))
+    surface = S if isinstance(S, SurfaceMatrix) else SurfaceMatrix(checked("S", S, (4, 4)))
     origin = surface.project(p[-1])
     T = surface.contact_frame(origin)
     length, R = touches.extent, T[:3, :3]
@@ -67,8 +67,9 @@ def cramer_rao(
     root = upper_root(np.concatenate([J, stated.rows(length)[0]]))
     wide = 1e30 * np.eye(2)
     decision = decide(root[6:, 6:] * UNIT, wide, math.inf)
-    if decision.rank < 3:
-        return _open_covariance(decision.vectors[:, decision.passed], decision.information[decision.passed], length)
+    known = decision.passed & (decision.information > 0.0)  # points in one place know nothing
+    if not known.all():
+        return _open_covariance(decision.vectors[:, known], decision.information[known], length)
     X = np.linalg.solve(root.T, curvature_jacobian(c).T)
     result: Array = X.T @ X / length**2
     return result

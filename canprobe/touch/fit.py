@@ -81,9 +81,9 @@ def fit_surface(
     if method == "chord":
         return solve_pairs(touches, chord_pairs(touches), "chord")
     if method == "chen1996":
-        if lag < 1:
-            raise UsageError(f"lag: expected at least 1 sample, got {lag}")
-        return solve_paper(touches, lag_pairs(touches, usable_lag(len(p), lag)))
+        if lag < 1 or lag != int(lag):
+            raise UsageError(f"lag: expected at least 1 sample, a whole number of them, got {lag}")
+        return solve_paper(touches, lag_pairs(touches, usable_lag(len(p), int(lag))))
     raise unknown_method(method)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -113,12 +114,17 @@ def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling
     Raises:
         UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
     """
+    if not math.isfinite(coupling):
+        raise UsageError(f"coupling: expected a finite number, got {coupling}")
     return Noise(_one(n, "sigma_point", sigma_point), _one(n, "sigma_normal", sigma_normal), coupling)
 
 
 def _one(n: int, name: str, value: ArrayLike) -> Array:
-    sigma = np.asarray(value, dtype=np.float64)
     wanted = f"{name}: expected a number above 0, ({n},) of them, or definite covariances (3, 3) or ({n}, 3, 3)"
+    try:
+        sigma = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{wanted}, got {value!r}") from error
     if not np.isfinite(sigma).all():
         raise UsageError(f"{wanted}, got a value that is not finite")
     if sigma.shape in ((), (n,)):

@@ -78,3 +78,10 @@ def test_the_commands_write_blf(tmp_path, capsys):
     assert [frame[2:] for frame in read_log(out / "bus.blf")] == lines
     assert [frame[2:] for frame in read_log(tmp_path / "again.blf")] == lines
     assert main(["log", str(tmp_path / "none"), "--to", str(tmp_path / "x.blf")]) == 2
+
+
+@pytest.mark.parametrize("name", ["run.csv", "run.mf4", "run.log.gz"])
+def test_a_suffix_that_names_no_form_is_refused(candump, tmp_path, name):
+    with pytest.raises(UsageError, match=r"expected \.log \(candump\), \.asc, \.blf, \.trc, got \."):
+        convert_log(candump, tmp_path / name)
+    assert not (tmp_path / name).exists()

@@ -19,7 +19,7 @@ from canprobe.bus.configured import configured_bus
 from canprobe.bus.echoes import Echoes
 from canprobe.bus.open import open_port
 from canprobe.cli import main
-from canprobe.errors import UsageError
+from canprobe.errors import InterfaceError, UsageError
 
 SECOND = 1_000_000_000
 
@@ -254,3 +254,12 @@ def test_can_bridge_joins_two_buses_over_the_network(tmp_path):
                 server.join(10)
     assert [words for words in far.said if words[0] == "send"] == [["send", "701", "1", "5"]]
     assert not near.heard.is_set()
+
+
+def test_a_driver_whose_library_is_missing_is_an_interface_error(monkeypatch):
+    def trip(**_):
+        raise NameError("name 'canGetNumberOfChannels' is not defined")  # as kvaser does without canlib
+
+    monkeypatch.setattr("can.Bus", trip)
+    with pytest.raises(InterfaceError, match=r"0: kvaser cannot be opened; is its driver installed.*NameError"):
+        open_port("kvaser", "0", 1_000_000, MonotonicClock())

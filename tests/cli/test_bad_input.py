@@ -150,6 +150,10 @@ def test_emulated_nodes_cannot_be_reached_over_a_virtual_bus_of_one_process(tmp_
         (("up", "press"), "a lockstep bus lives inside one run"),
         (("run", "press", "--channel", "tactile=can1"), "the scene has no channel tactile, only can0"),
         (("run", "press", "--duration", "-1"), "expected seconds above 0"),
+        (("run", "press", "--duration", "1e9"), "duration_s: expected a number above 0 up to 86400, got 1000000000.0"),
+        (("run", "press", "--channel", "ü x"), "channel: expected text without spaces, in ASCII, got 'ü x'"),
+        (("run", "press", "--bus", ""), "argument --bus: expected a name"),
+        (("run", "press", "--out", ""), "argument --out: expected a name"),
         (("scan", "--bus", "lockstep"), "has nobody on it"),
     ],
 )
@@ -185,3 +189,40 @@ def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, t
         assert state_of(int.from_bytes(last[0x180 + node_id][:2], "little")) not in POWERED_STATES
         assert last[0x700 + node_id] == b"\x7f"
     assert last[0x710] == b"\x7f"
+
+
+def test_a_terminal_without_our_letters(tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONIOENCODING", "ascii")
+    for words in (("plan", "cylinder"), ("plan", "cylinder", "--json")):
+        process = start(tmp_path, *words)
+        out, err = process.communicate()
+        assert (process.returncode, err) == (0, "")
+        assert "--json" not in words or json.loads(out)["scene"] == "cylinder"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "out"),
+    [
+        ("eds list >&-", 0, ""),
+        ("eds list <&- 2>&-", 0, "puma260_joint\ntactile_array\ntactile_array_fd\n"),
+        ("plan cylindre 2>&-", 2, ""),  # a complaint does not go to stdout instead
+    ],
+)
+def test_closed_standard_streams(words, status, out, tmp_path):
+    line = f"{sys.executable} -m canprobe {words}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(
+        ["bash", "-c", line], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (status, out, "")
+
+
+def test_truth_and_store_that_have_no_place_are_told_before_anything_is_served(tmp_path):
+    (tmp_path / "file").write_text("")
+    emulate = ("emulate", "press", "--bus", "virtual", "--channel", "x")
+    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", ".")
+    assert line == "canprobe: .: Is a directory"
+    (line,) = lines_of(tmp_path, 3, *emulate, "--store", "file")
+    assert line == "canprobe: file: File exists"
+    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", "file/truth.npz")
+    assert line.startswith("canprobe: file")

@@ -19,7 +19,7 @@ from canprobe.cli.output import print_json, progress_bar
 from canprobe.cli.parser import channel, node_ids
 from canprobe.eds import eds_path
 from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
-from canprobe.scene_loader import packaged_scenes
+from canprobe.scene_loader import load_scene, packaged_scenes
 
 SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
 
@@ -236,9 +236,15 @@ def test_scan_prints_a_table_or_json(calls, capsys):
 
 def test_scenes(capsys):
     assert main(["scenes"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == [n for n, _ in packaged_scenes()]
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == [n for n, _ in packaged_scenes()]
+    folder = Path(last.removeprefix("in ").partition(";")[0])
     assert main(["scenes", "--json"]) == 0
-    assert [scene["name"] for scene in json.loads(capsys.readouterr().out)] == [n for n, _ in packaged_scenes()]
+    scenes = json.loads(capsys.readouterr().out)
+    assert [scene["name"] for scene in scenes] == [n for n, _ in packaged_scenes()]
+    for scene in scenes:
+        path = Path(scene["path"])
+        assert path.parent == folder and load_scene(path) == load_scene(scene["name"])
 
 
 def test_plan_text_and_json(capsys):

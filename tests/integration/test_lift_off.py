@@ -126,6 +126,18 @@ def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
 
+def test_a_controller_that_returns_no_command_is_told_so_off_the_object():
+    class Forgetful(Injected):
+        def command(self, measurement, command):
+            return command if measurement.cycle < self.at else None
+
+    run = Forgetful("press", HOLD_CYCLE, lambda _: None)
+    run.assert_within("interrupt").assert_drives_off()
+    assert str(run.error) == "controller: expected its step to return a Command, got None"
+    assert run.session.truth["force"][run.at] == pytest.approx(2.0, abs=0.2)
+    assert run.session.truth["force"][-1] == 0.0
+
+
 def test_nobody_need_listen():
     """`canprobe up SCENE 2>&1 | tee FILE`: Ctrl-C ends tee first, and each line said from then on is an error."""
 

@@ -10,7 +10,7 @@ import canprobe
 from canprobe.bus.candump import read_candump
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command
-from canprobe.errors import BusError, NodeError, SafetyStop
+from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
 from canprobe.session import Session, resolve_scene
@@ -240,3 +240,32 @@ def test_own_controller_in_ten_lines():
         cell.run(nod)
     assert np.ptp(cell.truth["q"][:, 5]) == pytest.approx(0.2, abs=0.01)
     assert np.ptp(cell.truth["q"][:, 0]) < 1e-3
+
+
+def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
+    session = session_of("free")
+    with pytest.raises(UsageError, match=r"controller: expected a function or something with step.* got 3"), session:
+        session.run(3)
+    assert len(session.cell.log) == 0
+    assert_safe(session)
+
+
+def test_the_log_has_what_was_commanded_whatever_becomes_of_the_controllers_arrays():
+    """A controller that writes each target into the same array, and one that writes into the measurement."""
+    session = session_of("free")
+    target, twice, sent = np.zeros(6), np.zeros(2), []
+
+    def step(measurement):
+        target[:] = measurement.q + 1e-4 * np.sin(measurement.cycle)
+        twice[:] = measurement.cycle
+        sent.append(target.copy())
+        with pytest.raises(ValueError, match="read-only"):
+            measurement.q[0] = 1.0
+        return Command(q_target=target, columns={"twice": twice}, done=len(sent) == 30)
+
+    with session:
+        session.run(step)
+        log = session.cell.log.arrays()
+    rows = np.isfinite(log["twice"][:, 0])
+    assert np.array_equal(log["q_target_rad"][rows], sent)
+    assert np.ptp(log["twice"][rows][:, 0]) == 29

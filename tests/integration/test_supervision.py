@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import signal
 from dataclasses import replace
 from pathlib import Path
@@ -368,11 +369,11 @@ def test_an_own_controller_cannot_leave_the_joints_range():
     assert np.abs(q[-1] - q[FREE_CYCLE - 20]).max() < 1e-3
 
 
-@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(5)])
+@pytest.mark.parametrize("target", [np.full(6, np.nan), np.zeros(5), "home"])
 def test_an_own_controllers_target_that_is_none(target):
     run = own_target(lambda q: target)("free", FREE_CYCLE, lambda _: None, own=True)
     run.assert_within("joint_stop").assert_drives_off()
-    assert "expected 6 finite angles" in str(run.error)
+    assert re.search("expected 6 (finite )?angles", str(run.error))
 
 
 def test_an_own_controllers_jump_is_made_at_the_joints_speed():

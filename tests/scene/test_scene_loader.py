@@ -253,3 +253,35 @@ def _section_class(name):
 def test_defaults_pass_their_own_checks():
     text = dump_scene(Scene(SceneInfo("test"), TaskSettings("free"), arm=ArmSettings(), plant=None))
     assert parse_scene(text).arm == ArmSettings()
+
+
+def test_a_byte_order_mark_and_windows_line_ends_are_read(tmp_path):
+    path = tmp_path / "notepad.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + SCAN.replace("\n", "\r\n").encode())
+    assert load_scene(path) == parse_scene(SCAN)
+
+
+@pytest.mark.parametrize(
+    ("number", "told"),
+    [("1" + "0" * 400, "task.duration_s: expected a number above 0 up to"), ("9" * 5000, "not valid TOML: ")],
+)
+def test_integers_that_no_float_holds(number, told):
+    (problem,) = problems_of(with_line("task", f"duration_s = {number}"))
+    assert problem.startswith(f"file.toml: {told}")
+
+
+def test_lists_nested_beyond_the_parser():
+    (problem,) = problems_of(f"x = {'[' * 5000}{']' * 5000}")
+    assert problem.startswith("file.toml: not valid TOML: ")
+
+
+@pytest.mark.parametrize(
+    ("section", "line", "told"),
+    [
+        ("limits", "joint_speed_share = 1e-9", "a number from 0.001 to 1"),  # the plan divides by it
+        ("sensor", "rate_hz = 1e-9", "a number from 1 to 1000"),
+    ],
+)
+def test_rates_and_shares_of_nearly_nothing(section, line, told):
+    (problem,) = problems_of(with_line(section, line))
+    assert problem == f"file.toml: {section}.{line.split()[0]}: expected {told}, got 1e-09"

@@ -270,6 +270,11 @@ def bad(points=None, normals=None, **kw):
         (bad(sigma_point=np.diag([1e-10, 1e-10, 0.0])), "sigma_point"),
         (bad(method="m1"), "method"),
         (bad(method="chen1996", lag=0), "lag"),
+        (bad(method="chen1996", lag=2.5), "lag"),
+        (bad(points=np.ma.masked_equal(np.eye(5, 3), 1.0)), "points"),
+        (bad(sigma_point="fine"), "sigma_point"),
+        (bad(coupling=np.nan), "coupling"),
+        (lambda: cramer_rao(np.zeros((5, 3)), np.eye(3)[[2] * 5], "S", sigma_point=1, sigma_normal=1), "S"),
         (lambda: Prior("x", 0.0, 1.0, 1.0), "prior.sigma_c13"),
     ],
 )
@@ -281,3 +286,21 @@ def test_errors_name_the_field(call, field):
 def test_a_wrong_method_gets_a_suggestion():
     with pytest.raises(UsageError, match='did you mean "chen1996"'):
         bad(method="chen96")()
+
+
+def test_a_length_that_is_hardly_wrong_is_told_with_the_digits_that_are():
+    with pytest.raises(UsageError, match=r"got length 1\.000002"):
+        bad(normals=np.tile([0.0, 0.0, 1.000002], (5, 1)))()
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+def test_the_bound_of_one_place_is_infinite(rows):
+    C = cramer_rao(
+        np.tile([0.0, 0.0, 0.05], (rows, 1)),
+        np.tile([0.0, 0.0, 1.0], (rows, 1)),
+        np.diag([1, 1, 1, -(0.05**2)]),
+        sigma_point=2e-5,
+        sigma_normal=1e-3,
+    )
+    assert np.isposinf(np.diag(C)).all()
+    assert np.isnan(C[~np.eye(3, dtype=bool)]).all()
