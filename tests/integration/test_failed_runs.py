@@ -76,8 +76,8 @@ def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
 ) -> None:
     (tmp_path / "log.npz").write_text("of an earlier run")
 
-    def full(path: Path, **_: Any) -> None:
-        path.write_bytes(b"PK, and no more")
+    def full(file: Any, **_: Any) -> None:  # a path, or an open file
+        (file.write_bytes if isinstance(file, Path) else file.write)(b"PK, and no more")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(np, "savez_compressed", full)
