@@ -35,6 +35,8 @@ WARM_UP_S = 0.1
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
 FREE_IT = "free it; a run does not begin while the array feels a force"
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
+"""Of the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
 
@@ -210,6 +212,9 @@ class Cell:
             command = step(measurement)
             if not isinstance(command, Command) or not isinstance(command.columns, dict):
                 raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
+            if not OWN_COLUMNS.isdisjoint(command.columns):
+                taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
+                raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
             return command
         except BaseException as error:
             self._lift_off(error)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import deque
 from collections.abc import MutableSequence
 
@@ -33,17 +34,29 @@ class RunLog:
         self._rows.append((self._names.setdefault(names, names), tuple(row.values())))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
-        """Every column that the rows have, (n,) or (n, k)."""
+        """Every column that the rows have, (n,) or (n, k).
+
+        A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
+        """
         columns: dict[str, dict[int, object]] = {}
         for i, (names, values) in enumerate(self._rows):
             for name, value in zip(names, values, strict=True):
                 columns.setdefault(name, {})[i] = value
-        return {name: self._array(column) for name, column in columns.items()}
+        return {name: self._array(name, column) for name, column in columns.items()}
 
-    def _array(self, column: dict[int, object]) -> NDArray[np.float64]:
+    def _array(self, name: str, column: dict[int, object]) -> NDArray[np.float64]:
         known = {i: value for i, value in column.items() if value is not None}
         shape = np.asarray(next(iter(known.values()))).shape if known else ()
         out = np.full((len(self._rows), *shape), np.nan)
+        misfits = 0
         for i, value in known.items():
-            out[i] = value
+            try:
+                out[i] = value
+            except (TypeError, ValueError):
+                misfits += 1
+        if misfits:
+            told = (
+                f"log: {misfits} values of column {name!r} are no numbers of shape {shape}, as its first is: left NaN"
+            )
+            warnings.warn(told, stacklevel=3)
         return out

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from canprobe.cell.cycle import CycleStatistics
 from canprobe.cell.log import RunLog
@@ -40,6 +41,15 @@ def test_what_a_row_lacks_is_nan_and_what_nobody_knows_too():
     np.testing.assert_array_equal(columns["a"], [1.0, np.nan, 3.0])
     np.testing.assert_array_equal(columns["b"], [[np.nan] * 3, [1.0] * 3, [np.nan] * 3])
     np.testing.assert_array_equal(columns["c"], [np.nan] * 3)
+
+
+def test_a_value_of_another_shape_costs_only_itself():
+    log = RunLog()
+    for row in ({"a": np.ones(3)}, {"a": np.ones(2)}, {"a": "x"}, {"a": np.full(3, 2.0)}):
+        log.add(row)
+    with pytest.warns(UserWarning, match=r"2 values of column 'a' are no numbers of shape \(3,\)"):
+        columns = log.arrays()
+    np.testing.assert_array_equal(columns["a"], [[1.0] * 3, [np.nan] * 3, [np.nan] * 3, [2.0] * 3])
 
 
 def test_statistics_of_the_last_cycles():

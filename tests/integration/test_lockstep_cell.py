@@ -251,6 +251,13 @@ def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
     assert_safe(session)
 
 
+def test_a_controller_cannot_write_the_cells_own_columns():
+    session = session_of("free")
+    with pytest.raises(UsageError, match="expected columns of its own, got t_s, which the cell writes itself"), session:
+        session.run(lambda _: Command(columns={"t_s": 0.0}))
+    assert_safe(session)
+
+
 def test_the_log_has_what_was_commanded_whatever_becomes_of_the_controllers_arrays():
     """A controller that writes each target into the same array, and one that writes into the measurement."""
     session = session_of("free")
