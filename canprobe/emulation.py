@@ -62,11 +62,18 @@ def emulate(
     way_out = "end that node, or name others with --nodes"
     busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
     with _free_port(interface, channel, bitrate, busy, way_out, data_bitrate=fast) as port:
-        rehearse(resolved)
+        rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
         _keep(world.nodes, store_folder)
         try:
-            _serve(world.participants, world.nodes, port, say=say, in_realtime=resolved.cycle.realtime)
+            _serve(
+                world.participants,
+                world.nodes,
+                port,
+                say=say,
+                in_realtime=resolved.cycle.realtime,
+                cycles_kept=plan.cycles if truth_path is not None else 0,
+            )
         finally:
             if truth_path is not None and world.recorder is not None:
                 world.recorder.save(truth_path)
@@ -156,13 +163,19 @@ def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
 
 
 def _serve(
-    participants: Sequence[Participant], nodes: Sequence[SlaveNode], port: Port, *, say: Say, in_realtime: bool
+    participants: Sequence[Participant],
+    nodes: Sequence[SlaveNode],
+    port: Port,
+    *,
+    say: Say,
+    in_realtime: bool,
+    cycles_kept: int = 0,
 ) -> None:
     from canprobe.bus.memory import reserve_memory
     from canprobe.bus.priority import DEVICE_PRIORITY, ask_for_processor, realtime
     from canprobe.emulator.serve import serve
 
-    reserve_memory()
+    reserve_memory(cycles_kept)
     port.drain()  # what passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()

@@ -329,8 +329,8 @@ class Session:
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
-        rehearse(self.scene)
-        reserve_memory()
+        rehearse(self.plan)
+        reserve_memory(self.plan.cycles if self._rows_kept is None else self._rows_kept)
         if child is not None:
             child.await_boot_ups(port, self._say)
         if self.scene.cycle.realtime:

@@ -7,24 +7,28 @@ import functools
 import gc
 from collections.abc import Iterator
 
-RESERVE = 32 << 20
-"""Bytes taken in advance: a cycle that keeps its frames and log rows grows by 2 to 4 KiB."""
+BYTES_PER_CYCLE = 4 << 10
+"""A cycle that keeps its frames and log rows grows by 2 to 4 KiB."""
+LEAST_RESERVE, LARGEST_RESERVE = 4 << 20, 32 << 20
+"""Bytes taken in advance; what a run of 20 s at 400 Hz grows by."""
 _SMALL = 480  # bytes; objects up to 512 come from Python's own allocator, larger ones from the C library
 _KEEP_EVERY = (256 << 10) // 512
 
 
 @functools.cache
-def reserve_memory(size: int = RESERVE) -> tuple[bytes, ...]:
+def reserve_memory(cycles: int) -> tuple[bytes, ...]:
     """Let both allocators take memory from the system now, and keep it.
 
-    A first touch of a page costs a microsecond, and a hundred in a virtual machine that has to ask its host.
+    A first touch of a page costs a microsecond, and a hundred in a virtual machine that has to ask its host: there a
+    second for the largest reserve.
 
     Args:
-        size: bytes, half for small objects and half for large ones.
+        cycles: that are going to keep something; for longer runs the rest is taken on the way.
 
     Returns:
         What holds the memory, kept until the process ends; a second call has nothing left to do.
     """
+    size = min(LEAST_RESERVE + cycles * BYTES_PER_CYCLE, LARGEST_RESERVE)  # half for small objects, half for large ones
     blocks = [bytes(_SMALL) for _ in range(size // 2 // 512)]
     for _ in range(2):  # the first raises glibc's limits above this size, the second then comes out of its heap
         bytearray(size // 2)

@@ -165,32 +165,42 @@ class TimedBus(LockstepBus):
         Raises:
             BusError: a participant's deadline never moves on, or more frames wait than may.
         """
-        if len(self._nodes) > 1 and not self._settling and not self._controllers.troubled:
-            self._glide(until_ns)
-        super().run_until_ns(until_ns)
+        if len(self._nodes) < 2 or self._settling or self._controllers.troubled or not self._glide(until_ns):
+            super().run_until_ns(until_ns)
 
-    def _glide(self, until_ns: int) -> None:
-        """Frame after frame without errors, in the order of `settle`; ends early when errors come up."""
+    def _glide(self, until_ns: int) -> bool:
+        """Frame after frame without errors, in the order of `settle`; False where errors came up before the end."""
         self._first_due = super().next_deadline_ns()
         self._stale, self._settling = False, True
+        clock, controllers, length, bit_ns = self.clock, self._controllers, self._length, self._bit_ns
         try:
-            while self.errors is None and not self._controllers.troubled:
-                due = self._first_due
-                if self._flying is None and self._ready:
+            while self.errors is None and not controllers.troubled:
+                due, entry = self._first_due, self._flying
+                if entry is None and self._ready:
                     start = self._free_ns if self._free_ns > self._since_ns else self._since_ns
                     if start <= until_ns and (due is None or start < due):
                         entry = heappop(self._ready)
-                        bits = self._length(*entry[3]) - INTERMISSION_BITS
-                        self._fly(entry, start, start + (bits * self._bit_ns or self._bits_ns(bits)))
-                if self._flying is not None and (due is None or self._end_ns <= due):
-                    if self._end_ns > until_ns:
-                        return
-                    self.clock.move_ns(self._end_ns)
-                    self._finish()
+                        bits = length(*entry[3]) - INTERMISSION_BITS
+                        self._flying, self._hit = entry, False
+                        end = self._end_ns = start + (bits * bit_ns or self._bits_ns(bits))
+                        self._free_ns = end + self._gap_ns
+                        self.busy_ns += self._free_ns - start
+                if entry is not None and (due is None or self._end_ns <= due):
+                    end = self._end_ns
+                    if end > until_ns:
+                        return True
+                    clock.move_ns(end)
+                    if self._hit or self._fifo:
+                        self._finish()
+                    else:
+                        self._flying = None
+                        self.frames += 1
+                        self._hand_over(entry[2], entry[3], end, ())
                 elif due is None or due > until_ns:
-                    return
+                    return True
                 else:
                     self._serve(due)
+            return False
         finally:
             self._settling = False
 
@@ -323,25 +333,33 @@ class TimedBus(LockstepBus):
         can_id, data = frame
         if self.recorder is not None:
             self.recorder(can_id, data, t_ns)
-        changed = False
         listeners = sender.listeners.get(can_id)
-        for receive, receiver in self._listeners_of(sender, can_id) if listeners is None else listeners:
-            if off and receiver in off:
-                continue
+        if listeners is None:
+            listeners = self._listeners_of(sender, can_id)
+        if off:
+            listeners = tuple(listener for listener in listeners if listener[1] not in off)
+        for receive, receiver in listeners:
             answers = receive(can_id, data, t_ns)
             due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
             if due != receiver.due:
-                receiver.due, changed = due, True
+                self._reschedule(receiver, due)
             if answers:
                 self._queue(receiver, answers)
-        if changed:
-            self._first_due = self._earliest()
         stamped = (can_id, data, t_ns)
         if off:
             self._deliver_to_ports(sender, stamped, off)
         else:
             for put in sender.inboxes:
                 put(stamped)
+
+    def _reschedule(self, node: BusNode, due_ns: int | None) -> None:
+        """A participant's deadline has moved."""
+        before, node.due = node.due, due_ns
+        first = self._first_due
+        if due_ns is not None and (first is None or due_ns < first):
+            self._first_due = due_ns
+        elif before == first:
+            self._first_due = self._earliest()
 
     def _deliver_to_ports(self, sender: BusNode, stamped: tuple[int, bytes, int], off: Sequence[BusNode]) -> None:
         for node in self._nodes:

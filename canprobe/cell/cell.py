@@ -12,11 +12,11 @@ from canprobe.bus.port import Port, PortCounters
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
-from canprobe.cell.log import CycleLog, LastRows, RunLog
+from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
-from canprobe.cell.supervision import Limits, Reaction, Seen
+from canprobe.cell.supervision import TOUCH_FORCE, Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch, obeys
@@ -35,8 +35,6 @@ STOP_TIMEOUT_S = 0.5
 FREE_IT = "free it; a run does not begin while the array feels a force"
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
-TOUCHING_N = 0.15
-"""Measured force from which the probe is on an object."""
 
 
 def _hold(_: Measurement) -> Command:
@@ -85,7 +83,7 @@ class Cell:
         observers: Observers | None = None,
         rows_kept: int | None = None,
     ) -> None:
-        self.log: CycleLog = RunLog() if rows_kept is None else LastRows(rows_kept)
+        self.log = RunLog(rows_kept)
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
@@ -318,7 +316,7 @@ class Cell:
     def _lift_off(self, error: BaseException) -> None:
         """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
-        if self._lift_from is None or supervisor.felt() < TOUCHING_N or supervisor.must_stop():
+        if self._lift_from is None or supervisor.felt() < TOUCH_FORCE or supervisor.must_stop():
             return
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
         t_s = supervisor.seen.measurement.t_ns * 1e-9
@@ -364,7 +362,7 @@ class Cell:
     def close(self) -> None:
         """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
         self._try(self._stop_drives)
-        if (force := self.supervisor.felt()) >= TOUCHING_N:
+        if (force := self.supervisor.felt()) >= TOUCH_FORCE:
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
         self._try(self._bring_up.release)
         self._try(self._port.close)

@@ -336,7 +336,7 @@ CONDITIONS: tuple[Condition, ...] = (
         "shape estimator diverges",
         "an answer that is not finite, or curved beyond 1/mm",
         Reaction.DEGRADE,
-        _cycles(1),
+        _cycles(2),
         BY_ITSELF,
         "it starts afresh, the servo keeps its surface; counted",
         count=checks.estimator_restarts,

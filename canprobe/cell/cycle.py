@@ -16,8 +16,9 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.frames import NmtState, pack_heartbeat
 from canprobe.protocol.sync import SyncCounter, pack_sync
 
-TIMED_CYCLES = 4
-"""The computing time of every fourth cycle is taken: in a virtual machine reading a clock costs as much as sending."""
+TIMED_CYCLES = 5
+"""The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending. What
+comes back every 2, 4 or 16 cycles, as images and answers do, then has its share in the sample."""
 
 
 @dataclass(frozen=True, slots=True)

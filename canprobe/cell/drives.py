@@ -5,8 +5,9 @@ The drives hold *motor* positions; the wrist's coupling is undone here and nowhe
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,7 +105,14 @@ class DriveGroup:
         self._aimed: tuple[int, ...] | None = None
         self._words = [0] * len(axes)
         self._steady: tuple[object, ...] | None = None
-        self._frames = command_frames(axes)
+        self._plan = [
+            (
+                frame.cob_id,
+                frame.every_cycle,
+                [(layout.pack, _picker(axis, picks, len(axes))) for axis, layout, picks in frame.parts],
+            )
+            for frame in command_frames(axes)
+        ]
         self._sent: dict[int, tuple[bytes, int]] = {}
         self._repeat = repeat_cycles
         self._pending = 0
@@ -240,15 +248,15 @@ class DriveGroup:
             words = list(map(controlword_toward, self.states, goals, self._words))
             self._steady = key if words == self._words else None
             self._words = words
-        values = list(zip(self._words, targets, strict=True))
+        values = [*self._words, *targets]
         frames = []
-        for frame in self._frames:
+        for cob_id, every_cycle, parts in self._plan:
             data = b""
-            for axis, layout, picks in frame.parts:
-                part = layout.pack(*[values[axis][pick] for pick in picks])
+            for pack, picks in parts:
+                part = pack(*picks(values))
                 data = _overlaid(data, part) if data else part
-            if frame.every_cycle or self._due(frame.cob_id, data):
-                frames.append((frame.cob_id, data))
+            if every_cycle or self._due(cob_id, data):
+                frames.append((cob_id, data))
         return frames
 
     def _goal_of(self, node_id: int) -> DriveState:
@@ -262,6 +270,14 @@ class DriveGroup:
             return False
         self._sent[cob_id] = (data, self._cycle)
         return True
+
+
+def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[int]], Sequence[int]]:
+    """What takes an axis's picks of (controlword, target) from all controlwords and, after them, all targets."""
+    places = [axis + pick * axes for pick in picks]
+    if len(places) == 1:
+        return lambda values: (values[places[0]],)
+    return itemgetter(*places) if places else lambda _: ()
 
 
 def _overlaid(data: bytes, part: bytes) -> bytes:

@@ -13,10 +13,10 @@ from canprobe.cell.build import make_task
 from canprobe.cell.limits import limits_of
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.cell.logged_way_back import TARGET_TOLERANCE, LoggedWayBack, worst_count
+from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.cell.tasks.touch_settings import TOUCH_FORCE
 from canprobe.planning.model import Plan
 from canprobe.robot.puma260 import MODELS
 
@@ -145,7 +145,7 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
         if contact is None:
             continue
         tracker.add(contact)
-        estimate = tracker.answer()
+        estimate = tracker.answer_at_once()
         if estimate is not None and bool(np.all(estimate.observed)):
             sensing.set_kappa(np.asarray(estimate.kappa))
     return tracker, sensing.dropped

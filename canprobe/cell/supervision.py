@@ -23,6 +23,8 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError
 
 Vector = NDArray[np.float64]
+TOUCH_FORCE = 0.15
+"""N; contact is made above it, and gone below half of it: an image of less tells nothing about its place."""
 
 
 class Reaction(Enum):

@@ -13,14 +13,12 @@ from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
 from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.joint_guard import JointGuard
 from canprobe.cell.measurement import Command, Measurement, TactileSample
-from canprobe.cell.supervision import Condition, Contact, Reaction, Seen
+from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Reaction, Seen
 from canprobe.errors import CanprobeError
 
 if TYPE_CHECKING:
     from canprobe.touch.patch import Patch
 
-LEAST_FORCE_N = 0.075
-"""Below it an image tells nothing about where the contact is."""
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
 SECOND_NS = 1_000_000_000
@@ -139,7 +137,7 @@ class Supervisor:
             patch = self._patch_from(measurement.tactile)
             self._force = patch.force
             self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
-            self._off_pad.add(patch.off_pad and patch.force > LEAST_FORCE_N, measurement.tactile.t_sample_ns)
+            self._off_pad.add(patch.off_pad and patch.force > TOUCH_FORCE / 2, measurement.tactile.t_sample_ns)
         return touch_finding(
             Contact(
                 self.seen.limits,

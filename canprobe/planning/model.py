@@ -13,6 +13,8 @@ MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
 HEARTBEAT_CONSUMED_MS = 250
 SYNC_OVERFLOW = 240
+AROUND_S = 3.0
+"""What a task takes besides its phase, about: enabling, the way to the object, settling, letting go."""
 
 NodeKind = Literal["drive", "tactile"]
 Direction = Literal["tpdo", "rpdo"]
@@ -284,6 +286,11 @@ class Plan:
     def traffic(self) -> Traffic:
         """Traffic of the bus that sets the pace: the arm's, or the only one."""
         return self.buses[0].traffic
+
+    @property
+    def cycles(self) -> int:
+        """About how many the whole task takes, with the ways to the object and back."""
+        return round((self.scene.task.duration_s + AROUND_S) * self.sync.rate_hz)
 
     @property
     def node_ids(self) -> tuple[int, ...]:

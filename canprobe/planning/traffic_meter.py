@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 from canprobe.planning.measured import ClassTraffic, Kind, MeasuredTraffic
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus, PlannedPdo
 from canprobe.planning.traffic import SYNCHRONOUS, on_the_wire
+from canprobe.planning.traffic_lateness import Lateness
 from canprobe.planning.wire_bits import exact_frame_bits, unstuffed_frame_bits
 from canprobe.protocol.frame_bits import FD_LENGTHS, best_case_bits, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
-_AT_ONCE = 512
+_AT_ONCE = 4096
 """Frames that are counted together, which is quicker than cycle by cycle."""
 
 
@@ -90,12 +91,10 @@ class TrafficMeter:
     _counts: dict[int, _Count] = field(init=False, default_factory=dict)
     _before: dict[int, _Count] = field(init=False, default_factory=dict)
     _taken: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
-    _cycle: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
+    _enough: int = field(init=False, default=_AT_ONCE)
     _first_ns: int | None = field(init=False, default=None)
     _sync_ns: int = field(init=False, default=0)
-    _by_counter: dict[int, int] = field(init=False, default_factory=dict)
-    _header_id: int | None = field(init=False, default=None)
-    _tactile_ns: int | None = field(init=False, default=None)
+    _lateness: Lateness = field(init=False)
     _unstuffed: dict[int, int] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -103,29 +102,53 @@ class TrafficMeter:
         self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
         self._expected = expected_messages(self.plan, self._bus)
         self._unstuffed = {n: unstuffed_frame_bits(n, self.plan.scene.bus) for n in FD_LENGTHS}
-        self._header_id = min((e.cob_id for e in self._expected.values() if e.kind == "tactile PDO"), default=None)
+        tactile = frozenset(e.cob_id for e in self._expected.values() if e.kind == "tactile PDO")
+        latest = {e.cob_id: e.latest_ns for e in self._expected.values() if e.latest_ns is not None}
+        self._lateness = Lateness(latest, tactile, min(tactile, default=None))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one frame; it is counted with the next SYNC, or after."""
+        """Take one frame; it is counted after the next SYNC, with many others."""
         self._taken.append((can_id, data, t_ns))
-        if len(self._taken) >= _AT_ONCE:
+        if len(self._taken) >= self._enough:
             self._count()
+            self._enough = len(self._taken) + _AT_ONCE
 
     def _count(self) -> None:
-        """Count what was taken, cycle by cycle; the frames since the last SYNC wait."""
-        taken, self._taken = self._taken, []
-        for frame in taken:
-            if frame[0] == SYNC_ID:
-                self._count_cycle()
-                self._begin_cycle(frame)
-            self._cycle.append(frame)
-
-    def _begin_cycle(self, sync: tuple[int, bytes, int]) -> None:
-        _, data, self._sync_ns = sync
+        """Count what was taken up to the last SYNC; the frames since then wait."""
+        taken = self._taken
+        ids = [frame[0] for frame in taken]
+        if SYNC_ID not in ids:
+            return
+        end = len(ids) - 1 - ids[::-1].index(SYNC_ID)
+        begin = 0
         if self._first_ns is None:
-            self._first_ns = self._sync_ns
-            self._before, self._counts = self._counts, {}
-        self._by_counter[data[0] if data else 0] = self._sync_ns
+            begin = ids.index(SYNC_ID)
+            self._tally(taken[:begin], self._before)
+            self._first_ns = taken[begin][2]
+        self._sync_ns = taken[end][2]
+        self._count_cycles(taken[begin:end])
+        self._taken = taken[end:]
+
+    def _count_cycles(self, frames: Sequence[tuple[int, bytes, int]]) -> None:
+        """Count frames from one SYNC to before another, and how far behind theirs they were."""
+        if not frames:
+            return
+        self._tally(frames, self._counts)
+        for delay in self._lateness.take(*zip(*frames, strict=True)):
+            count = self._counts[delay.cob_id]
+            count.late += delay.late
+            count.slowest_ns = max(count.slowest_ns, delay.slowest_ns)
+
+    def _tally(self, frames: Sequence[tuple[int, bytes, int]], counts: dict[int, _Count]) -> None:
+        """Add frames and their bits."""
+        for (can_id, n_data), frames_of in Counter([(can_id, len(data)) for can_id, data, _ in frames]).items():
+            count = counts.setdefault(can_id, _Count())
+            count.frames += frames_of
+            count.bits += 0 if self.exact else frames_of * self._unstuffed[n_data]
+        if self.exact:
+            bus = self.plan.scene.bus
+            for can_id, data, _ in frames:
+                counts[can_id].bits += exact_frame_bits(can_id, data, bus)
 
     @property
     def frames(self) -> int:
@@ -140,7 +163,7 @@ class TrafficMeter:
     def _all_counts(self) -> list[_Count]:
         self._count()
         waiting: dict[int, _Count] = {}
-        self._tally(waiting)
+        self._tally(self._taken, waiting)
         return [*self._before.values(), *self._counts.values(), *waiting.values()]
 
     def report(self) -> MeasuredTraffic:
@@ -148,7 +171,7 @@ class TrafficMeter:
         self._count()
         counts = self._counts if self._first_ns is not None else {}
         ns = 0 if self._first_ns is None else self._sync_ns - self._first_ns
-        seen = Counter(can_id for can_id, _, _ in self._cycle)
+        seen = Counter(can_id for can_id, _, _ in self._taken)
         for part in (self._before, self._counts):
             seen.update({can_id: one.frames for can_id, one in part.items()})
         return MeasuredTraffic(
@@ -163,37 +186,6 @@ class TrafficMeter:
             error_frames=self.error_frames,
             planned_worst=self._bus.traffic.load,
         )
-
-    def _count_cycle(self) -> None:
-        """Count the frames since the last SYNC, and how far behind it they were."""
-        counts, expectations = self._counts, self._expected
-        self._tally(counts)
-        for can_id, data, t_ns in self._cycle:
-            expected = expectations.get(can_id)
-            if expected is None or expected.latest_ns is None:
-                continue
-            trigger = self._sync_ns if expected.kind != "tactile PDO" else self._trigger(expected, data)
-            if trigger is not None:
-                took, count = t_ns - trigger, counts[can_id]
-                count.late += took > expected.latest_ns
-                count.slowest_ns = max(count.slowest_ns, took)
-        self._cycle.clear()
-
-    def _tally(self, counts: dict[int, _Count]) -> None:
-        """Add the frames since the last SYNC."""
-        bus, exact, unstuffed = self.plan.scene.bus, self.exact, self._unstuffed
-        for can_id, data, _ in self._cycle:
-            count = counts.get(can_id)
-            if count is None:
-                count = counts[can_id] = _Count()
-            count.frames += 1
-            count.bits += exact_frame_bits(can_id, data, bus) if exact else unstuffed[len(data)]
-
-    def _trigger(self, expected: Expected, data: bytes) -> int | None:
-        """When the SYNC behind a tactile PDO was through: the one that its header names."""
-        if expected.cob_id == self._header_id:
-            self._tactile_ns = self._by_counter.get(data[1]) if len(data) == 8 else None
-        return self._tactile_ns
 
     def _classes(self, counts: dict[int, _Count], seconds: float) -> Iterator[ClassTraffic]:
         found: dict[Kind, ClassTraffic] = {}

@@ -22,7 +22,7 @@ class CycleTimes:
     Attributes:
         period_ns: of SYNC, as asked.
         lateness_ns: of each SYNC behind its deadline (n,), ns.
-        compute_ns: from the last TPDO to the RPDOs, of every fourth cycle (m,), ns.
+        compute_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
         latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
         overruns: cycles woken more than half a period late.
         missed: TPDOs that a cycle did without.

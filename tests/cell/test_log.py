@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from canprobe.cell.cycle import CycleStatistics
-from canprobe.cell.log import LastRows, RunLog
+from canprobe.cell.log import RunLog
 
 
 def rows(count):
@@ -20,15 +20,26 @@ def filled(log, count):
 
 
 def test_the_last_rows_are_those_of_the_whole_log():
-    whole, last = filled(RunLog(), 50).arrays(), filled(LastRows(7), 50)
+    whole, last = filled(RunLog(), 50).arrays(), filled(RunLog(7), 50)
     assert len(last) == 7
     for name, column in last.arrays().items():
         np.testing.assert_array_equal(column, whole[name][-7:])
 
 
 def test_fewer_rows_than_are_kept():
-    assert filled(LastRows(7), 3).arrays()["q_rad"].shape == (3, 6)
-    assert LastRows(7).arrays() == {}
+    assert filled(RunLog(7), 3).arrays()["q_rad"].shape == (3, 6)
+    assert RunLog(7).arrays() == {}
+
+
+def test_what_a_row_lacks_is_nan_and_what_nobody_knows_too():
+    log = RunLog()
+    for row in ({"a": 1.0}, {"b": np.ones(3), "a": None}, {"a": 3, "c": None}):
+        log.add(row)
+    columns = log.arrays()
+    assert list(columns) == ["a", "b", "c"]
+    np.testing.assert_array_equal(columns["a"], [1.0, np.nan, 3.0])
+    np.testing.assert_array_equal(columns["b"], [[np.nan] * 3, [1.0] * 3, [np.nan] * 3])
+    np.testing.assert_array_equal(columns["c"], [np.nan] * 3)
 
 
 def test_statistics_of_the_last_cycles():

@@ -28,7 +28,7 @@ def bus(monkeypatch):
 @pytest.fixture
 def serve(bus, monkeypatch):
     """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
-    monkeypatch.setattr("canprobe.emulation.rehearse", lambda scene: None)
+    monkeypatch.setattr("canprobe.emulation.rehearse", lambda plan: None)
     monkeypatch.setattr("canprobe.bus.priority.ask_for_processor", lambda: False)
     nodes = []
 

@@ -19,7 +19,7 @@ def served(monkeypatch):
     def emulate(act, *options):
         bus = LockstepBus(VirtualClock())
         monkeypatch.setattr("canprobe.bus.open.open_port", lambda *_, **__: bus.port())
-        monkeypatch.setattr("canprobe.emulation.rehearse", lambda scene: None)
+        monkeypatch.setattr("canprobe.emulation.rehearse", lambda plan: None)
         monkeypatch.setattr("canprobe.bus.priority.ask_for_processor", lambda: False)  # not for the tests' own process
         monkeypatch.setattr("canprobe.emulator.serve.serve", lambda participants, port, stop: act(participants))
         return main(["emulate", "free", "--channel", "vcan0", "--nodes", "1,2", *options])

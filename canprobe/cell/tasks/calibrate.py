@@ -9,13 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.measurement import Command, Measurement
-from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervision import TOUCH_FORCE, Contact, Limits
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion
 from canprobe.cell.tasks.probing import ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.touch_settings import TOUCH_FORCE, Phase
+from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
 from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample

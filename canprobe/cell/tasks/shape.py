@@ -8,10 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.touch.estimators.base import answering
+
 if TYPE_CHECKING:
     from canprobe.touch.contact import ContactSample
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.estimators import Estimator
+    from canprobe.touch.estimators.base import Answering
 
 
 GAP_S = 0.1
@@ -38,8 +41,8 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    A contact is taken and an answer worked out by calls of their own: together they take longer than either, and the
-    loop has a cycle between two images for the answer.
+    A contact is taken and an answer worked out by calls of their own: together they take longer than either. An answer
+    comes in parts, one a call, as the whole would hold up the cycle in which it is due.
 
     Args:
         estimator: the online estimator.
@@ -63,12 +66,15 @@ class ShapeTracker:
         self._gap_s = gap_s
         self._last: ContactSample | None = None
         self._due = False
+        self._answering: Answering | None = None
+        self._place = (0.0, 0.0)
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
         if self._last is not None:
             if sample.t_s - self._last.t_s > self._gap_s:
                 self._estimator.reset()
+                self._answering = None
             else:
                 self.travelled_m += float(np.linalg.norm(sample.p_base - self._last.p_base))
         self._last = sample
@@ -77,17 +83,36 @@ class ShapeTracker:
         self._due = len(self.samples) % self._every == 0
 
     def answer(self) -> SurfaceEstimate | None:
-        """The estimate at the last contact, once, where one is due and can be given."""
-        if not self._due or self._last is None:
+        """Work on the estimate that is due; it, once, at the contact after which it was due, where it can be given."""
+        if self._answering is None:
+            if not self._due or self._last is None:
+                return None
+            self._due = False
+            self._place = self._last.t_s, self.travelled_m
+            self._answering = answering(self._estimator)
+        try:
+            next(self._answering)
+        except StopIteration as end:
+            self._answering = None
+            return self._told(end.value)
+        return None
+
+    def answer_at_once(self) -> SurfaceEstimate | None:
+        """All parts of the estimate that is due."""
+        estimate = self.answer()
+        while self._answering is not None:
+            estimate = self.answer()
+        return estimate
+
+    def _told(self, estimate: SurfaceEstimate | None) -> SurfaceEstimate | None:
+        """An estimate with its place on record; None where it has diverged."""
+        if estimate is None:
             return None
-        self._due = False
-        estimate = self._estimator.estimate()
-        if estimate is not None and has_diverged(estimate):
+        if has_diverged(estimate):
             self.restarts += 1
             self._estimator.reset()
             return None
-        if estimate is not None:
-            self.records.append(ShapeRecord(self._last.t_s, self.travelled_m, estimate))
+        self.records.append(ShapeRecord(*self._place, estimate))
         return estimate
 
 
@@ -103,5 +128,5 @@ def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every
     tracker = ShapeTracker(estimator, every)
     for sample in samples:
         tracker.add(sample)
-        tracker.answer()
+        tracker.answer_at_once()
     return tracker.records

@@ -8,12 +8,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.supervision import Limits
+from canprobe.cell.supervision import TOUCH_FORCE, Limits
 from canprobe.touch.servo import SurfaceGains
 
 Vector = NDArray[np.float64]
-TOUCH_FORCE = 0.15
-"""N; contact is made above it."""
 
 
 class Phase(IntEnum):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -62,6 +64,34 @@ class Estimator(Protocol):
 
     def reset(self) -> None:
         """Forget everything but the settings: contact was lost, or the array was reset."""
+
+
+Answering = Generator[None, None, SurfaceEstimate | None]
+"""An answer in parts: each `next` works out one, the last returns it."""
+
+
+def answering(estimator: Estimator) -> Answering:
+    """The answer of any estimator, in as many parts as it has: one, or those of its own `answering`.
+
+    Samples may be added between two parts.
+    """
+    parts: Callable[[], Answering] = getattr(estimator, "answering", None) or partial(_in_one, estimator)
+    return parts()
+
+
+def _in_one(estimator: Estimator) -> Answering:
+    yield from ()
+    return estimator.estimate()
+
+
+def whole(parts: Answering) -> SurfaceEstimate | None:
+    """The answer once all of its parts are worked out."""
+    while True:
+        try:
+            next(parts)
+        except StopIteration as end:
+            answer: SurfaceEstimate | None = end.value
+            return answer
 
 
 class Gate:

@@ -18,7 +18,7 @@ import numpy as np
 from canprobe.touch._arrays import Array
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate, is_umbilic
-from canprobe.touch.estimators.base import Dropped, Estimator
+from canprobe.touch.estimators.base import Answering, Dropped, Estimator, answering, whole
 from canprobe.touch.evidence import TO_Q
 
 SPAN = 0.5
@@ -62,7 +62,11 @@ class FollowingEstimator:
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
-        answer = self._inner.estimate()
+        return whole(self.answering())
+
+    def answering(self) -> Answering:
+        """The same in the parts of the estimator inside."""
+        answer = yield from answering(self._inner)
         if answer is None or answer.rank < 3:
             return answer
         if self._place is not None:

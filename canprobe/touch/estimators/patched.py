@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Dropped, Estimator
+from canprobe.touch.estimators.base import Answering, Dropped, Estimator, answering, whole
 from canprobe.touch.patch_curvature import PatchCurvature
 from canprobe.touch.patch_fusion import fuse, patch_estimate
 
@@ -39,8 +39,13 @@ class PatchedEstimator:
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
-        motion = self._motion.estimate()
+        return whole(self.answering())
+
+    def answering(self) -> Answering:
+        """The same in two parts: that of the motion, then the patch's, which takes as long."""
+        motion = yield from answering(self._motion)
         if motion is not None:
+            yield
             return fuse(motion, self.patch, self._length)
         return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
 

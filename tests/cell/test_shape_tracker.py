@@ -1,0 +1,108 @@
+"""When the estimator in the loop is asked, and how its answer comes in parts."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from canprobe.cell.tasks.shape import SHARPEST, ShapeTracker, replay_samples
+
+
+def contact(t_s, x=0.0):
+    return SimpleNamespace(t_s=t_s, p_base=np.array([x, 0.0, 0.0]))
+
+
+def estimate(curvature=10.0):
+    return SimpleNamespace(
+        kappa=np.array([curvature, 0.0]), observed=np.array([True, True]), S=np.eye(4), T_frame_contact=np.eye(4)
+    )
+
+
+class InOne:
+    """Tells an answer that names how many samples it rests on."""
+
+    def __init__(self, curvature=10.0):
+        self.n, self.resets, self.asked, self._curvature = 0, 0, 0, curvature
+
+    def add(self, _):
+        self.n += 1
+
+    def reset(self):
+        self.n, self.resets = 0, self.resets + 1
+
+    def estimate(self):
+        self.asked += 1
+        return estimate(self._curvature)
+
+
+class InThree(InOne):
+    def answering(self):
+        yield
+        yield
+        return self.estimate()
+
+
+def taken(tracker, times):
+    for t in times:
+        tracker.add(contact(t, 25e-3 * t))
+
+
+def test_an_answer_of_one_part_is_there_at_once_and_once():
+    tracker = ShapeTracker(InOne(), every=2)
+    taken(tracker, [0.0])
+    assert tracker.answer() is None
+    taken(tracker, [0.005])
+    assert tracker.answer() is not None and tracker.answer() is None
+
+
+def test_each_call_works_out_one_part():
+    tracker = ShapeTracker(InThree(), every=1)
+    taken(tracker, [0.0])
+    assert [tracker.answer() is not None for _ in range(5)] == [False, False, True, False, False]
+
+
+def test_an_answer_stands_at_the_contact_after_which_it_was_due():
+    tracker = ShapeTracker(InThree(), every=2)
+    taken(tracker, [0.0, 0.005])
+    tracker.answer()
+    taken(tracker, [0.01])
+    tracker.answer()
+    assert tracker.answer() is not None
+    (record,) = tracker.records
+    assert record.t_s == 0.005 and record.travelled_m == pytest.approx(25e-3 * 0.005)
+
+
+def test_what_is_due_meanwhile_is_begun_afterwards():
+    estimator = InThree()
+    tracker = ShapeTracker(estimator, every=1)
+    taken(tracker, [0.0])
+    tracker.answer()
+    taken(tracker, [0.005])
+    answers = [tracker.answer() is not None for _ in range(6)]
+    assert answers == [False, True, False, False, True, False] and estimator.asked == 2
+
+
+def test_a_new_contact_makes_an_unfinished_answer_void():
+    estimator = InThree()
+    tracker = ShapeTracker(estimator, every=2)
+    taken(tracker, [0.0, 0.005])
+    tracker.answer()
+    taken(tracker, [1.0])
+    assert estimator.resets == 1
+    assert [tracker.answer() for _ in range(4)] == [None] * 4 and not tracker.records
+
+
+def test_a_diverged_answer_starts_the_estimator_afresh():
+    estimator = InThree(curvature=2.0 * SHARPEST)
+    tracker = ShapeTracker(estimator, every=1)
+    taken(tracker, [0.0])
+    assert tracker.answer_at_once() is None
+    assert tracker.restarts == 1 and estimator.resets == 1 and not tracker.records
+
+
+def test_recorded_contacts_are_answered_one_by_one():
+    samples = [contact(0.005 * k) for k in range(10)]
+    for estimator in (InOne(), InThree()):
+        assert [r.t_s for r in replay_samples(estimator, samples, 3)] == [s.t_s for s in samples[2::3]]
