@@ -28,15 +28,15 @@ from canprobe.touch.nonlinear import robust
 from canprobe.touch.quadric import UNIT, Design, Linearised, gradient_rows, linearise, value_rows
 from canprobe.touch.terms import DEGREE, terms
 
-NONE, USUAL, TAIL = 0.90, 0.09, 0.01
+NONE, USUAL, TAIL = 0.88, 0.11, 0.01
 """Prior weights of: no misfit; a usual one; one that is only believed when seen.
 
-Nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round, or
-nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs that.
+Some nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round,
+or nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs that.
 """
-CHANGES = (0.1, 0.3)
+CHANGES = (0.1, 0.5)
 """A usual change of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
-outer side and 0.4 on top. Slower ones change K by some percent over a path of a radius."""
+outer side and 0.4 on top, a fillet more. Slower ones change K by some percent over a path of a radius."""
 BLURRED = 5e-3
 """κσ_p, rad: a point's noise over the least radius. Up to here `NONE` holds, from twice as much on a usual misfit is
 certain. A path on which points err by so much of the radius says next to nothing about cubic terms, so the prior alone
@@ -138,8 +138,9 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float =
 
 def _prior(blur: float) -> Array:
     """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
-    caution = min(max(blur / BLURRED - 1.0, 0.0), 1.0)
-    result: Array = _PRIOR + caution * (_CAUTIOUS - _PRIOR)
+    if blur <= BLURRED:
+        return _PRIOR
+    result: Array = _PRIOR + min(blur / BLURRED - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
     return result
 
 
