@@ -17,6 +17,7 @@ likelihood of a linear model.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -27,10 +28,19 @@ from canprobe.touch.nonlinear import robust
 from canprobe.touch.quadric import UNIT, Design, Linearised, gradient_rows, linearise, value_rows
 from canprobe.touch.terms import DEGREE, terms
 
-NONE, USUAL, TAIL = 0.85, 0.12, 0.03
-"""Prior weights of: no misfit; a usual one; one that is only believed when seen."""
-CHANGES = (0.05, 0.15, 0.5)
-"""A usual change of curvature along a surface: dK/ds over ‖K‖²."""
+NONE, USUAL, TAIL = 0.88, 0.11, 0.01
+"""Prior weights of: no misfit; a usual one; one that is only believed when seen.
+
+Some nine in ten places on what is felt are taken to be like a quadric over a path no longer than a radius: flat, round,
+or nearly so. An edge or a seam is one in a hundred; it shows, and then its likelihood outweighs that.
+"""
+CHANGES = (0.1, 0.5)
+"""A usual change of curvature along a surface, dK/ds over ‖K‖²: a torus 2.5 times as wide as its tube has 0.1 on its
+outer side and 0.4 on top, a fillet more. Slower ones change K by some percent over a path of a radius."""
+BLURRED = 5e-3
+"""κσ_p, rad: a point's noise over the least radius. Up to here `NONE` holds, from twice as much on a usual misfit is
+certain. A path on which points err by so much of the radius says next to nothing about cubic terms, so the prior alone
+answers for them, and it is the cautious one: there a region may hold the truth too often, not too seldom."""
 EVIDENCE = 10.0 ** np.arange(1.0, 9.0)
 """Variances of the tail over that of the best known of the terms."""
 LEFT_OUT = 0.35
@@ -46,9 +56,8 @@ _NEVER_LESS = 0.1
 _USUAL = np.concatenate([[0.0], np.square(CHANGES) / 36.0])
 _VARIANCES = np.concatenate([_USUAL, EVIDENCE])
 """No misfit, usual ones per ‖K‖⁴ (the length being 1), and the tail."""
-_PRIOR = np.concatenate(
-    [[NONE], np.full(len(CHANGES), USUAL / len(CHANGES)), np.full(len(EVIDENCE), TAIL / len(EVIDENCE))]
-)
+_PRIOR = np.repeat([NONE, USUAL / len(CHANGES), TAIL / len(EVIDENCE)], [1, len(CHANGES), len(EVIDENCE)])
+_CAUTIOUS = np.repeat([0.0, (NONE + USUAL) / len(CHANGES), TAIL / len(EVIDENCE)], [1, len(CHANGES), len(EVIDENCE)])
 
 
 class Corrected(NamedTuple):
@@ -57,7 +66,8 @@ class Corrected(NamedTuple):
     Attributes:
         c: (9,) parameters.
         root: (9, 9) upper triangular information root.
-        misfit: probability of there being one; `1 − NONE` where the residuals cannot tell.
+        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals cannot
+            tell.
         trusted: the change of K is small enough for a linear step.
     """
 
@@ -89,7 +99,13 @@ def scales(curvature: float) -> Array:
     return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _NEVER_LESS))
 
 
-def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
+def sharpest(c: Array) -> float:
+    """Largest |κ| · length of parameters (9,)."""
+    c11, c12, c22 = c[6:].tolist()
+    return float(abs(c11 + c22) + math.hypot(c11 - c22, 2.0 * c12))
+
+
+def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float = 0.0) -> Averaged:
     """Average over the variance of the terms, given in directions in which the data's information is diagonal.
 
     Args:
@@ -97,6 +113,7 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
         s: (9,) its score; terms `s / m` fit best.
         carried: (9, 9) what a unit of each puts the parameters off by, with the sign turned.
         curvature: ‖K‖ · length.
+        blur: κσ_p, rad.
     """
     variance = _VARIANCES.copy()
     variance[: len(_USUAL)] *= curvature**4
@@ -104,7 +121,8 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
     wider = 1.0 + variance[:, None] * m
     share = variance[:, None] / wider
     likelihood = 0.5 * (share @ (s * s) - np.log(wider).sum(axis=1))
-    weight = _PRIOR * np.exp(likelihood - likelihood.max())
+    evidence = np.exp(likelihood - likelihood.max())
+    weight = _prior(blur) * evidence
     weight /= weight.sum()
     shifts = -(share * s) @ carried.T
     mean = weight @ shifts
@@ -114,7 +132,16 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float) -> Averaged:
     changed = float(weight @ np.square(shifts[:, 6:]) @ _PER_SQUARE)
     spread.flat[60::10] += LEFT_OUT**2 * changed / _PER_SQUARE  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
-    return Averaged(mean, spread, left, 1.0 - float(weight[0]), trusted)
+    shown = 1.0 - NONE * float(evidence[0] / (_PRIOR @ evidence))
+    return Averaged(mean, spread, left, shown, trusted)
+
+
+def _prior(blur: float) -> Array:
+    """Prior weights of no misfit, the usual ones and the tail, at κσ_p (rad)."""
+    if blur <= BLURRED:
+        return _PRIOR
+    result: Array = _PRIOR + min(blur / BLURRED - 1.0, 1.0) * (_CAUTIOUS - _PRIOR)
+    return result
 
 
 def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corrected:
@@ -134,7 +161,8 @@ def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corr
     carried = H @ (J.T @ E)  # terms a put the quadric off by −carried a
     m, U = np.linalg.eigh(E.T @ (E - J @ carried))  # what the nine parameters and their prior cannot explain of them
     s = U.T @ (carried.T @ slack - E.T @ r)
-    found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature)
+    blur = sharpest(c) * math.sqrt(float(d.point_variance.mean()))
+    found = averaged(np.maximum(m, 0.0), s, carried @ U, curvature, blur)
     lower = np.asarray(np.linalg.cholesky(H + found.spread), dtype=np.float64)
     return Corrected(c + found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
 

@@ -120,3 +120,22 @@ class TestWork:
             estimator.add(sample)
             estimator.estimate()
         assert not evaluations
+
+
+def test_the_first_step_of_a_path_at_pace_is_not_crowded_that_of_a_contact_at_rest_is(truth):
+    """Points from before there is a mean are no part of the first step's length; 16 on one spot are believed less."""
+    counted = []
+    for waits in (0, 40):
+        path = truth.path("cylinder")
+        rest = np.zeros(waits, dtype=int)
+        order = np.concatenate([rest, np.arange(len(path.points))])
+        settings = {"sigma_point": 1e-6, "sigma_normal": 1e-3, "memory_m": MEMORY, "window": 160}
+        estimator = make_estimator("recursive", probe_radius=0.04, **settings)
+        for i, sample in enumerate(truth.samples(path.points[order], path.normals[order])):
+            estimator.add(sample)
+            if (found := estimator.estimate()) is not None:
+                counted.append((found.samples, min(i + 1, 16)))
+                break
+    (at_pace, taken), (at_rest, kept) = counted
+    assert at_pace == taken
+    assert at_rest < 0.8 * kept

@@ -7,13 +7,14 @@ the samples say at terms of zero; they are never put into the filter, only into 
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from canprobe.touch._arrays import Array, eigen, solved
 from canprobe.touch.estimators.score import Score
-from canprobe.touch.misfit import averaged, scales
+from canprobe.touch.misfit import averaged, scales, sharpest
 from canprobe.touch.noise import Correlation
 from canprobe.touch.nonlinear import size_of
 from canprobe.touch.terms import shifted
@@ -44,10 +45,12 @@ class Expected(NamedTuple):
     Attributes:
         noise: variance of the residuals over what is stated. Generous deviations make a misfit look like noise.
         curvature: least ‖K‖ · length whose usual changes are reckoned with: a flat place need not lie on a plane.
+        sigma_point: stated standard deviation of a point over the length.
     """
 
     noise: float = 1.0
     curvature: float = 0.0
+    sigma_point: float = 0.0
 
 
 AS_STATED = Expected()
@@ -123,6 +126,7 @@ class LeftOut:
         off = X[:9]
         off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
         off = off @ U
-        found = averaged(np.maximum(values, 0.0) / expected.noise, s / expected.noise, -off, curvature)
+        blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
+        found = averaged(np.maximum(values, 0.0) / expected.noise, s / expected.noise, -off, curvature, blur)
         both = H @ shared[:9] @ (weighted @ U * found.share) @ off.T
         return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)

@@ -144,7 +144,8 @@ class RecursiveEstimator:
     def _expected(self) -> Expected:
         """Stated noise counts unless it is twice the usual; a probe feels surfaces about as curved as itself."""
         usual = self._change.usual
-        return Expected(usual if usual < GENEROUS else 1.0, self._coupling * self._memory)
+        noise = usual if usual < GENEROUS else 1.0
+        return Expected(noise, self._coupling * self._memory, self._gate.sigma_point / self._memory)
 
     def _notes(self) -> tuple[str, ...]:
         changes, doubtful = self._change.alarms, round(self._doubtful)
@@ -201,7 +202,7 @@ class RecursiveEstimator:
 
     def _weigh(self, moved: float, weight: Array) -> float:
         """Count a step; the weight of each sample where they are crowded, else 1."""
-        crowd = min(1.0, self._crowd * moved / len(weight))
+        crowd = min(1.0, self._crowd * moved / min(len(weight), self._travel.measured))
         kept = math.exp(-moved / self._memory)
         self._doubtful = kept * self._doubtful + np.count_nonzero(weight < 1.0)
         self._spread.fade(kept)

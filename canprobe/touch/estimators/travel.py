@@ -26,11 +26,13 @@ class Travel:
     Attributes:
         total: path so far, m.
         weight: of the last point: below 1 where it lies several times further from the median than points usually do.
+        measured: points over which the path was measured so far; the first ones, before there is a mean, are not.
     """
 
     def __init__(self, step: float) -> None:
         self.total = 0.0
         self.weight = 1.0
+        self.measured = 0
         self._usual2 = 0.0
         self._step2 = step * step
         self._last: deque[list[float]] = deque(maxlen=_MEDIAN_OF)
@@ -51,6 +53,7 @@ class Travel:
         if self._count < _MEAN_OF:
             self._mark = self._mean
             return 0.0
+        self.measured += 1
         u, v, w = self._mark
         square = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2
         if square < self._step2:
