@@ -7,7 +7,7 @@ Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.emulator.application import Application
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
@@ -53,7 +53,7 @@ class PdoEngine:
         for rules in _discover(core, 0x1800, transmits=True):
             self._tpdos.append(tpdo := Tpdo(core, rules))
             self._watch(rules, tpdo)
-        core.dictionary.written = self.event_key
+        core.dictionary.written = self._written
         core.dictionary.on_write(0x1007, lambda _sub, _value: self._rebuild())
 
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
@@ -129,13 +129,13 @@ class PdoEngine:
 
     def event(self, index: int, subindex: int = 0) -> None:
         """A value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
-        self.event_key(key_of(index, subindex))
+        self._written((key_of(index, subindex),))
 
-    def event_key(self, key: int) -> None:
-        """As `event`, by dictionary key."""
+    def _written(self, keys: Sequence[int]) -> None:
+        """As `event`, of values that changed together: one event for each TPDO."""
         if self._core.state is NmtState.OPERATIONAL:
             for tpdo in self._on_event:
-                if key in tpdo.keys:
+                if any(key in tpdo.keys for key in keys):
                     tpdo.event(self._core.now_ns)
 
     def sync(self, t_ns: int, counter: int, elapsed: int) -> None:
