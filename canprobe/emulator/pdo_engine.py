@@ -15,22 +15,28 @@ from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.pdo_rules import PdoRules
 from canprobe.emulator.rpdo import Rpdo
-from canprobe.emulator.tpdo import BUFFERED, Tpdo
+from canprobe.emulator.tpdo import BUFFERED, Packing, Tpdo
 from canprobe.protocol.frames import NmtState
 
 Sampler = Callable[[int], None]
 
 
 class _Group:
-    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`."""
+    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`.
 
-    __slots__ = ("every", "first", "samplers", "start", "tpdos")
+    Attributes:
+        samplers: bring their values up to date.
+        packing: how each is then packed.
+    """
+
+    __slots__ = ("every", "first", "packing", "samplers", "start", "tpdos")
 
     def __init__(self, every: int, start: int) -> None:
         self.every, self.start = every, start
         self.first: int | None = None
         self.tpdos: list[Tpdo] = []
         self.samplers: list[Sampler] = []
+        self.packing: list[Packing] = []
 
 
 class PdoEngine:
@@ -146,6 +152,7 @@ class PdoEngine:
             counter: its counter, 0 without one.
             elapsed: SYNCs since the last one heard, lost ones included (the counter tells).
         """
+        core = self._core
         self._sync_ns = t_ns
         count = self._count = self._count + elapsed
         for rpdo in self._waiting:
@@ -158,8 +165,9 @@ class PdoEngine:
             if group.first is not None and (count - group.first) % group.every == 0:
                 for sampler in group.samplers:
                     sampler(t_ns)
-                for tpdo in group.tpdos:
-                    tpdo.send()
+                values, append = core.dictionary.values, core.out.append
+                for cob_id, pack, fetch in group.packing:
+                    append((cob_id, pack(*fetch(values))))
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
@@ -187,6 +195,7 @@ class PdoEngine:
         self._groups = list(groups.values())
         for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
             group.samplers = self._samplers_of(group.tpdos)
+            group.packing = [tpdo.packing for tpdo in group.tpdos]
             group.first = phases.get((group.every, group.start), None if group.start else self._count)
 
     def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:
