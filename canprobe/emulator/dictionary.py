@@ -94,29 +94,10 @@ class Dictionary:
         self._refreshers[index] = refresh
 
     def slot(self, key: int) -> Slot:
-        """Where a value of a cyclic RPDO goes. Hooks and checks hung in later are not seen."""
+        """What `write_value` of a cyclic RPDO needs. Hooks and checks hung in later are not seen."""
         entry, index = self.entries[key], key >> 8
         low, high = -inf if entry.low is None else entry.low, inf if entry.high is None else entry.high
         return key, key & 0xFF, low, high, tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
-
-    def write_slots(self, slots: tuple[Slot, ...], values: Iterable[int]) -> None:
-        """Store the values of an RPDO as `write_value` does each; one that is refused is dropped."""
-        stored, told = self.values, []
-        for value, (key, subindex, low, high, checks, hooks) in zip(values, slots, strict=True):
-            if not low <= value <= high:
-                continue
-            try:
-                for check in checks:
-                    check(subindex, value)
-                stored[key] = value
-                for hook in hooks:
-                    hook(subindex, value)
-            except SdoAbort:
-                continue
-            if key in self.watched:
-                told.append(key)
-        if told:
-            self.written(told)
 
     def find(self, index: int, subindex: int) -> Entry:
         """The entry, or SdoAbort: no object, or no such subindex of it."""

@@ -7,6 +7,7 @@ Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.emulator.application import Application
@@ -166,8 +167,12 @@ class PdoEngine:
                 for sampler in group.samplers:
                     sampler(t_ns)
                 values, append = core.dictionary.values, core.out.append
-                for cob_id, pack, fetch in group.packing:
-                    append((cob_id, pack(*fetch(values))))
+                try:
+                    for cob_id, pack, fetch in group.packing:
+                        append((cob_id, pack(*fetch(values))))
+                except (struct.error, TypeError):
+                    for tpdo in group.tpdos:
+                        tpdo.send()  # the one with the value that does not fit says so
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:

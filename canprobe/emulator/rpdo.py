@@ -33,6 +33,7 @@ class Rpdo:
         "_rules",
         "_slots",
         "_timer",
+        "_unpack",
         "cob_id",
         "keys",
         "pending",
@@ -43,6 +44,7 @@ class Rpdo:
         self._core, self._emcy, self._rules = core, emcy, rules
         self._timer = core.timers.new(self._timed_out)
         self._layout = PdoLayout(0, ())
+        self._unpack = self._layout.raw_unpack
         self._slots: tuple[Slot, ...] = ()
         self.keys: tuple[int, ...] = ()
         self._event_ns = 0
@@ -62,6 +64,7 @@ class Rpdo:
             self._forgive()  # what was wrong with the old parameters
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, entries)
+        self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)
         self.synchronous = dictionary.number(index, TYPE) <= 240
@@ -96,9 +99,25 @@ class Rpdo:
             self.apply(data)
 
     def apply(self, data: bytes) -> None:
-        """Store the values; one that the dictionary refuses is dropped."""
+        """Store the values, each as `Dictionary.write_value` does; one that it would refuse is dropped."""
         self.pending = None
-        self._core.dictionary.write_slots(self._slots, self._layout.unpack(data))
+        dictionary, told = self._core.dictionary, []
+        values, watched = dictionary.values, dictionary.watched
+        for value, (key, subindex, low, high, checks, hooks) in zip(self._unpack(data), self._slots, strict=True):
+            if not low <= value <= high:
+                continue
+            try:
+                for check in checks:
+                    check(subindex, value)
+                values[key] = value
+                for hook in hooks:
+                    hook(subindex, value)
+            except SdoAbort:
+                continue
+            if key in watched:
+                told.append(key)
+        if told:
+            dictionary.written(told)
 
     def _forgive(self) -> None:
         for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):

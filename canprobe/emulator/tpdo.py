@@ -54,6 +54,7 @@ class Tpdo:
         "_event_timer",
         "_inhibit_ns",
         "_inhibit_timer",
+        "_layout",
         "_rules",
         "active",
         "before",
@@ -69,7 +70,8 @@ class Tpdo:
         self._core, self._rules = core, rules
         self._event_timer = core.timers.new(self._event_due)
         self._inhibit_timer = core.timers.new(self._inhibit_over)
-        self.packing: Packing = 0, bytes, _no_values
+        self._layout = PdoLayout(0, ())
+        self.packing: Packing = 0, self._layout.raw_pack, _no_values
         self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
         self.active = self.requested = False
         self._buffer: bytes | None = None
@@ -95,8 +97,8 @@ class Tpdo:
         self._inhibit_ns = number(index, INHIBIT) * 100_000
         self._event_ns = number(index, EVENT) * 1_000_000
         if self.active:
-            layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
-            self.packing = self._cob_id, layout.pack, _fetcher(self.keys)
+            self._layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
+            self.packing = self._cob_id, self._layout.raw_pack, _fetcher(self.keys)
 
     @property
     def by_event(self) -> bool:
@@ -154,8 +156,7 @@ class Tpdo:
             self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
 
     def _packed(self) -> bytes:
-        _, pack, fetch = self.packing
-        return pack(*fetch(self._core.dictionary.values))
+        return self._layout.pack(*self.packing[2](self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
         self.before(t_ns)

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from canprobe.emulator.entries import key_of
+from canprobe.errors import ProtocolError
+
 MS = 1_000_000
 OFF = 0x80000000
 
@@ -231,3 +234,10 @@ def test_cia301_pdo_30_values_of_an_rpdo_are_one_event(bench, type_, at_once, at
     parts = {0x20010020: "aabbccdd", 0x20020010: "0500"}
     frames = [bench.send(0x205, "".join(parts[word] for word in words)), bench.send(0x80, ""), bench.send(0x80, "")]
     assert [[f"{can_id:x} {data}" for can_id, data in some] for some in frames] == [at_once, at_sync, []]
+
+
+def test_a_value_that_does_not_fit_its_pdo_is_named(bench):
+    bench.nmt(0x01)
+    bench.node.dictionary.values[key_of(0x2001)] = 1 << 32
+    with pytest.raises(ProtocolError, match="PDO 0x185: cannot pack"):
+        bench.send(0x80, "")
