@@ -6,9 +6,8 @@ brings a live value up to date before it is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container, Iterable, Sequence
 from dataclasses import replace
-from functools import partial
 from math import inf
 
 from canopen.objectdictionary import ObjectDictionary
@@ -18,6 +17,8 @@ from canprobe.emulator.entries import Entry, Value, key_of, read_entries
 
 Check = Callable[[int, Value], None]
 Hook = Callable[[int, Value], None]
+Slot = tuple[int, int, float, float, tuple[Check, ...], tuple[Hook, ...]]
+"""Where a value of a cyclic RPDO goes, looked up once: key, subindex, least, greatest, checks, hooks."""
 
 
 class Dictionary:
@@ -26,7 +27,8 @@ class Dictionary:
     Attributes:
         entries: by key (index << 8 | subindex).
         values: present values by key; cyclic code reads and writes here directly.
-        written: called with the key after a value was stored over SDO, or over an RPDO where `watched` says so.
+        written: called with the keys of values that were stored together: one over SDO, or those of an RPDO that are
+            `watched`.
         watched: keys of which `written` has to be told when an RPDO brings them.
         configured: called with the index after a value was stored over SDO.
     """
@@ -39,7 +41,7 @@ class Dictionary:
         self._checks: dict[int, list[Check]] = {}
         self._hooks: dict[int, list[Hook]] = {}
         self._refreshers: dict[int, Callable[[int], None]] = {}
-        self.written: Callable[[int], None] = _nothing
+        self.written: Callable[[Sequence[int]], None] = _nothing
         self.watched: Container[int] = ()
         self.configured: Callable[[int], None] = _nothing
         self.restore(self.entries)
@@ -91,30 +93,11 @@ class Dictionary:
         """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
         self._refreshers[index] = refresh
 
-    def storer(self, key: int) -> Callable[[Value], None]:
-        """What stores a value of a cyclic RPDO.
-
-        The same as `write_value`, with the look-ups done once. Hooks and checks hung in later are not seen.
-        """
-        entry, index, subindex = self.entries[key], key >> 8, key & 0xFF
-        checks, hooks = tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
-        if entry.low is None and entry.high is None and not checks and not hooks:
-            return partial(self.values.__setitem__, key)
-        values = self.values
+    def slot(self, key: int) -> Slot:
+        """What `write_value` of a cyclic RPDO needs. Hooks and checks hung in later are not seen."""
+        entry, index = self.entries[key], key >> 8
         low, high = -inf if entry.low is None else entry.low, inf if entry.high is None else entry.high
-
-        def store(value: Value) -> None:
-            if not isinstance(value, bytes) and not low <= value <= high:
-                entry.check_limits(value)
-            for check in checks:
-                check(subindex, value)
-            values[key] = value
-            for hook in hooks:
-                hook(subindex, value)
-            if key in self.watched:
-                self.written(key)
-
-        return store
+        return key, key & 0xFF, low, high, tuple(self._checks.get(index, ())), tuple(self._hooks.get(index, ()))
 
     def find(self, index: int, subindex: int) -> Entry:
         """The entry, or SdoAbort: no object, or no such subindex of it."""
@@ -153,8 +136,8 @@ class Dictionary:
         self.values[entry.key] = value
         for hook in self._hooks.get(index, ()):
             hook(subindex, value)
-        self.written(entry.key)
+        self.written((entry.key,))
 
 
-def _nothing(key: int) -> None:
+def _nothing(key: object) -> None:
     return None

@@ -58,8 +58,7 @@ class DriveApplication(Application):
         self._faults = DriveFaults(node, lambda t_ns: self._states.event(Event.FAULT_DETECTED, t_ns))
         self._states = DriveStates(self._entered_state, lambda: self._parameters.quick_stop in STAYS_STOPPED)
         self._supervision = Supervision(node, self._parameters, self._abort_connection)
-        self._loop = DriveLoop(self._axis, self._plant, self._parameters, self._values)
-        dictionary.on_write(0x6072, lambda _sub, _value: self._loop.limit())
+        self._loop = DriveLoop(self._axis, self._plant, self._parameters, dictionary)
         self._modes = ModeSelection(self._parts(), lambda: self._states.state is _ENABLED)
         self._pass_on = timers.new(self._states.pass_on)
         node.store.volatile |= _VOLATILE

@@ -14,6 +14,7 @@ from canprobe.emulator.drive_units import Units
 from canprobe.emulator.node import SlaveNode
 
 _I16, _I32 = 1 << 15, 1 << 31
+_TORQUES = (0x6074, 0x6077)
 
 
 class DriveFeedback:
@@ -22,7 +23,6 @@ class DriveFeedback:
     Attributes:
         counts: motor position at the last `measure`.
         plant_torque: tells the torque that the plant needs for its motion now, permille.
-        torque: tells the torque now, permille; a drive that controls torque puts its own there.
     """
 
     def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
@@ -31,19 +31,17 @@ class DriveFeedback:
         self._velocity = 0.0
         self._t_ns: int | None = None
         self.plant_torque = partial(plant.torque_permille, axis)
-        self.torque: Callable[[], float] = self.plant_torque
-        sources: dict[int, tuple[int, Callable[[], float]]] = {
-            0x6062: (_I32, lambda: units.position(motion.demand(self._t_ns or 0))),
-            0x6064: (_I32, lambda: (self.counts - units.origin) / units.scale),
-            0x606B: (_I32, lambda: motion.speed(self._t_ns or 0) / units.speed_scale),
-            0x606C: (_I32, lambda: self._velocity / units.speed_scale),
-            0x6074: (_I16, self._torque),
-            0x6077: (_I16, self._torque),
-            0x60F4: (_I32, lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale),
+        self._sources: dict[int, Callable[[], float]] = {
+            0x6062: lambda: units.position(motion.demand(self._t_ns or 0)),
+            0x6064: lambda: (self.counts - units.origin) / units.scale,
+            0x606B: lambda: motion.speed(self._t_ns or 0) / units.speed_scale,
+            0x606C: lambda: self._velocity / units.speed_scale,
+            0x60F4: lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale,
         }
-        for index, (limit, source) in sources.items():
+        self.tell_torque(self.plant_torque)
+        for index in self._sources:
             if node.dictionary.has_index(index):
-                sample = self._sampler(index, limit, source)
+                sample = self._sampler(index, _I16 if index in _TORQUES else _I32)
                 node.pdos.on_trigger(index, sample)
                 node.dictionary.on_read(index, self._reader(sample))
 
@@ -63,17 +61,18 @@ class DriveFeedback:
             self.counts, self._t_ns = counts, t_ns
         return self.counts
 
-    def _torque(self) -> float:
-        return self.torque()  # whoever tells it now
+    def tell_torque(self, source: Callable[[], float]) -> None:
+        """Take the torque, permille, from `source` from now on: the plant's, or that of a drive that controls it."""
+        self._sources.update(dict.fromkeys(_TORQUES, source))
 
-    def _sampler(self, index: int, limit: int, source: Callable[[], float]) -> Callable[[int], None]:
-        """What puts a value into the dictionary, as a whole number of so many bits."""
-        values, key = self._core.dictionary.values, index << 8
+    def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
+        """What puts a value into the dictionary, as a whole number within +-limit."""
+        values, key, sources = self._core.dictionary.values, index << 8, self._sources
 
         def sample(t_ns: int) -> None:
             if t_ns != self._t_ns:
                 self.measure(t_ns)
-            number = round(source())
+            number = round(sources[index]())
             values[key] = number if -limit <= number < limit else min(max(number, -limit), limit - 1)
 
         return sample

@@ -25,6 +25,7 @@ class CyclicPosition(DriveMode):
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
+        self._loop = parts.loop
         self._fresh = False
         self._latched_ns = 0
         parts.node.dictionary.on_write(self.target, self._target_written)
@@ -41,12 +42,13 @@ class CyclicPosition(DriveMode):
 
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the following error and the master, latch the target received since the last SYNC."""
-        demand = self._motion.demand(t_ns)
-        if self._supervision.following_error(demand - counts, t_ns):
+        demand, supervision, window = self._motion.demand(t_ns), self._supervision, self._parameters.following_window
+        error = demand - counts
+        if (not -window <= error <= window or supervision.strays) and supervision.following_error(error, t_ns):
             self.parts.fault(FOLLOWING_ERROR, t_ns)
             return
         fresh, self._fresh = self._fresh, False
-        self._supervision.sync(fresh, t_ns)
+        supervision.sync(fresh, t_ns)
         if fresh and not self.halted:
             self._latch(t_ns, demand)
 
@@ -54,14 +56,15 @@ class CyclicPosition(DriveMode):
         """Follow the target from where the reference is, `demand`."""
         values, parameters, units = self._values, self._parameters, self._units
         target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
-        allowed = parameters.clamp(target)
+        allowed = target if parameters.low <= target <= parameters.high else parameters.clamp(target)
         counts = allowed * units.scale + units.origin
         passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
         if abs(counts - demand) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:
             self.parts.fault(REFERENCE_LIMIT, t_ns)
             return
         self._latched_ns = t_ns
-        self.parts.loop.feed_forward()
+        if self._loop.changed:
+            self._loop.feed_forward()
         self._motion.reach(counts, t_ns, parameters.interpolation_ns)
         limited = allowed != target or (parameters.max_torque < PEAK_PERMILLE and self._strains())
         if limited is not self.limited:

@@ -40,7 +40,7 @@ class CyclicTorque(CyclicMode):
         values, parameters, parts = self._values, self._parameters, self.parts
         wanted = int(values[_TARGET]) + int(values.get(_OFFSET, 0))
         self._torque = min(max(wanted, -parameters.max_torque), parameters.max_torque)
-        parts.feedback.torque = self._applied
+        parts.feedback.tell_torque(self._applied)
         here, speed, (low, high) = self._motion.demand(t_ns), self._motion.speed(t_ns), parameters.fence
         dynamics, limit = parts.plant.motor_dynamics(parts.axis), parameters.max_speed
         self._motion.follow(Fenced(TorqueRun(here, speed, self._torque, dynamics, limit), low, high), t_ns)
@@ -55,7 +55,7 @@ class CyclicTorque(CyclicMode):
 
     def _give_up(self) -> None:
         feedback = self.parts.feedback
-        feedback.torque = feedback.plant_torque
+        feedback.tell_torque(feedback.plant_torque)
 
     def _applied(self) -> float:
         return self._torque

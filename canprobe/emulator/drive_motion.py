@@ -83,7 +83,9 @@ class Motion:
         if self._timer.due_ns is not None:
             self._end = self.demand(t_ns)
             self._stop()
-        self._ramp(self._end, counts, t_ns, t_ns + duration_ns)
+        start, end_ns = self._end, t_ns + duration_ns
+        self._start, self._end, self._t0, self._t1 = start, counts, t_ns, end_ns  # as `_ramp`, in every cycle
+        self._plant.set_ramp(self._axis, start, counts, t_ns, end_ns)
 
     def demand(self, t_ns: int) -> float:
         """The reference at `t_ns`, counts."""

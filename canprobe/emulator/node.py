@@ -43,6 +43,7 @@ class SlaveNode:
         core: state, dictionary and timers, shared with the services.
         emcy, pdos, store: the services an application works with.
         application: the device.
+        next_deadline_ns: when `advance` has something to do, or None.
         lss: the LSS service; None where the node's id cannot be changed over the bus.
         rerouted: called when `listens` has changed; a bus puts its own function there.
     """
@@ -66,6 +67,8 @@ class SlaveNode:
         """
         self.application = application if application is not None else Application()
         self.core = core = NodeCore(node_id, Dictionary(od))
+        self.next_deadline_ns: int | None = None
+        core.timers.holder = self
         self._boot_ns = boot_ns
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
@@ -112,11 +115,6 @@ class SlaveNode:
         """The node's object dictionary with its present values."""
         return self.core.dictionary
 
-    @property
-    def next_deadline_ns(self) -> int | None:
-        """When `advance` has something to do, or None."""
-        return self.core.timers.next_ns
-
     def start(self, t_ns: int) -> list[Frame]:
         """Power on."""
         self.core.now_ns = t_ns
@@ -131,12 +129,15 @@ class SlaveNode:
         if route is None:
             return []
         core = self.core
-        due = core.timers.next_ns
+        due = self.next_deadline_ns
         if due is not None and due < t_ns:
             self._run(t_ns)
         core.now_ns = t_ns
         route(data, t_ns)
-        return self._taken()
+        out = core.out  # as `_taken`
+        if out:
+            core.out = []
+        return out
 
     def advance(self, t_ns: int) -> list[Frame]:
         """Do everything that is due up to and at `t_ns`."""

@@ -7,7 +7,8 @@ Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import struct
+from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.emulator.application import Application
 from canprobe.emulator.core import NO_ROUTES, NodeCore, Route
@@ -15,22 +16,28 @@ from canprobe.emulator.emergency import Emergency
 from canprobe.emulator.entries import Value, key_of
 from canprobe.emulator.pdo_rules import PdoRules
 from canprobe.emulator.rpdo import Rpdo
-from canprobe.emulator.tpdo import BUFFERED, Tpdo
+from canprobe.emulator.tpdo import BUFFERED, Packing, Tpdo
 from canprobe.protocol.frames import NmtState
 
 Sampler = Callable[[int], None]
 
 
 class _Group:
-    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`."""
+    """TPDOs that a SYNC triggers together: every `every`-th, counted from the SYNC with counter `start`.
 
-    __slots__ = ("every", "first", "samplers", "start", "tpdos")
+    Attributes:
+        samplers: bring their values up to date.
+        packing: how each is then packed.
+    """
+
+    __slots__ = ("every", "first", "packing", "samplers", "start", "tpdos")
 
     def __init__(self, every: int, start: int) -> None:
         self.every, self.start = every, start
         self.first: int | None = None
         self.tpdos: list[Tpdo] = []
         self.samplers: list[Sampler] = []
+        self.packing: list[Packing] = []
 
 
 class PdoEngine:
@@ -53,7 +60,7 @@ class PdoEngine:
         for rules in _discover(core, 0x1800, transmits=True):
             self._tpdos.append(tpdo := Tpdo(core, rules))
             self._watch(rules, tpdo)
-        core.dictionary.written = self.event_key
+        core.dictionary.written = self._written
         core.dictionary.on_write(0x1007, lambda _sub, _value: self._rebuild())
 
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
@@ -129,13 +136,13 @@ class PdoEngine:
 
     def event(self, index: int, subindex: int = 0) -> None:
         """A value of the device changed: TPDOs of type 0, 254 and 255 that carry it are due."""
-        self.event_key(key_of(index, subindex))
+        self._written((key_of(index, subindex),))
 
-    def event_key(self, key: int) -> None:
-        """As `event`, by dictionary key."""
+    def _written(self, keys: Sequence[int]) -> None:
+        """As `event`, of values that changed together: one event for each TPDO."""
         if self._core.state is NmtState.OPERATIONAL:
             for tpdo in self._on_event:
-                if key in tpdo.keys:
+                if any(key in tpdo.keys for key in keys):
                     tpdo.event(self._core.now_ns)
 
     def sync(self, t_ns: int, counter: int, elapsed: int) -> None:
@@ -146,6 +153,7 @@ class PdoEngine:
             counter: its counter, 0 without one.
             elapsed: SYNCs since the last one heard, lost ones included (the counter tells).
         """
+        core = self._core
         self._sync_ns = t_ns
         count = self._count = self._count + elapsed
         for rpdo in self._waiting:
@@ -158,8 +166,13 @@ class PdoEngine:
             if group.first is not None and (count - group.first) % group.every == 0:
                 for sampler in group.samplers:
                     sampler(t_ns)
-                for tpdo in group.tpdos:
-                    tpdo.send()
+                values, append = core.dictionary.values, core.out.append
+                try:
+                    for cob_id, pack, fetch in group.packing:
+                        append((cob_id, pack(*fetch(values))))
+                except (struct.error, TypeError):
+                    for tpdo in group.tpdos:
+                        tpdo.send()  # the one with the value that does not fit says so
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
@@ -187,6 +200,7 @@ class PdoEngine:
         self._groups = list(groups.values())
         for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
             group.samplers = self._samplers_of(group.tpdos)
+            group.packing = [tpdo.packing for tpdo in group.tpdos]
             group.first = phases.get((group.every, group.start), None if group.start else self._count)
 
     def _samplers_of(self, tpdos: list[Tpdo]) -> list[Sampler]:

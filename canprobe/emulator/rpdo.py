@@ -5,12 +5,11 @@ Source: CiA 301, "RPDO", objects 1400h and 1600h; errors 8210h, 8220h, 8250h.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from canprobe.emulator.aborts import SdoAbort
 from canprobe.emulator.core import NodeCore
+from canprobe.emulator.dictionary import Slot
 from canprobe.emulator.emergency import Emergency
-from canprobe.emulator.entries import Value, key_of
+from canprobe.emulator.entries import key_of
 from canprobe.emulator.pdo_rules import COB_ID, EVENT, TYPE, PdoRules
 from canprobe.protocol.emcy import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT
 from canprobe.protocol.pdo import PdoLayout
@@ -32,8 +31,9 @@ class Rpdo:
         "_event_ns",
         "_layout",
         "_rules",
-        "_stores",
+        "_slots",
         "_timer",
+        "_unpack",
         "cob_id",
         "keys",
         "pending",
@@ -44,7 +44,8 @@ class Rpdo:
         self._core, self._emcy, self._rules = core, emcy, rules
         self._timer = core.timers.new(self._timed_out)
         self._layout = PdoLayout(0, ())
-        self._stores: tuple[Callable[[Value], None], ...] = ()
+        self._unpack = self._layout.raw_unpack
+        self._slots: tuple[Slot, ...] = ()
         self.keys: tuple[int, ...] = ()
         self._event_ns = 0
         self.cob_id: int | None = None
@@ -63,8 +64,9 @@ class Rpdo:
             self._forgive()  # what was wrong with the old parameters
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
         self._layout = PdoLayout(self.cob_id or 0, entries)
+        self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
-        self._stores = tuple(dictionary.storer(key) for key in self.keys)
+        self._slots = tuple(dictionary.slot(key) for key in self.keys)
         self.synchronous = dictionary.number(index, TYPE) <= 240
         self._event_ns = dictionary.number(index, EVENT) * 1_000_000
 
@@ -97,13 +99,25 @@ class Rpdo:
             self.apply(data)
 
     def apply(self, data: bytes) -> None:
-        """Store the values; one that the dictionary refuses is dropped."""
+        """Store the values, each as `Dictionary.write_value` does; one that it would refuse is dropped."""
         self.pending = None
-        for value, store in zip(self._layout.unpack(data), self._stores, strict=True):
+        dictionary, told = self._core.dictionary, []
+        values, watched = dictionary.values, dictionary.watched
+        for value, (key, subindex, low, high, checks, hooks) in zip(self._unpack(data), self._slots, strict=True):
+            if not low <= value <= high:
+                continue
             try:
-                store(value)
+                for check in checks:
+                    check(subindex, value)
+                values[key] = value
+                for hook in hooks:
+                    hook(subindex, value)
             except SdoAbort:
                 continue
+            if key in watched:
+                told.append(key)
+        if told:
+            dictionary.written(told)
 
     def _forgive(self) -> None:
         for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Container, Iterator, Sequence
+from heapq import merge
 from itertools import groupby
+from operator import itemgetter
 from typing import Protocol
 
 from canprobe.bus.memory import garbage_collection_paused
@@ -52,6 +54,23 @@ class _Seat:
             self.queue.extend(answers)
 
 
+_Said = tuple[int, _Seat, Frame]
+"""A frame that a seat sends, behind its identifier."""
+_IDENTIFIER = itemgetter(0)
+
+
+class _Audiences(dict[int, tuple[_Seat, ...]]):
+    """Who listens to an identifier: found once, until a node changes its mind."""
+
+    def __init__(self, seats: Sequence[_Seat]) -> None:
+        super().__init__()
+        self._seats = seats
+
+    def __missing__(self, can_id: int) -> tuple[_Seat, ...]:
+        found = self[can_id] = tuple(seat for seat in self._seats if can_id in seat.ears)
+        return found
+
+
 class Exchange:
     """The nodes of one process behind one bus: each hears the bus and the other nodes, none itself.
 
@@ -64,7 +83,7 @@ class Exchange:
         self._seats = tuple(_Seat(node) for node in nodes)
         self._kinds = tuple(tuple(seats) for _, seats in groupby(self._seats, key=_kind))
         self._witnesses = tuple(seat for seat in self._seats if getattr(seat.node, "witness", False))
-        self._audiences: dict[int, tuple[_Seat, ...]] = {}
+        self._audiences = _Audiences(self._seats)
         self.skipped = 0
         """SYNCs that were left unanswered because the next one had come already."""
         self.rerouted = True
@@ -85,13 +104,6 @@ class Exchange:
         ]
         wanted = {can_id for _, ids in by_seat for can_id in ids}
         return frozenset(i for i in wanted if all(i in ids or i not in seat.ears for seat, ids in by_seat))
-
-    def _audience(self, can_id: int) -> tuple[_Seat, ...]:
-        """Who listens to an identifier: found once, until a node changes its mind."""
-        seats = self._audiences.get(can_id)
-        if seats is None:
-            seats = self._audiences[can_id] = tuple(seat for seat in self._seats if can_id in seat.ears)
-        return seats
 
     @property
     def next_deadline_ns(self) -> int | None:
@@ -131,7 +143,7 @@ class Exchange:
                     continue
                 yield from self._synchronise(data, heard_ns)
                 continue
-            for seat in self._audience(can_id):
+            for seat in self._audiences[can_id]:
                 seat.hear(can_id, data, heard_ns)
         for seat in self._seats:
             due = seat.node.next_deadline_ns
@@ -144,16 +156,14 @@ class Exchange:
         """Pass a SYNC on. The nodes hear each other's answers to it only once they have all heard the SYNC itself."""
         if before := self._settle(t_ns):
             yield before
-        spoken: list[tuple[_Seat, Frame]] = []
+        spoken: list[_Said] = []
         for kind in self._kinds:
-            for seat in kind:
-                if SYNC_ID in seat.ears:
-                    seat.hear(SYNC_ID, data, t_ns)
-            if said := _said(kind):
+            answers = [(seat, seat.node.receive(SYNC_ID, data, t_ns)) for seat in kind if SYNC_ID in seat.ears]
+            if said := _in_order(answers):
                 spoken += said
-                yield [frame for _, frame in said]
-        for sender, frame in spoken:
-            if self._audience(frame[0]):
+                yield [frame for _, _, frame in said]
+        for can_id, sender, frame in spoken:
+            if self._audiences[can_id]:
                 self._overhear(sender, frame, t_ns)
 
     def _settle(self, t_ns: int) -> list[Frame]:
@@ -168,7 +178,7 @@ class Exchange:
         return sent
 
     def _overhear(self, sender: _Seat, frame: Frame, t_ns: int) -> None:
-        for seat in self._audience(frame[0]):
+        for seat in self._audiences[frame[0]]:
             if seat is not sender:
                 seat.hear(*frame, t_ns)
 
@@ -183,18 +193,13 @@ def _next_of(seats: Sequence[_Seat]) -> _Seat | None:
     return min(talking, key=_head) if talking else None
 
 
-def _said(seats: Sequence[_Seat]) -> list[tuple[_Seat, Frame]]:
-    """Empty the queues, lowest identifier first, each in its own order."""
-    talking = [seat for seat in seats if seat.queue]
-    said: list[tuple[_Seat, Frame]] = []
-    if len(talking) == 1 or all(len(seat.queue) == 1 for seat in talking):  # as after nearly every SYNC
-        for seat in sorted(talking, key=_head):
-            said += [(seat, frame) for frame in seat.queue]
-            seat.queue.clear()
-        return said
-    while (sender := _next_of(talking)) is not None:
-        said.append((sender, sender.queue.popleft()))
-    return said
+def _in_order(answers: Sequence[tuple[_Seat, Sequence[Frame]]]) -> list[_Said]:
+    """What the seats answer, lowest identifier first, each seat's in its own order."""
+    said = [(frame[0], seat, frame) for seat, frames in answers for frame in frames]
+    talking = [seat for seat, frames in answers if frames]
+    if len(said) == len(talking):  # one frame each, as after nearly every SYNC
+        return sorted(said, key=_IDENTIFIER)
+    return list(merge(*[[one for one in said if one[1] is seat] for seat in talking], key=_IDENTIFIER))
 
 
 def _kind(seat: _Seat) -> type:

@@ -82,12 +82,23 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
+        for index in (MODE, THRESHOLD, GAIN, FULL_SCALE_PA):
+            node.dictionary.on_write(index, lambda _sub, _value: self._read_settings())
         self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
         entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
         self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
         if self._sized:
             node.dictionary.on_check(WINDOW_SIZE, self._check_window)
             node.dictionary.on_write(WINDOW_SIZE, self._begin_window)
+        self._read_settings()
+
+    def _read_settings(self) -> None:
+        """Take what the dictionary says now; an array without a window size has 8 taxels along the window."""
+        number = self._node.dictionary.number
+        self._mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
+        self._gain, self._threshold = number(GAIN, 0, 1000), number(THRESHOLD)
+        self._full_scale = number(FULL_SCALE_PA, 0, 100_000)
+        self._window = number(WINDOW_SIZE, 0, WINDOW) if self._sized else WINDOW
 
     def keep(self) -> bytes:
         """The tare."""
@@ -104,7 +115,8 @@ class TactileApplication(Application):
         self._pipeline.clear()
         self._taring = None
         self._frames = 0
-        self._origin = middle(self._window())
+        self._read_settings()
+        self._origin = middle(self._window)
 
     def entered(self, t_ns: int) -> None:
         """Sample at once on entering operational, so that the first frame shows something real."""
@@ -143,13 +155,10 @@ class TactileApplication(Application):
 
     def _show(self, raw: Raw, age_us: int) -> None:
         """Put one frame into the objects that the TPDOs carry."""
-        dictionary = self._node.dictionary
-        number = dictionary.number
-        mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
-        settings = self._tare, number(GAIN, 0, 1000), number(THRESHOLD)
+        dictionary, mode, window = self._node.dictionary, self._mode, self._window
+        settings = self._tare, self._gain, self._threshold
         image = correct(raw, *settings)
         overload = is_overloaded(raw) or is_overloaded(image)
-        window = self._window()
         self._origin = follow(image, self._origin, window)
         row, column = self._origin if mode is TactileMode.WINDOW else (0, 0)
         header = TactileHeader(self._frames, self._counter, row, column, mode, overload, age_us, window=window)
@@ -157,7 +166,7 @@ class TactileApplication(Application):
         content: Image | Features = image
         if mode is TactileMode.FEATURES:
             seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
-            content = compute_features(seen, number(FULL_SCALE_PA, 0, 100_000))
+            content = compute_features(seen, self._full_scale)
         whole = pack_whole(header, content)
         words = struct.unpack(f"<{len(whole) // 8}Q", whole)
         dictionary.put(OVERLOAD, 0, int(overload))
@@ -166,18 +175,15 @@ class TactileApplication(Application):
         dictionary.values.update(zip(self._content[mode], content_words, strict=False))
         dictionary.put(HEADER, 0, words[0])
 
-    def _window(self) -> int:
-        """Taxels along the window; an array without the object has 8."""
-        return self._node.dictionary.number(WINDOW_SIZE, 0, WINDOW) if self._sized else WINDOW
-
     def _check_window(self, subindex: int, value: Value) -> None:
         if value not in WINDOWS:
             raise SdoAbort(Abort.VALUE)
-        if self._node.state is NmtState.OPERATIONAL and value != self._window():
+        if self._node.state is NmtState.OPERATIONAL and value != self._window:
             raise SdoAbort(Abort.DEVICE_STATE)
 
     def _begin_window(self, subindex: int, value: Value) -> None:
-        self._origin = middle(self._window())
+        self._read_settings()
+        self._origin = middle(self._window)
 
     def _begin_tare(self, subindex: int, value: Value) -> None:
         self._tare, self._taring = None, []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from heapq import heapify, heappop, heappush, heapreplace
+from typing import Protocol
 
 _ROOM = 64
 
@@ -13,22 +14,23 @@ class Timer:
 
     Attributes:
         due_ns: when it fires, or None while it is not armed.
+        queued_ns: where its entry on the heap is, at `due_ns` or before (for `Timers`).
     """
 
-    __slots__ = ("_callback", "_owner", "_queued_ns", "due_ns")
+    __slots__ = ("_callback", "_owner", "due_ns", "queued_ns")
 
     def __init__(self, owner: Timers, callback: Callable[[int], None]) -> None:
         self._owner = owner
         self._callback = callback
-        self._queued_ns: int | None = None
+        self.queued_ns: int | None = None
         self.due_ns: int | None = None
 
     def arm(self, due_ns: int) -> None:
         """Fire at `due_ns`, in place of any earlier order."""
         self.due_ns = due_ns
-        queued = self._queued_ns
+        queued = self.queued_ns
         if queued is None or due_ns < queued:
-            self._queued_ns = due_ns
+            self.queued_ns = due_ns
             self._owner.queue(due_ns, self)
         elif queued == self._owner.next_ns:
             self._owner.tidy()
@@ -41,38 +43,31 @@ class Timer:
     def cancel(self) -> None:
         """Do not fire."""
         self.due_ns = None
-        if self._queued_ns is not None:
+        if self.queued_ns is not None:
             self._owner.tidy()
 
     def holds(self, queued_ns: int) -> bool:
         """Whether the entry of `queued_ns` is still needed; if it is not, it counts as taken off the heap."""
-        if queued_ns != self._queued_ns:
+        if queued_ns != self.queued_ns:
             return False
         if self.due_ns is None:
-            self._queued_ns = None
+            self.queued_ns = None
         return self.due_ns is not None
 
-    def moved(self) -> int:
-        """The entry on the heap goes to where the deadline is now, which is returned."""
-        assert self.due_ns is not None
-        self._queued_ns = self.due_ns
-        return self.due_ns
-
-    def surfaced(self, queued_ns: int) -> bool:
-        """Take the entry of `queued_ns` off the heap; queue again when it was re-armed. True when it is due then."""
-        if queued_ns != self._queued_ns:
-            return False
-        self._queued_ns = None
-        if self.due_ns == queued_ns:
-            return True
-        if self.due_ns is not None:
-            self.arm(self.due_ns)
-        return False
-
     def fire(self, due_ns: int) -> None:
-        """Disarm and call back with the time that was ordered."""
-        self.due_ns = None
+        """Disarm and call back with the time that was ordered; the entry is off the heap."""
+        self.due_ns = self.queued_ns = None
         self._callback(due_ns)
+
+
+class Holder(Protocol):
+    """Somebody who shows the next deadline."""
+
+    next_deadline_ns: int | None
+
+
+class _Nobody:
+    next_deadline_ns: int | None = None
 
 
 class Timers:
@@ -81,9 +76,10 @@ class Timers:
     Attributes:
         now_ns: the time up to which `run` was last called.
         next_ns: the earliest deadline, or None.
+        holder: whose `next_deadline_ns` is the same: buses ask for it far more often than it changes.
     """
 
-    __slots__ = ("_count", "_heap", "_most", "next_ns", "now_ns")
+    __slots__ = ("_count", "_heap", "_most", "holder", "next_ns", "now_ns")
 
     def __init__(self) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
@@ -91,6 +87,7 @@ class Timers:
         self._most = _ROOM
         self.now_ns = 0
         self.next_ns: int | None = None
+        self.holder: Holder = _Nobody()
 
     def new(self, callback: Callable[[int], None]) -> Timer:
         """A timer that calls `callback(due_ns)`; not armed."""
@@ -101,24 +98,28 @@ class Timers:
         self._count += 1
         heappush(self._heap, (due_ns, self._count, timer))
         if self.next_ns is None or due_ns < self.next_ns:
-            self.next_ns = due_ns
+            self.next_ns = self.holder.next_deadline_ns = due_ns
         if len(self._heap) > self._most:
             self._compact()
 
     def tidy(self) -> None:
-        """Take entries of deadlines that were moved or cancelled from the top of the heap (for `Timer`)."""
+        """Put the heap right where its first entry is of a deadline that was moved or cancelled (for `Timer`)."""
         heap = self._heap
         while heap:
-            due, _, timer = heap[0]
-            if timer.due_ns == due:
-                self.next_ns = due
+            queued, _, timer = heap[0]
+            due = timer.due_ns
+            if due == queued:
+                self.next_ns = self.holder.next_deadline_ns = due
                 return
-            if timer.holds(due):
-                self._count += 1
-                heapreplace(heap, (timer.moved(), self._count, timer))
-            else:
+            if due is None or queued != timer.queued_ns:
+                if queued == timer.queued_ns:
+                    timer.queued_ns = None
                 heappop(heap)
-        self.next_ns = None
+            else:
+                timer.queued_ns = due
+                self._count += 1
+                heapreplace(heap, (due, self._count, timer))
+        self.next_ns = self.holder.next_deadline_ns = None
 
     def _compact(self) -> None:
         """Drop the entries of deadlines that were moved or cancelled, which else stay until their time."""
@@ -133,6 +134,5 @@ class Timers:
         heap = self._heap
         while heap and heap[0][0] <= t_ns:
             due, _, timer = heappop(heap)
-            if timer.surfaced(due):
-                timer.fire(due)
-        self.tidy()
+            timer.fire(due)
+            self.tidy()

@@ -20,6 +20,8 @@ BUFFERED, ON_REQUEST = 252, 253
 _NO_RTR = 1 << 30  # of the COB-ID
 
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
+Packing = tuple[int, Callable[..., bytes], Fetch]
+"""Identifier, what packs the values, what takes them from the dictionary."""
 
 
 def _fetcher(keys: tuple[int, ...]) -> Fetch:
@@ -36,6 +38,7 @@ class Tpdo:
         active: valid and with something mapped.
         before: samples what is mapped, at a time.
         keys: mapped dictionary keys.
+        packing: how to make the frame; of an active PDO.
         type: transmission type.
         start: SYNC start value (18xxh:06).
         remote_id: identifier of the remote request that is answered, or None.
@@ -49,14 +52,14 @@ class Tpdo:
         "_earliest_ns",
         "_event_ns",
         "_event_timer",
-        "_fetch",
         "_inhibit_ns",
         "_inhibit_timer",
-        "_pack",
+        "_layout",
         "_rules",
         "active",
         "before",
         "keys",
+        "packing",
         "remote_id",
         "requested",
         "start",
@@ -67,8 +70,8 @@ class Tpdo:
         self._core, self._rules = core, rules
         self._event_timer = core.timers.new(self._event_due)
         self._inhibit_timer = core.timers.new(self._inhibit_over)
-        self._pack: Callable[..., bytes] = bytes
-        self._fetch: Fetch = _no_values
+        self._layout = PdoLayout(0, ())
+        self.packing: Packing = 0, self._layout.raw_pack, _no_values
         self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
         self.active = self.requested = False
         self._buffer: bytes | None = None
@@ -94,7 +97,8 @@ class Tpdo:
         self._inhibit_ns = number(index, INHIBIT) * 100_000
         self._event_ns = number(index, EVENT) * 1_000_000
         if self.active:
-            self._pack, self._fetch = PdoLayout(self._cob_id, entries, self.type, fd=True).pack, _fetcher(self.keys)
+            self._layout = PdoLayout(self._cob_id, entries, self.type, fd=True)
+            self.packing = self._cob_id, self._layout.raw_pack, _fetcher(self.keys)
 
     @property
     def by_event(self) -> bool:
@@ -133,8 +137,7 @@ class Tpdo:
     def send(self) -> None:
         """Pack the present values and send them."""
         self.requested = False
-        core = self._core
-        core.out.append((self._cob_id, self._pack(*self._fetch(core.dictionary.values))))
+        self._core.send(self._cob_id, self._packed())
 
     def sample(self, t_ns: int) -> None:
         """Type 252: pack the values of this SYNC, for the next remote request."""
@@ -153,7 +156,7 @@ class Tpdo:
             self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
 
     def _packed(self) -> bytes:
-        return self._pack(*self._fetch(self._core.dictionary.values))
+        return self._layout.pack(*self.packing[2](self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
         self.before(t_ns)

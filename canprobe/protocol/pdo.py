@@ -110,6 +110,8 @@ class PdoLayout:
         fd: the mapping may have up to 512 bits; above 64 the frame is one of CAN FD, filled up with zeros to a length
             that FD has.
         length: data bytes of the frame.
+        raw_pack, raw_unpack: as `pack` and `unpack`, where errors are excluded or looked into later: a struct.error or
+            TypeError that names no PDO.
 
     Raises:
         ProtocolError: an entry without length, or more bits in all than a frame has.
@@ -120,8 +122,8 @@ class PdoLayout:
     transmission_type: int = 1
     fd: bool = False
     length: int = field(init=False)
-    _pack: Callable[..., bytes] = field(init=False, repr=False, compare=False)
-    _unpack: Callable[[bytes], tuple[int, ...]] = field(init=False, repr=False, compare=False)
+    raw_pack: Callable[..., bytes] = field(init=False, repr=False, compare=False)
+    raw_unpack: Callable[[bytes], tuple[int, ...]] = field(init=False, repr=False, compare=False)
 
     def __reduce__(self) -> tuple[type[PdoLayout], tuple[object, ...]]:
         """Pickled as it was made: what is compiled cannot go to another process, as results of runs do."""
@@ -138,8 +140,8 @@ class PdoLayout:
         codec = _BitCodec(entries, length) if form is None else struct.Struct(form)
         object.__setattr__(self, "entries", entries)
         object.__setattr__(self, "length", length)
-        object.__setattr__(self, "_pack", codec.pack)
-        object.__setattr__(self, "_unpack", codec.unpack)
+        object.__setattr__(self, "raw_pack", codec.pack)
+        object.__setattr__(self, "raw_unpack", codec.unpack)
 
     @property
     def signals(self) -> tuple[PdoEntry, ...]:
@@ -153,7 +155,7 @@ class PdoLayout:
             ProtocolError: wrong number of values, or a value that does not fit its entry.
         """
         try:
-            return self._pack(*values)
+            return self.raw_pack(*values)
         except (struct.error, TypeError) as error:
             raise ProtocolError(f"PDO {self.cob_id:#05x}: cannot pack {values}: {error}") from None
 
@@ -164,7 +166,7 @@ class PdoLayout:
             ProtocolError: shorter or longer data. (A slave accepts longer RPDOs: cut before.)
         """
         try:
-            return self._unpack(data)
+            return self.raw_unpack(data)
         except struct.error:
             raise ProtocolError(f"PDO {self.cob_id:#05x}: expected {self.length} bytes, got {len(data)}") from None
 

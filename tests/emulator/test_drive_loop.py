@@ -18,9 +18,10 @@ def dynamic():
     return Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity="dynamic"))
 
 
-def at_work(rig, mode, target):
-    """Operational, RPDO1 = controlword + the mode's target."""
-    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), ("_1600_2", target), ("_1600_0", 2)):
+def at_work(rig, mode, *words):
+    """Operational, RPDO1 = controlword + the mode's target + what else is mapped."""
+    mapped = [(f"_1600_{sub}", word) for sub, word in enumerate(words, start=2)]
+    for name, value in (("_1400_1", 0x80000201), ("_1600_0", 0), *mapped, ("_1600_0", 1 + len(words))):
         rig.put(**{name: value})
     rig.put(_1400_1=0x201).enable(mode).drive.nmt(0x01)
     return rig
@@ -34,6 +35,19 @@ def test_position_mode_feeds_both_forward_and_takes_them_back(rig, plant):
     assert len(plant.loops) == told  # changes only
     rig.word(0x07)
     assert plant.loops[-1] == (0, 800, 0.0, 0.0)
+
+
+def test_position_mode_feeds_what_an_rpdo_brings(rig, plant):
+    at_work(rig, CSP, 0x607A0020, 0x60B20010)
+    for torque in (120, 120, -40):
+        rig.cycles(2, HOLD + torque.to_bytes(2, "little", signed=True).hex())
+    rig.cycles(1)
+    assert plant.loops == [(0, 2000, 0.0, 120.0), (0, 2000, 0.0, -40.0)]
+    rig.word(0x07)
+    assert plant.loops[2:] == [(0, 2000, 0.0, 0.0)]
+    rig.word(0x0F)
+    rig.cycles(3, HOLD + "d8ff")
+    assert plant.loops[3:] == [(0, 2000, 0.0, -40.0)]
 
 
 def test_velocity_mode_feeds_torque_only(rig, plant):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from canprobe.emulator.entries import key_of
+from canprobe.errors import ProtocolError
+
 MS = 1_000_000
 OFF = 0x80000000
 
@@ -216,3 +219,25 @@ def test_cia301_pdo_33_the_error_of_a_pdo_ends_when_it_is_switched_off(bench):
     head = bytes((0x23, 0x00, 0x14, 1)).hex()
     assert bench.send(0x605, head + "05020080") == [(0x85, "0000000000000000"), (0x585, "6000140100000000")]
     assert bench.read(0x1001) == 0
+
+
+@pytest.mark.parametrize(
+    ("type_", "at_once", "at_sync"), [(255, ["185 aabbccdd0500"], []), (0, [], ["185 aabbccdd0500"])]
+)
+@pytest.mark.parametrize("words", [[0x20010020], [0x20010020, 0x20020010], [0x20020010, 0x20010020]])
+def test_cia301_pdo_30_values_of_an_rpdo_are_one_event(bench, type_, at_once, at_sync, words):
+    bench.write(0x2002, 0, 5, 2)
+    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020, 0x20020010], type=type_)
+    configure(bench, 0x1400, cob_id=0x205, words=words, type=255)
+    bench.nmt(0x01, 0)
+    bench.send(0x80, "")
+    parts = {0x20010020: "aabbccdd", 0x20020010: "0500"}
+    frames = [bench.send(0x205, "".join(parts[word] for word in words)), bench.send(0x80, ""), bench.send(0x80, "")]
+    assert [[f"{can_id:x} {data}" for can_id, data in some] for some in frames] == [at_once, at_sync, []]
+
+
+def test_a_value_that_does_not_fit_its_pdo_is_named(bench):
+    bench.nmt(0x01)
+    bench.node.dictionary.values[key_of(0x2001)] = 1 << 32
+    with pytest.raises(ProtocolError, match="PDO 0x185: cannot pack"):
+        bench.send(0x80, "")

@@ -80,9 +80,6 @@ class _Axis:
         r = self.r + self.slope * tau
         return r - self.lag * self.slope + p11 * e + p12 * de, self.slope + p21 * e + p22 * de, r
 
-    def anchor(self, t_ns: int, state: tuple[float, float, float]) -> None:
-        self.t_ns, (self.q, self.v, self.r) = t_ns, state
-
     def begin(self, ramp: tuple[int, int, float, float]) -> None:
         """Follow a ramp from the anchor on (the anchor is at or after the ramp's start)."""
         t0, t1, start, end = ramp
@@ -105,7 +102,7 @@ class _Axis:
             self.begin(self.coming.pop(0))
         else:
             self.r, self.slope, self.end_ns = self.end, 0.0, _NEVER
-            self.plan_event()
+            self.event_ns = self.coming[0][0] if self.coming else _NEVER
 
 
 class IdealArm:
@@ -146,15 +143,14 @@ class IdealArm:
         """
         a = self._axes[axis]
         ramp = (t0_ns, t1_ns, start_counts, end_counts)
-        if a.coming:
-            a.coming = [r for r in a.coming if r[0] < t0_ns]
         if t0_ns > self.t_ns:
-            a.coming.append(ramp)
+            a.coming = [*(r for r in a.coming if r[0] < t0_ns), ramp]
             a.plan_event()
             return
         states = self._evaluated or self._states()
         a.t_ns, (a.q, a.v, a.r) = self.t_ns, states[axis]
-        a.coming.clear()
+        if a.coming:
+            a.coming.clear()
         a.begin(ramp)
         states[axis] = (a.q, a.v, a.r)  # the other motors know nothing of this ramp
 
@@ -170,7 +166,7 @@ class IdealArm:
 
     def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Positions (counts) and rates (counts/s) of the six motors now."""
-        positions, rates, _ = zip(*self._states(), strict=True)
+        positions, rates, _ = zip(*(self._evaluated or self._states()), strict=True)
         return positions, rates
 
     @property
@@ -222,7 +218,9 @@ class IdealArm:
         torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
         torque += COULOMB_NM[axis] * tanh(rate / STICTION_RATE)
         permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
-        return permille if abs(permille) <= PEAK_PERMILLE else max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
+        if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
+            return permille
+        return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Nothing: these motors track as they do, whatever torque that takes.
@@ -274,8 +272,9 @@ class IdealArm:
 
     def _state(self, a: _Axis, t_ns: int) -> State:
         while t_ns >= a.event_ns:
-            when = a.event_ns
-            a.anchor(when, a.at(self._transition(when - a.t_ns), 1e-9 * (when - a.t_ns)))
+            span_ns = a.event_ns - a.t_ns
+            a.q, a.v, a.r = a.at(self._transition(span_ns), 1e-9 * span_ns)
+            a.t_ns = a.event_ns
             a.pass_event()
         return a.at(self._transition(t_ns - a.t_ns), 1e-9 * (t_ns - a.t_ns))
 
