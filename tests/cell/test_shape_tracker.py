@@ -57,19 +57,27 @@ def test_an_answer_of_one_part_is_there_at_once_and_once():
     assert tracker.answer() is not None and tracker.answer() is None
 
 
-def test_each_call_works_out_one_part():
-    tracker = ShapeTracker(InThree(), every=1)
-    taken(tracker, [0.0])
-    assert [tracker.answer() is not None for _ in range(5)] == [False, False, True, False, False]
+def answered(tracker, times, calls=2):
+    """Whether an answer was there: after each contact, over so many cycles."""
+    found = []
+    for t in times:
+        taken(tracker, [t])
+        found.append([tracker.answer() is not None for _ in range(calls)])
+    return found
+
+
+def test_one_part_is_worked_out_after_each_contact():
+    tracker = ShapeTracker(InThree(), every=4)
+    found = answered(tracker, [0.005 * k for k in range(12)])
+    assert [k for k, calls in enumerate(found) if any(calls)] == [5, 9]
+    assert all(calls[1] is False for calls in found), "in the cycle after the contact"
 
 
 def test_an_answer_stands_at_the_contact_after_which_it_was_due():
     tracker = ShapeTracker(InThree(), every=2)
     taken(tracker, [0.0, 0.005])
     tracker.answer()
-    taken(tracker, [0.01])
-    tracker.answer()
-    assert tracker.answer() is not None
+    assert answered(tracker, [0.01, 0.011]) == [[False, False], [True, False]]
     (record,) = tracker.records
     assert record.t_s == 0.005 and record.travelled_m == pytest.approx(25e-3 * 0.005)
 
@@ -77,11 +85,8 @@ def test_an_answer_stands_at_the_contact_after_which_it_was_due():
 def test_what_is_due_meanwhile_is_begun_afterwards():
     estimator = InThree()
     tracker = ShapeTracker(estimator, every=1)
-    taken(tracker, [0.0])
-    tracker.answer()
-    taken(tracker, [0.005])
-    answers = [tracker.answer() is not None for _ in range(6)]
-    assert answers == [False, True, False, False, True, False] and estimator.asked == 2
+    found = [any(calls) for calls in answered(tracker, [0.005 * k for k in range(7)])]
+    assert found == [False, False, True, False, False, True, False] and estimator.asked == 2
 
 
 def test_a_new_contact_makes_an_unfinished_answer_void():
@@ -89,9 +94,8 @@ def test_a_new_contact_makes_an_unfinished_answer_void():
     tracker = ShapeTracker(estimator, every=2)
     taken(tracker, [0.0, 0.005])
     tracker.answer()
-    taken(tracker, [1.0])
-    assert estimator.resets == 1
-    assert [tracker.answer() for _ in range(4)] == [None] * 4 and not tracker.records
+    assert answered(tracker, [1.0], calls=4) == [[False] * 4]
+    assert estimator.resets == 1 and not tracker.records
 
 
 def test_a_diverged_answer_starts_the_estimator_afresh():

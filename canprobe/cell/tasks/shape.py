@@ -41,8 +41,9 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    A contact is taken and an answer worked out by calls of their own: together they take longer than either. An answer
-    comes in parts, one a call, as the whole would hold up the cycle in which it is due.
+    A contact is taken and an answer worked out by calls of their own: together they take longer than either, and the
+    loop has a cycle between two images for the answer. It comes in parts, one after each contact, as the whole would
+    hold up its cycle; a later part may know a contact more than the first.
 
     Args:
         estimator: the online estimator.
@@ -68,6 +69,7 @@ class ShapeTracker:
         self._due = False
         self._answering: Answering | None = None
         self._place = (0.0, 0.0)
+        self._turn = False
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
@@ -81,9 +83,13 @@ class ShapeTracker:
         self.samples.append(sample)
         self._estimator.add(sample)
         self._due = len(self.samples) % self._every == 0
+        self._turn = True
 
     def answer(self) -> SurfaceEstimate | None:
         """Work on the estimate that is due; it, once, at the contact after which it was due, where it can be given."""
+        if not self._turn:
+            return None
+        self._turn = False
         if self._answering is None:
             if not self._due or self._last is None:
                 return None
@@ -101,6 +107,7 @@ class ShapeTracker:
         """All parts of the estimate that is due."""
         estimate = self.answer()
         while self._answering is not None:
+            self._turn = True
             estimate = self.answer()
         return estimate
 
