@@ -158,11 +158,11 @@ class _Observations:
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
-    """What the scene's estimator said, by the instant of its last sample, ns."""
+    """What the scene's estimator said, by the instant of the sample after which it did, ns."""
     if result is None:
         return {}
     records = next(iter(result.estimates.values()))
-    return {round(record.t_s * 1e9): record.estimate for record in records}
+    return {round(record.told_s * 1e9): record.estimate for record in records}
 
 
 def _columns(folder: Path | None) -> dict[int, dict[str, float | NDArray[np.float64]]]:

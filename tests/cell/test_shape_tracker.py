@@ -79,6 +79,7 @@ def test_an_answer_stands_at_the_contact_after_which_it_was_due():
     tracker.answer()
     assert answered(tracker, [0.01, 0.011]) == [[False, False], [True, False]]
     (record,) = tracker.records
+    assert record.told_s == 0.011
     assert record.t_s == 0.005 and record.travelled_m == pytest.approx(25e-3 * 0.005)
 
 

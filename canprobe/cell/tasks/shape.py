@@ -31,11 +31,13 @@ class ShapeRecord:
         t_s: instant of its last sample, on the cycle's clock, s.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
+        told_s: instant of the contact in the cycle after which it was told, s.
     """
 
     t_s: float
     travelled_m: float
     estimate: SurfaceEstimate
+    told_s: float
 
 
 class ShapeTracker:
@@ -119,7 +121,8 @@ class ShapeTracker:
             self.restarts += 1
             self._estimator.reset()
             return None
-        self.records.append(ShapeRecord(*self._place, estimate))
+        assert self._last is not None
+        self.records.append(ShapeRecord(*self._place, estimate, self._last.t_s))
         return estimate
 
 
