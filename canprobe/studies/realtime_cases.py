@@ -66,7 +66,8 @@ def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measu
 
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
     """Six drives and the sensor at half their rate, none of them started by the session."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL, bitrate=WIRE_BITRATE)
+    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
+    scene = replace(scene, bus=replace(scene.bus, bitrate=WIRE_BITRATE))  # no CAN has it, so no scene may ask for it
     real = with_real_nodes(replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz)))
     assert real.sensor is not None
     return replace(real, sensor=replace(real.sensor, mode=mode, rate_hz=rate_hz / 2))
