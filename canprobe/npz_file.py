@@ -1,8 +1,9 @@
-"""Read the columns of a run's ``.npz`` file, or say what is wrong with it."""
+"""Write columns into an ``.npz`` file, read them, or say what is wrong with it."""
 
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,18 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError
 
 
-def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays into exactly this file, compressed: numpy would append ``.npz`` to a name."""
+    with path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **columns)
+
+
+def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:
     """Every array of an ``.npz`` file.
 
     Args:
         path: of the file.
+        expected: what it should be, in words.
 
     Raises:
         UsageError: no such file, or it is cut off, empty or something else.
@@ -25,7 +33,7 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
             saved = np.load(opened, allow_pickle=False)
             if not isinstance(saved, np.lib.npyio.NpzFile):
-                raise UsageError(f"{path}: expected an .npz of a run, got a single array")
+                raise UsageError(f"{path}: expected {expected}, got a single array")
             return {name: saved[name] for name in saved.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{path}: expected an .npz of a run; cannot be read: {error}") from error
+        raise UsageError(f"{path}: expected {expected}; cannot be read: {error}") from error

@@ -16,6 +16,7 @@ from canprobe.cell.replay import replay_contacts, replay_task
 from canprobe.cell.tasks.build import estimates_of
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import ProtocolError, UsageError
+from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.recorded_summary import estimate_columns, replay_text, summarise_replay
 from canprobe.scene import Scene
@@ -54,8 +55,7 @@ class ReplayResult:
         columns: dict[str, Array] = {}
         for method, records in self.estimates.items():
             columns |= {f"{method}_{name}": values for name, values in estimate_columns(records).items()}
-        with Path(path).open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **columns)
+        write_npz(Path(path), columns)
 
 
 def replay(

@@ -22,7 +22,6 @@ Columns (n patches, m path points; base frame; mixed units are SI in the stated 
 
 from __future__ import annotations
 
-import zipfile
 from os import PathLike
 from pathlib import Path
 
@@ -30,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
+from canprobe.npz_file import read_npz, write_npz
 from canprobe.touch.local_patch import LocalPatch
 from canprobe.touch.surface_map import SurfaceMap
 
@@ -71,8 +71,7 @@ def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None
             value = np.asarray(getattr(patch, field), np.float64)
             column[(i, slice(len(value))) if value.ndim else i] = value
         columns[name] = column
-    with Path(path).open("wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **columns)
+    write_npz(Path(path), columns)
 
 
 def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
@@ -88,7 +87,9 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
     file = Path(path)
     if file.is_dir():
         file = file / "surface.npz"
-    columns = _read(file)
+    if not file.exists():
+        raise UsageError(f"{file}: no such file; a run writes surface.npz where its scene asks for a shape")
+    columns = read_npz(file, "an npz file with a surface map")
     if (version := columns.get("format_version")) is None:
         raise UsageError(f"{file}: expected a surface map, got a file without 'format_version'")
     if version.shape != () or version != FORMAT_VERSION:
@@ -104,19 +105,6 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
         raise UsageError(f"{file}: method: expected a name, got {method.dtype} of shape {method.shape}")
     _check(file, columns)
     return _build(file, columns, str(method))
-
-
-def _read(file: Path) -> dict[str, NDArray[np.generic]]:
-    try:
-        with file.open("rb") as opened:  # numpy leaves a file open that it cannot read
-            saved = np.load(opened, allow_pickle=False)
-            if isinstance(saved, np.ndarray):
-                raise UsageError(f"{file}: expected an npz file with a surface map, got a single array")
-            return {name: saved[name] for name in saved.files}
-    except FileNotFoundError as error:
-        raise UsageError(f"{file}: no such file; a run writes surface.npz where its scene asks for a shape") from error
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        raise UsageError(f"{file}: expected an npz file with a surface map; cannot be read: {error}") from error
 
 
 def _check(file: Path, columns: dict[str, NDArray[np.generic]]) -> None:
