@@ -181,21 +181,12 @@ class TimedBus(LockstepBus):
                     if start <= until_ns and (due is None or start < due):
                         entry = heappop(self._ready)
                         bits = length(*entry[3]) - INTERMISSION_BITS
-                        self._flying, self._hit = entry, False
-                        end = self._end_ns = start + (bits * bit_ns or self._bits_ns(bits))
-                        self._free_ns = end + self._gap_ns
-                        self.busy_ns += self._free_ns - start
+                        self._fly(entry, start, start + (bits * bit_ns or self._bits_ns(bits)))
                 if entry is not None and (due is None or self._end_ns <= due):
-                    end = self._end_ns
-                    if end > until_ns:
+                    if self._end_ns > until_ns:
                         return True
-                    clock.move_ns(end)
-                    if self._hit or self._fifo:
-                        self._finish()
-                    else:
-                        self._flying = None
-                        self.frames += 1
-                        self._hand_over(entry[2], entry[3], end, ())
+                    clock.move_ns(self._end_ns)
+                    self._finish()
                 elif due is None or due > until_ns:
                     return True
                 else:
