@@ -42,9 +42,8 @@ class CyclicPosition(DriveMode):
 
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the following error and the master, latch the target received since the last SYNC."""
-        demand, supervision, window = self._motion.demand(t_ns), self._supervision, self._parameters.following_window
-        error = demand - counts
-        if (not -window <= error <= window or supervision.strays) and supervision.following_error(error, t_ns):
+        demand, supervision = self._motion.demand(t_ns), self._supervision
+        if supervision.following_error(demand - counts, t_ns):
             self.parts.fault(FOLLOWING_ERROR, t_ns)
             return
         fresh, self._fresh = self._fresh, False
@@ -56,7 +55,7 @@ class CyclicPosition(DriveMode):
         """Follow the target from where the reference is, `demand`."""
         values, parameters, units = self._values, self._parameters, self._units
         target: int = values[_TARGET] + values.get(_OFFSET, 0)  # type: ignore[assignment, operator]
-        allowed = target if parameters.low <= target <= parameters.high else parameters.clamp(target)
+        allowed = parameters.clamp(target)
         counts = allowed * units.scale + units.origin
         passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
         if abs(counts - demand) > parameters.max_speed * passed_ns * 1e-9 + ROUNDING_COUNTS:

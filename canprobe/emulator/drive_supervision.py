@@ -13,11 +13,7 @@ from canprobe.protocol.emcy import RPDO_TIMEOUT, SYNC_LOST
 
 
 class Supervision:
-    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error.
-
-    Attributes:
-        strays: the following error was outside its window when last looked at.
-    """
+    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error."""
 
     def __init__(self, node: SlaveNode, parameters: DriveParameters, on_loss: Callable[[int, int], None]) -> None:
         """`on_loss(code, t_ns)` is called when the master is taken for dead."""
@@ -25,13 +21,12 @@ class Supervision:
         self._timer = node.core.timers.new(self._sync_missing)
         self._misses = 0
         self._by_rpdo = False
-        self._outside_ns = 0
-        self.strays = False
+        self._outside_ns: int | None = None
 
     def start(self, target: int | None, t_ns: int) -> None:
         """Operation is enabled, in a mode that lives by SYNC and the object `target`, or by neither (None)."""
         self._misses = 0
-        self.strays = False
+        self._outside_ns = None
         self._timer.cancel()
         if target is not None:
             self._by_rpdo = self._node.pdos.receives(target)
@@ -56,10 +51,13 @@ class Supervision:
 
     def following_error(self, error_counts: float, t_ns: int) -> bool:
         """Whether the error has been outside 6065h for the time of 6066h."""
-        strayed, self.strays = self.strays, abs(error_counts) > self._parameters.following_window
-        if not strayed:
+        window = self._parameters.following_window
+        if abs(error_counts) <= window:
+            self._outside_ns = None
+            return False
+        if self._outside_ns is None:
             self._outside_ns = t_ns
-        return self.strays and t_ns - self._outside_ns >= self._parameters.following_timeout_ns
+        return t_ns - self._outside_ns >= self._parameters.following_timeout_ns
 
     def _sync_missing(self, due_ns: int) -> None:
         self._node.emcy.report(SYNC_LOST)

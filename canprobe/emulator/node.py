@@ -134,10 +134,7 @@ class SlaveNode:
             self._run(t_ns)
         core.now_ns = t_ns
         route(data, t_ns)
-        out = core.out  # as `_taken`
-        if out:
-            core.out = []
-        return out
+        return self._taken()
 
     def advance(self, t_ns: int) -> list[Frame]:
         """Do everything that is due up to and at `t_ns`."""

@@ -166,10 +166,9 @@ class PdoEngine:
             if group.first is not None and (count - group.first) % group.every == 0:
                 for sampler in group.samplers:
                     sampler(t_ns)
-                values, append = core.dictionary.values, core.out.append
+                values = core.dictionary.values
                 try:
-                    for cob_id, pack, fetch in group.packing:
-                        append((cob_id, pack(*fetch(values))))
+                    core.out += [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
                 except (struct.error, TypeError):
                     for tpdo in group.tpdos:
                         tpdo.send()  # the one with the value that does not fit says so

@@ -111,14 +111,12 @@ class Timers:
             if due == queued:
                 self.next_ns = self.holder.next_deadline_ns = due
                 return
-            if due is None or queued != timer.queued_ns:
-                if queued == timer.queued_ns:
-                    timer.queued_ns = None
-                heappop(heap)
-            else:
+            if timer.holds(queued) and due is not None:
                 timer.queued_ns = due
                 self._count += 1
                 heapreplace(heap, (due, self._count, timer))
+            else:
+                heappop(heap)
         self.next_ns = self.holder.next_deadline_ns = None
 
     def _compact(self) -> None:

@@ -61,10 +61,7 @@ class Plant:
         self.arm: IdealArm | DynamicArm | None = None
         self._pressed: PressedProbe | None = None
         if config.model is not None:
-            self.arm = arm = make_arm(config)
-            # What drives ask in every cycle goes straight to the arm; the methods below are of a plant without one.
-            self.set_ramp, self.motor_counts = arm.set_ramp, arm.motor_counts  # type: ignore[method-assign]
-            self.torque_permille = arm.torque_permille  # type: ignore[method-assign]
+            self.arm = make_arm(config)
         if config.object is not None and config.model is None:
             _refuse_tight_hollow(config)
             self._pressed = PressedProbe(config)
@@ -100,7 +97,7 @@ class Plant:
         Raises:
             RuntimeError: without an arm.
         """
-        self._need_arm()
+        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
 
     def motor_counts(self, axis: int) -> float:
         """Motor position now, counts, continuous; 0 without an arm.
@@ -108,7 +105,7 @@ class Plant:
         Args:
             axis: 0 to 5.
         """
-        return 0.0
+        return self.arm.motor_counts(axis) if self.arm is not None else 0.0
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
@@ -116,7 +113,7 @@ class Plant:
         Args:
             axis: 0 to 5.
         """
-        return 0
+        return self.arm.torque_permille(axis) if self.arm is not None else 0
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
