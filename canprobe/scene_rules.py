@@ -145,6 +145,12 @@ def _sensor_rate(cycle: float | None, sensor: float | None) -> str | None:
     return f"expected at most cycle.rate_hz = {cycle:g}, got {sensor:g}: frames are triggered by SYNC"
 
 
+def _compute_time(rate: float | None, compute_us: float | None) -> str | None:
+    if rate is None or compute_us is None or compute_us * rate < 1e6:
+        return None
+    return f"expected less than the {1e6 / rate:g} µs of a cycle (cycle.rate_hz = {rate:g}), got {compute_us:g}"
+
+
 RULES: tuple[Rule, ...] = (
     Rule("sensor.node_id", ("arm.node_ids", "sensor.node_id"), _duplicate_node),
     Rule("object", ("task.kind", "sensor.emulated", "object"), _object_missing),
@@ -157,6 +163,7 @@ RULES: tuple[Rule, ...] = (
     Rule("object.ring_radius_mm", ("object.kind", "object.ring_radius_mm", "object.radius_mm"), _torus_radii),
     Rule("task.force_n", ("task.kind", "task.force_n", "limits.force_max_n"), _force_target),
     Rule("sensor.rate_hz", ("cycle.rate_hz", "sensor.rate_hz"), _sensor_rate),
+    Rule("cycle.compute_us", ("cycle.rate_hz", "cycle.compute_us"), _compute_time),
 )
 
 

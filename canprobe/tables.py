@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
-from canprobe.npz_file import read_npz
+from canprobe.npz_file import read_npz, write_npz
 
 if TYPE_CHECKING:
     import pandas
@@ -122,7 +122,7 @@ def parquet_to_npz(parquet: Path | str, npz: Path | str) -> None:
         UsageError: no such file, not one of ours, or the extra is missing.
     """
     columns, _ = _read_parquet(Path(parquet))
-    np.savez_compressed(npz, allow_pickle=False, **columns)
+    write_npz(Path(npz), columns)
 
 
 def write_parquet(

@@ -150,7 +150,13 @@ def _check_syncs(recording: Recording, plan: Plan) -> None:
     where = f"{recording.path}: on {recording.channel}"
     if len(recording.syncs) < 2:
         raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h); a replay goes from SYNC to SYNC")
-    period = float(np.median(np.diff(recording.sync_stamps)))
+    steps = np.diff(recording.sync_stamps)
+    if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):
+        raise UsageError(
+            f"{where} {twice} of {len(recording.syncs)} SYNCs (080h) at once with the one before: was every"
+            " frame logged twice?"
+        )
+    period = float(np.median(steps))
     if abs(period - plan.sync.period_ns) > RATE_TOLERANCE * plan.sync.period_ns:
         raise UsageError(
             f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.scene.name} has one every"

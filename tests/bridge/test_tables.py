@@ -60,8 +60,8 @@ def test_units_are_read_off_the_names(name, unit):
 def test_a_file_goes_to_parquet_and_back_bit_by_bit(run, tmp_path, name):
     folder, _ = run
     npz_to_parquet(folder / name, tmp_path / "table.parquet")
-    parquet_to_npz(tmp_path / "table.parquet", tmp_path / "back.npz")
-    with np.load(folder / name) as before, np.load(tmp_path / "back.npz") as after:
+    parquet_to_npz(tmp_path / "table.parquet", tmp_path / "back.of.a.run")  # into exactly this file
+    with np.load(folder / name) as before, np.load(tmp_path / "back.of.a.run") as after:
         assert before.files == after.files
         for column in before.files:
             assert before[column].dtype == after[column].dtype

@@ -31,13 +31,14 @@ def test_pdos_of_another_mapping_are_told(lockstep_run, copy_of):
         (lambda lines: [*lines[:1999], lines[1999][:25], *lines[2000:]], r"bus\.log:2000: no candump line"),
         (lambda lines: [], "no frame at all; node 1 "),
         (lambda lines: [restamped(x, 2 * stamp_us(x)) for x in lines], "a SYNC every 5.000 ms, but .* every 2.500 ms"),
+        (lambda lines: [line for line in lines for _ in range(2)], r"on can0 \d+ of \d+ SYNCs .*logged twice\?"),
         (lambda lines: lines[: len(lines) // 4], "nothing was touched"),
         (
             lambda lines: [x.replace("183#37", "183#FF") for x in lines],
             r"bus\.log: on can0: statusword 0x..ff is no CiA 402 state",
         ),
     ],
-    ids=["no sync", "torn line", "empty", "other rate", "no contact", "no state"],
+    ids=["no sync", "torn line", "empty", "other rate", "doubled", "no contact", "no state"],
 )
 def test_a_log_that_cannot_be_replayed(lockstep_run, copy_of, change, message):
     with pytest.raises(UsageError, match=message):

@@ -241,3 +241,14 @@ def test_a_value_that_does_not_fit_its_pdo_is_named(bench):
     bench.node.dictionary.values[key_of(0x2001)] = 1 << 32
     with pytest.raises(ProtocolError, match="PDO 0x185: cannot pack"):
         bench.send(0x80, "")
+
+
+def test_pdos_before_one_that_cannot_be_packed_are_sent_once(bench):
+    configure(bench, 0x1801, cob_id=0x285, words=[0x20020010], type=1)
+    bench.nmt(0x01)
+    bench.node.dictionary.values[key_of(0x2002)] = 1 << 16
+    bench.write(0x1800, 1, OFF | 0x185, 4)
+    configure(bench, 0x1800, cob_id=0x185, words=[0x20010020], type=1)
+    with pytest.raises(ProtocolError, match="PDO 0x285: cannot pack"):
+        bench.send(0x80, "")
+    assert [can_id for can_id, _ in bench.node.core.out] == [0x185]

@@ -107,6 +107,7 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
         ("bus", "bitrate = 2000000", "bus.bitrate", ("from 10000 to 1000000",)),
         ("bus", "channel = ''", "bus.channel", ('got ""',)),
         ("cycle", "rate_hz = 0", "cycle.rate_hz", ("from 1 to 2000",)),
+        ("cycle", "compute_us = 2500", "cycle.compute_us", ("less than the 2500 µs of a cycle", "got 2500")),
         ("arm", "model = 'upen'", "arm.model", ("upenn, unimate", "did you mean upenn?")),
         ("arm", "emulated = 1", "arm.emulated", ("true or false", "got 1")),
         ("arm", "node_ids = [1, 2, 3, 4, 5, 5]", "arm.node_ids", ("all different",)),
