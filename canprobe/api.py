@@ -105,7 +105,7 @@ def run(
     controller = make_task(plan)
     failure: BaseException | None = None
     with Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges:
-        session = Session(resolved, folder, say, (*observers, *bridges.observers))
+        session = Session(plan, folder, say, (*observers, *bridges.observers))
         try:
             with session:
                 session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
@@ -265,9 +265,10 @@ def open_cell(
         bridge=bridge,
     )
     folder = Path(out) if out is not None else None
+    plan = make_plan(resolved)
     with (
-        Bridges(make_plan(resolved), folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
-        Session(resolved, folder, say, (*observers, *bridges.observers), rows_kept) as session,
+        Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
+        Session(plan, folder, say, (*observers, *bridges.observers), rows_kept) as session,
     ):
         yield session
 
@@ -296,7 +297,7 @@ def up(
     check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
-        telling_notes(Session(resolved, None, say, bridges.observers, ROWS_OF_UP), say) as session,
+        telling_notes(Session(plan, None, say, bridges.observers, ROWS_OF_UP), say) as session,
     ):
         say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
         session.run(_requested(plan, None, lambda: make_task(plan), bridges), news_teller(session, say))
