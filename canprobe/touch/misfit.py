@@ -84,12 +84,14 @@ class Averaged(NamedTuple):
         shift: (9,) what to add to them.
         spread: (9, 9) covariance that the terms add to theirs.
         share: (9,) how much of each direction of the terms the data settle: mean variance left.
+        terms: (9,) the terms in these directions.
         misfit, trusted: as of `Corrected`.
     """
 
     shift: Array
     spread: Array
     share: Array
+    terms: Array
     misfit: float
     trusted: bool
 
@@ -133,7 +135,7 @@ def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float =
     spread.flat[60::10] += LEFT_OUT**2 * changed / _PER_SQUARE  # of K
     trusted = changed <= (TRUST * max(curvature, 1.0)) ** 2
     shown = 1.0 - NONE * float(evidence[0] / (_PRIOR @ evidence))
-    return Averaged(mean, spread, left, shown, trusted)
+    return Averaged(mean, spread, left, weight @ (share * s), shown, trusted)
 
 
 def _prior(blur: float) -> Array:

@@ -103,9 +103,10 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
     found = sums.amend(c, H, np.zeros(3))
-    direct = np.linalg.lstsq(flat, residuals, rcond=None)[0][:9]  # terms that show: those that fit best
+    both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
-    assert np.allclose(found.c - c, direct, atol=0.02)
+    assert np.allclose(found.c - c, both[:9], atol=0.02)
+    assert np.allclose(sums.explanation(c, H), both, atol=0.02)
     wide = np.linalg.inv(flat.T @ flat)[:9, :9]
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)
@@ -136,6 +137,23 @@ def test_on_a_torus_the_filter_says_how_far_it_is_off():
     assert len(hits[False]) >= 6
     assert np.mean(hits[False]) > 0.75
     assert np.mean(hits[False]) > np.mean(hits[True])
+
+
+@pytest.mark.parametrize("path", ["weave", "circle"])
+def test_a_torus_felt_finely_is_no_change_of_the_surface(path):
+    """At 5 µm every sample disagrees with a quadric, as those before let expect: the memory is kept, and K is right."""
+    from canprobe.studies.ground import make_ground
+
+    ground = make_ground("torus", 0.04, path, 0.02, 160)
+    found = []
+    for seed in range(8):
+        points, normals = ground.felt(5e-6, 2e-4, RNG(seed))
+        e = fit_surface(points, normals, sigma_point=5e-6, sigma_normal=2e-4, method="recursive")
+        assert e.rank == 3
+        assert not [note for note in e.notes if "changed" in note]
+        error = ground.error(e.T_frame_contact, e.K)
+        found.append(error @ np.linalg.solve(e.covariance, error) < 7.815)
+    assert np.mean(found) > 0.75
 
 
 def test_where_k_is_its_noise_the_others_hardly_count():

@@ -8,6 +8,7 @@ measured by what it usually is, since stated standard deviations are often gener
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -69,6 +70,10 @@ class ChangeTest:
         if len(self._last) == LAST_FEW:
             self._of_best += LONG_TERM * (best - self._of_best)
         return False
+
+    def usual_again(self, squares: Sequence[float]) -> bool:
+        """Whether such squared innovations alone would set off no alarm, once something is taken into account."""
+        return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM * self.usual
 
     def alarm(self) -> None:
         """Count a change; the running innovation begins again at what is usual."""

@@ -59,11 +59,16 @@ def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Tou
     return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
 
 
-def squared_innovations(e: Equations, inverse: Array) -> list[float]:
-    """Squared innovation of each contact, χ² of 3, under an inverse root (9, 9) of the information."""
-    predicted = e.rows[:, :, :9] @ inverse
+def squared_innovations(rows: Array, residuals: Array, inverse: Array) -> list[float]:
+    """Squared innovation of contacts with rows (n, 3, 18) and residuals (n, 3), χ² of 3.
+
+    Args:
+        rows, residuals: as of `Equations`.
+        inverse: (9, 9) of the root of the information.
+    """
+    predicted = rows[:, :, :9] @ inverse
     variance = 1.0 + np.square(predicted).sum(axis=2)
-    found: list[float] = (np.square(e.residuals) / variance).sum(axis=1).tolist()
+    found: list[float] = (np.square(residuals) / variance).sum(axis=1).tolist()
     return found
 
 

@@ -56,6 +56,28 @@ class Expected(NamedTuple):
 AS_STATED = Expected()
 
 
+class _Along(NamedTuple):
+    """The terms along directions in which what the samples say about them is independent.
+
+    Attributes:
+        information, score: (9,) as for `averaged`.
+        off: (9, 9) what a unit along each does to the parameters.
+        terms: (9, 9) the terms of such a unit.
+        shared: (18, 9) covariance of the score with that of the terms.
+        weighted: (9, 9) weights of what the samples say.
+        curvature, blur: as for `averaged`.
+    """
+
+    information: Array
+    score: Array
+    off: Array
+    terms: Array
+    shared: Array
+    weighted: Array
+    curvature: float
+    blur: float
+
+
 class LeftOut:
     """Sums over the rows of parameters and terms.
 
@@ -111,6 +133,21 @@ class LeftOut:
             place: (3,) where the answer is wanted, in the filter's frame.
             expected: of the samples.
         """
+        a = self._along(c, H, expected)
+        off = a.off
+        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ a.terms
+        found = averaged(a.information, a.score, -off, a.curvature, a.blur)
+        both = H @ a.shared[:9] @ (a.weighted * found.share) @ off.T
+        return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
+
+    def explanation(self, c: Array, H: Array, expected: Expected = AS_STATED) -> Array:
+        """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
+        a = self._along(c, H, expected)
+        found = averaged(a.information, a.score, -a.off, a.curvature, a.blur)
+        return np.concatenate([found.shift, a.terms @ found.terms])
+
+    def _along(self, c: Array, H: Array, expected: Expected) -> _Along:
+        """The terms along directions in which the samples know them independently."""
         curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
@@ -122,11 +159,7 @@ class LeftOut:
         m = D[:, None] * (self._information[9:] @ X)
         weighted = solved(V, m)
         values, U = eigen(m @ weighted)
-        s = U.T @ (weighted.T @ (D * self._slope))
-        off = X[:9]
-        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] * D
-        off = off @ U
+        information = np.maximum(values, 0.0) / expected.noise
+        s = U.T @ (weighted.T @ (D * self._slope)) / expected.noise
         blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
-        found = averaged(np.maximum(values, 0.0) / expected.noise, s / expected.noise, -off, curvature, blur)
-        both = H @ shared[:9] @ (weighted @ U * found.share) @ off.T
-        return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
+        return _Along(information, s, X[:9] @ U, D[:, None] * U, shared, weighted @ U, curvature, blur)

@@ -158,10 +158,14 @@ class RecursiveEstimator:
         compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
         if compared and any([self._change.take(square, caution) for square in compared.squares]):
-            self._change.alarm()
-            self._drop_agreeing(compared.squares)
-            self._spread.fade(0.0)
-            self._start = Start(self._memory, self._prior)
+            explained = self._explained(compared.equations)
+            if explained is None:
+                self._change.alarm()
+                self._drop_agreeing(compared.squares)
+                self._spread.fade(0.0)
+                self._start = Start(self._memory, self._prior)
+            else:
+                compared = explained
         if self._start is not None:
             self._begin_with(self._start, moved)
         elif compared:
@@ -169,7 +173,19 @@ class RecursiveEstimator:
 
     def _compared(self) -> _Compared:
         found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
-        squares = squared_innovations(found, self._filter.inverse)
+        return self._judged(found, found.residuals)
+
+    def _explained(self, found: Equations) -> _Compared | None:
+        """As `_compared`, where the contacts are as the terms that a quadric leaves out had them expected."""
+        if self._quadric:
+            return None
+        f = self._filter
+        terms = f.left_out.explanation(f.c, f.inverse @ f.inverse.T, self._expected())
+        left = self._judged(found, found.residuals - found.rows @ terms)
+        return left if self._change.usual_again(left.squares) else None
+
+    def _judged(self, found: Equations, residuals: Array) -> _Compared:
+        squares = squared_innovations(found.rows, residuals, self._filter.inverse)
         return _Compared(found, squares, [p.weight * weight_of(s) for p, s in zip(self._pending, squares, strict=True)])
 
     def _absorb(self, compared: _Compared, moved: float) -> None:
