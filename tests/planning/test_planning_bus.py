@@ -358,8 +358,9 @@ def test_a_controller_that_takes_too_long_is_refused(cylinder):
     budget = make_plan(cylinder).traffic.budget
     longest = (budget.slack_ns + budget.compute_ns) / 1000
     assert make_plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
-    problems = reasons(change(cylinder, cycle={"compute_us": longest + 1}))
-    assert "1 µs behind the next SYNC" in problems[0]
+    longer = change(cylinder, cycle={"compute_us": longest + 1})
+    assert "1 µs behind the next SYNC" in reasons(longer)[0]
+    assert f"cycle.compute_us = {longest:.0f}" in [way.partition(":")[0] for way in ways_out(longer)]
 
 
 def test_a_sensor_alone_has_a_budget_too():
