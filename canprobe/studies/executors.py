@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import re
 import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
@@ -53,12 +54,14 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
     Raises:
         UsageError: package `distributed` is not there.
-        StudyError: no scheduler answers.
+        StudyError: that is no address, or no scheduler answers.
     """
     try:
         from distributed import Client
     except ImportError as error:
         raise UsageError("--dask needs the package distributed: pip install 'canprobe[dask]'") from error
+    if not re.search(r":[0-9]+$", address):  # a Client that fails at once takes twenty seconds to end
+        raise StudyError(f"--dask {address}: expected the address and port of a Dask scheduler, as tcp://10.0.0.1:8786")
     try:
         client = Client(address, timeout=_DASK_WAIT, set_as_default=False)
     except (OSError, ValueError) as error:

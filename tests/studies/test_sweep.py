@@ -260,6 +260,14 @@ def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
         assert len(measured(tmp_path)) == 6
 
 
+def test_a_dask_address_has_a_port():
+    with (
+        pytest.raises(StudyError, match=r"--dask nonsense: expected the address and port .* tcp://"),
+        dask_executor("nonsense"),
+    ):
+        pass
+
+
 def test_dask_is_asked_for_by_name_or_address(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(UsageError, match=r"pip install 'canprobe\[dask\]'"), dask_executor("tcp://127.0.0.1:1"):
