@@ -10,9 +10,11 @@ from __future__ import annotations
 import contextlib
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 from canprobe.bus.guest import PACKAGE, GuestError, GuestJob, is_installed
 from canprobe.bus.socketcan import check_interface, has_socketcan
@@ -23,6 +25,9 @@ CHANNEL = "vcan0"
 NO_VCAN = 125
 GUEST_LOST = 123
 WAY = "CANPROBE_VCAN"
+
+_MAPPINGS = Path("/proc/sys/vm/max_map_count")
+_ENOUGH_MAPPINGS = 1 << 20  # of 4 KiB: more than the guest's memory
 
 _MAKE_LINK = f"ip link add dev {CHANNEL} type vcan && ip link set {CHANNEL} up"
 _IN_NAMESPACE = f'ip link set lo up; {_MAKE_LINK} && exec "$@"'
@@ -83,6 +88,8 @@ def _supervise_guest(job: GuestJob, signals: Signals, timeout_s: float | None) -
         return interrupted
     status, timed_out = supervise(job, signals, timeout_s)
     _report_time_out(timed_out, timeout_s)
+    if status == 128 + signal.SIGKILL:
+        _report_killed()
     job.halt()
     return status
 
@@ -157,6 +164,20 @@ def _install(line: str) -> bool:
 def _report_time_out(timed_out: bool, timeout_s: float | None) -> None:
     if timed_out:
         _say(f"the command was stopped after {timeout_s:g} s")
+
+
+def _report_killed() -> None:
+    """The guest maps the pages of its processes one by one, and its kernel kills a process that cannot map another."""
+    try:
+        mappings = int(_MAPPINGS.read_text())
+    except (OSError, ValueError):
+        return
+    if mappings < _ENOUGH_MAPPINGS:
+        _say(
+            f"the command was killed; a process that holds more than about {mappings // 256} MiB is, as "
+            f"vm.max_map_count is {mappings} on this machine; type:  {'' if os.geteuid() == 0 else 'sudo '}"
+            f"sysctl vm.max_map_count={_ENOUGH_MAPPINGS}"
+        )
 
 
 def _no_vcan(why: str) -> int:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import deque
 from collections.abc import MutableSequence
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,19 +38,25 @@ class RunLog:
         """Every column that the rows have, (n,) or (n, k).
 
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
+        One column after the other: all of them at once take as much memory again as the rows.
         """
-        columns: dict[str, dict[int, object]] = {}
-        for i, (names, values) in enumerate(self._rows):
-            for name, value in zip(names, values, strict=True):
-                columns.setdefault(name, {})[i] = value
-        return {name: self._array(name, column) for name, column in columns.items()}
+        kinds = {id(names): names for names, _ in self._rows}
+        return {
+            name: self._array(name, {kind: names.index(name) for kind, names in kinds.items() if name in names})
+            for name in dict.fromkeys(chain.from_iterable(kinds.values()))
+        }
 
-    def _array(self, name: str, column: dict[int, object]) -> NDArray[np.float64]:
-        known = {i: value for i, value in column.items() if value is not None}
-        shape = np.asarray(next(iter(known.values()))).shape if known else ()
+    def _array(self, name: str, places: dict[int, int]) -> NDArray[np.float64]:
+        """A column, which rows of some kinds (the identity of their names) have at these places."""
+        known = [
+            (i, value)
+            for i, (names, values) in enumerate(self._rows)
+            if (place := places.get(id(names))) is not None and (value := values[place]) is not None
+        ]
+        shape = np.asarray(known[0][1]).shape if known else ()
         out = np.full((len(self._rows), *shape), np.nan)
         misfits = 0
-        for i, value in known.items():
+        for i, value in known:
             try:
                 out[i] = value
             except (TypeError, ValueError):

@@ -84,6 +84,16 @@ def test_time_out_ends_command_and_guest(tmp_path: Path) -> None:
     assert b"canprobe: vcan: the command was stopped after 0.5 s" in err
 
 
+@pytest.mark.skipif(has_socketcan(), reason="the command would not run in a guest")
+@needs_guest
+def test_a_killed_command_is_told_what_kills_there(tmp_path: Path) -> None:
+    process = start(tmp_path, "--", "sh", "-c", "kill -KILL $$")
+    _, error = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGKILL
+    few = int(Path("/proc/sys/vm/max_map_count").read_text()) < 1 << 20
+    assert (b"sysctl vm.max_map_count=1048576" in error) == few
+
+
 @needs_guest
 def test_a_guest_that_panics_is_told_from_a_command_that_fails(tmp_path: Path) -> None:
     with (
