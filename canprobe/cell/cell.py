@@ -6,8 +6,6 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
@@ -364,9 +362,8 @@ class Cell:
             row["torque_permille"] = measurement.torque_permille
         if command is not None:
             if command.q_target is not None:
-                row["q_target_rad"] = np.array(command.q_target)  # a copy: controllers of users write into theirs
-            for name, value in command.columns.items():
-                row[name] = value.copy() if isinstance(value, np.ndarray) else value
+                row["q_target_rad"] = command.q_target
+            row.update(command.columns)
         self.log.add(row)
         if self._observers is not None and self.cycle is not None:
             self._observers.cycle(self.cycle.t_first_ns, measurement, command)

@@ -52,6 +52,24 @@ def test_a_value_of_another_shape_costs_only_itself():
     np.testing.assert_array_equal(columns["a"], [[1.0] * 3, [np.nan] * 3, [np.nan] * 3, [2.0] * 3])
 
 
+def test_rows_of_other_names_have_no_other_shape():
+    log = RunLog()
+    for row in ({"a": 1.0}, {"a": np.ones(3), "b": 2.0}, {"b": 3, "a": 4}, {"a": 10**400}, {"a": 5.0}):
+        log.add(row)
+    with pytest.warns(UserWarning, match=r"2 values of column 'a' are no numbers of shape \(\)"):
+        columns = log.arrays()
+    np.testing.assert_array_equal(columns["a"], [1.0, np.nan, 4.0, np.nan, 5.0])
+    np.testing.assert_array_equal(columns["b"], [np.nan, 2.0, 3.0, np.nan, np.nan])
+
+
+def test_a_controller_may_write_into_what_it_gave():
+    log, value = RunLog(), np.zeros(2)
+    for k in range(3):
+        value[:] = k
+        log.add({"a": value, "b": k if k else None})
+    np.testing.assert_array_equal(log.arrays()["a"], [[0.0, 0.0], [1.0, 1.0], [2.0, 2.0]])
+
+
 def test_statistics_of_the_last_cycles():
     kept, all_ = CycleStatistics.of_last(3), CycleStatistics.of_last(None)
     for statistics in (kept, all_):
