@@ -249,7 +249,7 @@ def open_cell(
         out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
         say: called with each step.
         observers, bridge: as for :func:`run`.
-        rows_kept: cycles whose row of the log is kept; all by default, which grows by 3 KiB a cycle.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
