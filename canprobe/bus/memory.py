@@ -10,7 +10,7 @@ from collections.abc import Iterator
 BYTES_PER_CYCLE = 4 << 10
 """A cycle that keeps its frames, log rows and truth grows by 1 to 3 KiB."""
 LEAST_RESERVE, LARGEST_RESERVE = 4 << 20, 32 << 20
-"""Bytes taken in advance; what a run of 20 s at 400 Hz grows by."""
+"""Bytes taken in advance; more than a run of 20 s at 400 Hz grows by."""
 _SMALL = 480  # bytes; objects up to 512 come from Python's own allocator, larger ones from the C library
 _KEEP_EVERY = (256 << 10) // 512
 

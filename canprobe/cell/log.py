@@ -53,10 +53,10 @@ class _Kind:
         if any(value.dtype.kind not in "biuf" for value in values):
             return
         self._block = np.empty(sum(value.size for value in values))
-        ends = np.cumsum([value.size for value in values])
-        self._views = [
-            self._block[end - value.size : end].reshape(value.shape) for end, value in zip(ends, values, strict=True)
-        ]
+        start = 0
+        for value in values:
+            self._views.append(self._block[start : start + value.size].reshape(value.shape))
+            start += value.size
 
 
 class RunLog:

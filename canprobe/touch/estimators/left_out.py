@@ -134,7 +134,7 @@ class LeftOut:
             expected: of the samples.
         """
         a = self._along(c, H, expected)
-        off = a.off
+        off = a.off.copy()
         off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ a.terms
         found = averaged(a.information, a.score, -off, a.curvature, a.blur)
         both = H @ a.shared[:9] @ (a.weighted * found.share) @ off.T
