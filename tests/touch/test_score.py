@@ -37,7 +37,7 @@ def test_steps_add_up_across_a_change_of_frame(correlation):
     back = np.eye(9) + 0.2 * rng.normal(size=(9, 9))
     score = Score(np.zeros((9, 9)), correlation)
     for k, (J, (_, moved, kept)) in enumerate(zip(rows, STEPS, strict=True)):
-        score.take((J if k < 2 else J @ back).reshape(-1, 9), moved, kept)
+        score.take((J if k < 2 else J @ back).reshape(-1, 9), moved, kept, 0.0)
         if k == 1:
             score.carry(back)
     assert np.allclose(score.matrix, of_all(np.concatenate(rows) @ back, places, weights, correlation))
@@ -48,7 +48,7 @@ def test_a_batch_goes_on_as_steps():
     first, then = rng.normal(size=(6, 3, 9)), rng.normal(size=(2, 3, 9))
     score = Score(PRIOR, correlation)
     score.start(first, 1e-3)
-    score.take(then.reshape(-1, 9), 0.4e-3, 0.9)
+    score.take(then.reshape(-1, 9), 0.4e-3, 0.9, 1.0 - 0.9**2)
     places = np.concatenate([np.linspace(0.0, 1e-3, 6), [1.2e-3, 1.4e-3]])
     weights = np.array(6 * [0.9] + 2 * [1.0])
     assert np.allclose(score.matrix, PRIOR + of_all(np.concatenate([first, then]), places, weights, correlation))
@@ -57,8 +57,8 @@ def test_a_batch_goes_on_as_steps():
 def test_independent_rows_count_with_their_weight_squared():
     J = np.random.default_rng(2).normal(size=(2, 9, 9))
     score = Score(PRIOR, None)
-    score.take(J[0], 1e-3, 0.9)
-    score.take(J[1], 1e-3, 0.5)
+    score.take(J[0], 1e-3, 0.9, 1.0 - 0.9**2)
+    score.take(J[1], 1e-3, 0.5, 1.0 - 0.5**2)
     assert np.allclose(score.matrix, PRIOR + 0.25 * J[0].T @ J[0] + J[1].T @ J[1])
     score.reset()
     assert np.allclose(score.matrix, PRIOR)

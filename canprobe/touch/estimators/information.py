@@ -1,8 +1,15 @@
-"""A square-root information filter for the nine-parameter model, and how it is carried from frame to frame."""
+"""A square-root information filter for the nine-parameter model, and how it is carried from frame to frame.
+
+Forgetting makes a sample count for less than it knows: weights w, the samples' path Δs apart, leave the variance that
+`(Σ w)² / Σ w²` of them would have in full. A prior that counted in full would then count for more than was stated,
+twice as much after a long path. So it counts by `Σ w² / Σ w` as well: the least mean square of the errors, over
+surfaces as the prior says they are.
+"""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -19,12 +26,28 @@ ANCHOR = 0.05
 """Travel between two changes of the working frame over the memory."""
 
 
+class _Path(NamedTuple):
+    """What the path counts for, m: the sums of its pieces' weights and of their squares."""
+
+    weight: float = 0.0
+    square: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """By how much the prior counts."""
+        return self.square / self.weight if self.weight else 1.0
+
+    def on(self, moved: float, kept: float) -> _Path:
+        """With a new piece (m), after which the others count `kept` times what they did."""
+        return _Path(kept * self.weight + moved, kept**2 * self.square + moved)
+
+
 class InformationFilter:
     """Parameters with a root of their information in a working frame; rows come in, old ones fade.
 
     Args:
         length: the memory, and the unit of length of the problem, m.
-        prior: never forgotten: what forgetting takes of it is put back.
+        prior: counts as the samples do, which are new and in full at first and faded to a half after a long path.
         correlation: of the rows along the path; only the covariance of the answer knows of it.
 
     Attributes:
@@ -48,6 +71,7 @@ class InformationFilter:
         """Know nothing but the prior: a plane in a frame (4, 4)."""
         self.T = T
         self.c = np.zeros(9)
+        self._path = _Path()
         self._set_root(self._prior_rows)
         self.left_out.reset()
 
@@ -65,6 +89,7 @@ class InformationFilter:
             travelled: length of that path, m.
         """
         self.T, self.c = T, c.copy()
+        self._path = _Path(travelled, travelled)
         self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
         self.left_out.start(rows, residuals, travelled)
 
@@ -72,7 +97,9 @@ class InformationFilter:
         """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length)
-        lost = math.sqrt(1.0 - kept) * self._prior_rows
+        before, self._path = self._path, self._path.on(moved, kept)
+        share = self._path.share
+        lost = math.sqrt(share - kept * before.share) * self._prior_rows
         stacked = np.empty((18 + len(rows), 10))
         stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
         stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
@@ -81,7 +108,7 @@ class InformationFilter:
         self._set_root(full[:9, :9])
         step = self.inverse @ full[:9, 9]
         self.c = self.c + step
-        self.left_out.take(rows, residuals, step, moved, kept)
+        self.left_out.take(rows, residuals, step, moved, kept, share**2 - (kept * before.share) ** 2)
 
     def place(self, point: Array) -> Array:
         """A point (3,) of base in the working frame, dimensionless."""

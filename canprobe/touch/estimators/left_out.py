@@ -108,9 +108,11 @@ class LeftOut:
         self._information = flat.T @ flat
         self._slope = flat[:, 9:].T @ residuals.reshape(-1)
 
-    def take(self, rows: Array, residuals: Array, step: Array, moved: float, kept: float) -> None:
+    def take(  # noqa: PLR0917 - as `Score.take`, and what the sums need
+        self, rows: Array, residuals: Array, step: Array, moved: float, kept: float, known: float
+    ) -> None:
         """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
-        self.score.take(rows, moved, kept)
+        self.score.take(rows, moved, kept, known)
         self._information = kept * self._information + rows.T @ rows
         self._slope = kept * self._slope + rows[:, 9:].T @ residuals - self._information[9:, :9] @ step
 

@@ -55,9 +55,16 @@ class Score:
         fades = np.exp((places - travelled) / self._correlation.length)
         self._recent = self._correlation.shares[:, None] * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
-    def take(self, J: Array, moved: float, kept: float) -> None:
-        """Take new whitened rows (3n, k) over a step of the path (m); `kept` is what it leaves of the information."""
-        self.matrix = kept**2 * self.matrix + (1.0 - kept**2) * self._prior + self._added(J, moved, kept)
+    def take(self, J: Array, moved: float, kept: float, known: float) -> None:
+        """Take new whitened rows over a step of the path.
+
+        Args:
+            J: (3n, k).
+            moved: m.
+            kept: what the step leaves of the information.
+            known: what of the prior is put back into the matrix, over the whole prior.
+        """
+        self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
 
     def carry(self, back: Array) -> None:
         """Go over to other parameters; back (k, k) is d(old)/d(new)."""
