@@ -7,8 +7,10 @@ import multiprocessing
 import os
 import re
 import signal
-from collections.abc import Iterator
+import time
+from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
+from multiprocessing.process import BaseProcess
 
 from canprobe.child import end_with_parent
 from canprobe.errors import StudyError, UsageError
@@ -16,6 +18,8 @@ from canprobe.errors import StudyError, UsageError
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
 """What tells a BLAS how many threads to use, when it is loaded."""
 _DASK_WAIT = "10s"
+_GRACE_S = 1.0
+"""For workers to end by themselves: what they compute may hear SIGTERM as a wish to stop a run, and go on."""
 
 
 @contextlib.contextmanager
@@ -38,8 +42,8 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         with _environment(dict.fromkeys(THREADS, "1")):  # workers start when cells are submitted
             yield _Deaf(pool)
     except BaseException:
-        for worker in set(multiprocessing.active_children()) - before:
-            worker.terminate()
+        pool.shutdown(wait=False, cancel_futures=True)
+        _end(set(multiprocessing.active_children()) - before)
         raise
     finally:
         pool.shutdown()
@@ -87,6 +91,15 @@ class _Deaf(Executor):
             return self._pool.submit(fn, *args, **kwargs)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _end(workers: Iterable[BaseProcess]) -> None:
+    for worker in workers:
+        worker.terminate()
+    until = time.monotonic() + _GRACE_S
+    for worker in workers:
+        worker.join(max(until - time.monotonic(), 0.0))
+        worker.kill()
 
 
 @contextlib.contextmanager

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -241,6 +242,25 @@ def test_a_pool_that_is_left_by_an_exception_is_ended(demo):
         pool.submit(signal.pause)
         raise KeyError
     assert pids and all(gone(pid) for pid in pids)
+
+
+def hear_nothing():
+    """What a run makes of SIGTERM: a wish to stop it, after which its worker goes on."""
+    signal.signal(signal.SIGTERM, lambda *_: None)
+    while True:
+        signal.pause()
+
+
+def test_workers_that_do_not_hear_are_ended_too(demo):
+    with pytest.raises(KeyError), process_pool(1) as pool:
+        pid = pool.submit(os.getpid).result()
+        deaf = [pool.submit(hear_nothing) for _ in range(3)]
+        while not deaf[0].running():
+            pass
+        time.sleep(0.2)
+        raise KeyError
+    assert gone(pid)
+    assert deaf[2].cancelled()
 
 
 @pytest.mark.filterwarnings("default")
