@@ -164,6 +164,8 @@ def _cells(columns: Mapping[str, NDArray[Any]]) -> list[_Cell]:
 
 def _read_parquet(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     arrow = _need("pyarrow", "Parquet")
+    if not path.exists():
+        raise UsageError(f"{path}: no such file")
     try:
         table = _need("pyarrow.parquet", "Parquet").read_table(path)
     except (OSError, arrow.ArrowException) as error:
