@@ -30,9 +30,13 @@ if TYPE_CHECKING:
     from canprobe.cell.tasks.calibrate import CalibrateTask
     from canprobe.touch.estimators import Estimator
 
-SIGMA_POINT_M = 0.1e-3
-SIGMA_NORMAL_RAD = 2e-3
-"""Of what no error of the centroid explains: that one turns the normal by 1/R_p of it as well (`Noise.coupling`)."""
+SIGMA_POINT_M = 0.09e-3
+SIGMA_NORMAL_RAD = 1.8e-3
+"""Of what no error of the centroid explains: that one turns the normal by 1/R_p of it as well (`Noise.coupling`).
+
+On the calibration seeds 97.6 % of the 95 % regions hold the truth with these, and 86.9 % on the sphere, whose curvature
+is felt 1 % too large. 0.1 mm and 2 mrad make it 98.6 % and 92.2 %, 0.08 mm and 1.6 mrad 95 % and three in four.
+"""
 CORRELATION = (4e-3, 0.015)
 """Length (m) and share of errors that last: gains, hysteresis and creep err alike for millimetres. Single errors are a
 third of what is stated, so the share is of that. Set on seeds 0 and 1 of nine scenes, and what no centroid explains on
