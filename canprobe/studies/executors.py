@@ -7,10 +7,10 @@ import multiprocessing
 import os
 import re
 import signal
-import time
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing.process import BaseProcess
+from time import perf_counter
 
 from canprobe.child import end_with_parent
 from canprobe.errors import StudyError, UsageError
@@ -96,9 +96,9 @@ class _Deaf(Executor):
 def _end(workers: Iterable[BaseProcess]) -> None:
     for worker in workers:
         worker.terminate()
-    until = time.monotonic() + _GRACE_S
+    until = perf_counter() + _GRACE_S
     for worker in workers:
-        worker.join(max(until - time.monotonic(), 0.0))
+        worker.join(max(until - perf_counter(), 0.0))
         worker.kill()
 
 
