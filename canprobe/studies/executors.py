@@ -7,7 +7,7 @@ import multiprocessing
 import os
 import re
 import signal
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from multiprocessing.process import BaseProcess
 from time import perf_counter
@@ -93,13 +93,14 @@ class _Deaf(Executor):
             signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _end(workers: Iterable[BaseProcess]) -> None:
+def _end(workers: Collection[BaseProcess]) -> None:
     for worker in workers:
         worker.terminate()
     until = perf_counter() + _GRACE_S
     for worker in workers:
         worker.join(max(until - perf_counter(), 0.0))
         worker.kill()
+        worker.join()
 
 
 @contextlib.contextmanager

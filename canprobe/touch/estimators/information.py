@@ -1,9 +1,8 @@
 """A square-root information filter for the nine-parameter model, and how it is carried from frame to frame.
 
-Forgetting makes a sample count for less than it knows: weights w, the samples' path Δs apart, leave the variance that
-`(Σ w)² / Σ w²` of them would have in full. A prior that counted in full would then count for more than was stated,
-twice as much after a long path. So it counts by `Σ w² / Σ w` as well: the least mean square of the errors, over
-surfaces as the prior says they are.
+Forgetting makes samples count for less than they know: with weights w they leave the variance that `(Σ w)² / Σ w²` of
+them would in full, and count for `Σ w`. A prior in full would outweigh them by more than was stated, twice as much
+after a long path. So it counts by `Σ w² / Σ w`: the least mean square of the errors, over surfaces as it says they are.
 """
 
 from __future__ import annotations
@@ -97,9 +96,10 @@ class InformationFilter:
         """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
         rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
         kept = math.exp(-moved / self.length)
-        before, self._path = self._path, self._path.on(moved, kept)
+        left = kept * self._path.share
+        self._path = self._path.on(moved, kept)
         share = self._path.share
-        lost = math.sqrt(share - kept * before.share) * self._prior_rows
+        lost = math.sqrt(share - left) * self._prior_rows
         stacked = np.empty((18 + len(rows), 10))
         stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
         stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
@@ -108,7 +108,7 @@ class InformationFilter:
         self._set_root(full[:9, :9])
         step = self.inverse @ full[:9, 9]
         self.c = self.c + step
-        self.left_out.take(rows, residuals, step, moved, kept, share**2 - (kept * before.share) ** 2)
+        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
 
     def place(self, point: Array) -> Array:
         """A point (3,) of base in the working frame, dimensionless."""
