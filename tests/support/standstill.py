@@ -14,7 +14,7 @@ from types import TracebackType
 import pytest
 from _pytest.runner import runtestprotocol
 
-ATTEMPTS = 5
+ATTEMPTS = 3
 LIMIT_S = 0.12
 """Half of the nodes' patience: no process of a test, waiting for its turn on one processor, waits as long."""
 CALM_S, PATIENCE_S = 2.0, 30.0
