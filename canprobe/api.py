@@ -212,13 +212,12 @@ def _draw(result: RunResult, out: Path) -> None:
     if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
         page.write_page(recorded.read_run(out), out / "report.html")
-    try:
+    if "report.png" in result.plan.outputs:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface
-    except ImportError:  # the study extra is not installed
-        return
-    draw_run(result, out / "report.png")
-    draw_surface(result, out / "surface.png")
+
+        draw_run(result, out / "report.png")
+        draw_surface(result, out / "surface.png")
 
 
 @contextlib.contextmanager

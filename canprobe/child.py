@@ -144,6 +144,7 @@ class EmulatorChild:
             patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
             for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
                 self._process.send_signal(number)
+                self._process.send_signal(signal.SIGCONT)  # one that was stopped hears it only then
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):
                     self._process.wait(patience_s)
                     break

@@ -48,11 +48,12 @@ WAVE = Only("kind", ("wave",), required=True)
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
-    """`[scene]`: what the scene is called, and the seed of everything random in it."""
+    """`[scene]`: what the scene is called, the seed of everything random in it, and whether its run is drawn."""
 
     name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")]
     title: str = ""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
+    figures: bool = True  # report.png, surface.png and report.html: seconds that a series of runs can spare
 
 
 @dataclass(frozen=True, slots=True)

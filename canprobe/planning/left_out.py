@@ -99,13 +99,17 @@ def _no_dynamics(scene: Scene) -> str | None:
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 
-def _no_figure(_: Scene) -> str | None:
+def _no_figure(scene: Scene) -> str | None:
+    if not scene.scene.figures:
+        return "scene.figures = false"
     if importlib.util.find_spec("matplotlib") is not None:
         return None
     return "the study extra is not installed: pip install 'canprobe[study]'"
 
 
 def _no_page(scene: Scene) -> str | None:
+    if not scene.scene.figures:
+        return "scene.figures = false"
     if scene.task.kind == "listen":
         return 'task.kind = "listen": nothing moves'
     if importlib.util.find_spec("viser") is not None:

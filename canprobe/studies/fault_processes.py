@@ -148,7 +148,12 @@ class _Run:
 
     def _start_master(self, scene: Scene) -> subprocess.Popen[bytes]:
         assert scene.arm is not None and scene.sensor is not None
-        real = replace(scene, arm=replace(scene.arm, emulated=False), sensor=replace(scene.sensor, emulated=False))
+        real = replace(
+            scene,
+            scene=replace(scene.scene, figures=False),
+            arm=replace(scene.arm, emulated=False),
+            sensor=replace(scene.sensor, emulated=False),
+        )
         path = self.folder / "scene.toml"
         path.write_text(dump_scene(real), encoding="utf-8")
         command = [sys.executable, "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]

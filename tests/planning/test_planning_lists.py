@@ -71,6 +71,17 @@ def test_switches_of_the_plant_are_listed():
     assert "cover blur" not in left
 
 
+def test_figures_are_left_out_where_they_are_switched_off():
+    cylinder = load_scene("cylinder")
+    plan = make_plan(dataclasses.replace(cylinder, scene=dataclasses.replace(cylinder.scene, figures=False)))
+    assert {name for name in make_plan(cylinder).outputs if name.startswith(("report", "surface."))} == {
+        *("report.png", "surface.png", "report.html", "surface.npz")
+    }
+    assert {name for name in plan.outputs if name.startswith(("report", "surface."))} == {"surface.npz"}
+    left = dict(plan.left_out)
+    assert left["figure"] == left["replay to share (report.html)"] == "scene.figures = false"
+
+
 def test_outputs_without_truth():
     scene = load_scene("free")
     real = dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, emulated=False))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
-
-import pytest
 
 import canprobe
 from canprobe.results import RunResult
@@ -13,6 +12,4 @@ from canprobe.scene import Scene
 
 def undrawn_run(scene: Scene, **options: Any) -> RunResult:
     """`canprobe.run` that leaves all its files but the figures."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("canprobe.api._draw", lambda result, folder: None)
-        return canprobe.run(scene, **options)
+    return canprobe.run(replace(scene, scene=replace(scene.scene, figures=False)), **options)

@@ -53,10 +53,11 @@ def full_scan(bench: Any) -> Any:
     SYNC for its time stops by itself, as it must, and the run has to end safely all the same. Where a node did not
     answer in time at bring-up, nothing has moved, and there is no cycle to report.
     """
+    scene = bench.scene("cylinder", rate_hz=400, missed_syncs=40)
     told = []
     for attempt in range(ATTEMPTS):
         name = f"results-{attempt}"
-        command = bench.start("run", "cylinder", *ON_VCAN0, "--out", name)
+        command = bench.start("run", scene, *ON_VCAN0, "--out", name)
         status = command.wait(PATIENCE_S)
         if status == 0:
             return bench.results(name)

@@ -143,6 +143,7 @@ def slow_scene(path: Path) -> Path:
     """The scene `press` at 100 Hz with patient drives, as `Bench.scene`: a slow machine must not decide here."""
     text = re.sub(r"missed_syncs = .*\n", "", (SCENES / "press.toml").read_text())
     text = text.replace("[arm]\n", "[arm]\nmissed_syncs = 20\n").replace("[sensor]\n", "[sensor]\nrate_hz = 50\n")
+    text = text.replace("[scene]\n", "[scene]\nfigures = false\n")
     path.write_text(f"{text}\n[cycle]\nrate_hz = 100\n")
     return path
 
