@@ -14,8 +14,10 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from canprobe.errors import ProtocolError
-from canprobe.protocol.busy_period import Arrivals, Level
+from canprobe.protocol.busy_period import Arrivals, Integers, Level
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS, best_case_bits, worst_case_bits
 
 __all__ = [
@@ -187,28 +189,32 @@ _Timed = tuple[Message, int]
 def _respond_all(timed: Sequence[_Timed], bounds: Sequence[int | None], bitrate: int, errors: Errors) -> list[Response]:
     """Every response; `bounds` are upper bounds of them, where known."""
     known = list(zip(timed, bounds, strict=True))
-    return [_respond(timed[: rank + 1], known[rank + 1 :], bitrate, errors) for rank in range(len(timed))]
+    table = _table(timed)
+    return [
+        _respond(timed[: rank + 1], table[: rank + 1], known[rank + 1 :], bitrate, errors) for rank in range(len(timed))
+    ]
 
 
 def _respond(
-    level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]], bitrate: int, errors: Errors
+    level: Sequence[_Timed],
+    table: Integers,
+    below: Sequence[tuple[_Timed, int | None]],
+    bitrate: int,
+    errors: Errors,
 ) -> Response:
     message, frame_ns = level[-1]
     error_cost = _ceil_div(errors.overhead_bits * _NS, bitrate) + max(c for _, c in level)
     if _overloaded(level, errors.interval_ns, error_cost):
         return Response(message, frame_ns, None, 0)
-    worst = instances = 0
-    for start, blocking in _starts(level, below).items():
-        *above, own = (_align(m, c, start) for m, c in level)
-        bit = _ceil_div(_NS, bitrate)
-        at = Level(own, above, blocking, bit, errors.burst, errors.interval_ns, error_cost).finished()
-        instances = max(instances, len(at))
-        worst = max([worst, *((message.offset_ns or 0) + finished - release for release, finished in at)])
-    return Response(message, frame_ns, worst, instances)
+    starts, blocking = _starts(level, below)
+    bit = _ceil_div(_NS, bitrate)
+    at = Level(_aligned(table, starts), blocking, bit, errors.burst, errors.interval_ns, error_cost)
+    worst, instances = at.worst()
+    return Response(message, frame_ns, max(0, (message.offset_ns or 0) + worst), instances)
 
 
-def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> dict[int, int]:
-    """Where a busy period has to begin in the transaction, and how long a frame from below can block it there.
+def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]]) -> tuple[Integers, Integers]:
+    """Where (n,) a busy period has to begin in the transaction, and how long (n,) a frame from below can block it.
 
     It begins where one of the transaction's messages is at its latest. If nothing of the level keeps its own time, then
     really with that message, so that what blocks it is on the bus between its earliest and its latest queueing.
@@ -216,36 +222,46 @@ def _starts(level: Sequence[_Timed], below: Sequence[tuple[_Timed, int | None]])
     longest = max((c for (_, c), _ in below), default=0)
     members = [(m, m.offset_ns) for m, _ in level if m.offset_ns is not None]
     if not members:
-        return {0: longest}
-    cycle = math.lcm(
-        *(m.period_ns for m, _ in members), *(m.period_ns for (m, _), _ in below if m.offset_ns is not None)
-    )
+        return np.zeros(1, dtype=np.int64), np.full(1, longest)
+    cycle = math.lcm(*(m.period_ns for m, _ in members))
     unknown = len(members) < len(level) or any(end is None for _, end in below)
-    found: dict[int, int] = {}
-    for message, offset in members:
-        for first in range(offset, offset + cycle, message.period_ns):
-            blocking = longest if unknown else _blocking(below, first, message.jitter_ns)
-            start = (first + message.jitter_ns) % cycle
-            found[start] = max(found.get(start, 0), blocking)
-    return found
+    if not unknown:
+        cycle = math.lcm(cycle, *(m.period_ns for (m, _), _ in below if m.offset_ns is not None))
+    releases = [np.arange(offset, offset + cycle, m.period_ns) for m, offset in members]
+    first = np.concatenate(releases)
+    jitter = np.repeat([m.jitter_ns for m, _ in members], [len(one) for one in releases])
+    starts, index = np.unique((first + jitter) % cycle, return_inverse=True)
+    blocking = np.zeros_like(starts)
+    np.maximum.at(blocking, index, longest if unknown else _blocking(below, first, jitter))
+    return starts, blocking
 
 
-def _blocking(below: Sequence[tuple[_Timed, int | None]], first: int, jitter_ns: int) -> int:
-    return max((c for (m, c), end in below if _on_the_bus(m, end, first, jitter_ns)), default=0)
+def _blocking(below: Sequence[tuple[_Timed, int | None]], first: Integers, jitter: Integers) -> Integers:
+    """Longest frame that can be on the bus at `first` (n,) or within `jitter` (n,) after it."""
+    always = max((c for (m, c), end in below if m.offset_ns is None or end is None), default=0)
+    # a message with an offset is through `end` after its event at the latest
+    table = [(c, m.period_ns, m.offset_ns, end) for (m, c), end in below if None not in (m.offset_ns, end)]
+    if not table:
+        return np.full_like(first, always)
+    cost, period, offset, end = np.array(table, dtype=np.int64).T
+    into = (first[:, None] - offset) % period  # since it was last released
+    on_the_bus = (into < end - offset) | (into + jitter[:, None] >= period)
+    return np.asarray(np.where(on_the_bus, cost, 0).max(axis=1, initial=always), dtype=np.int64)
 
 
-def _on_the_bus(message: Message, end_ns: int | None, first: int, jitter_ns: int) -> bool:
-    """Whether a message, through `end_ns` after its event at the latest, can be on the bus at `first` or in jitter."""
-    if message.offset_ns is None or end_ns is None:
-        return True
-    into = (first - message.offset_ns) % message.period_ns  # since it was last released
-    return into < end_ns - message.offset_ns or into + jitter_ns >= message.period_ns
+def _table(timed: Sequence[_Timed]) -> Integers:
+    """(m, 5): frame, period, jitter, whether there is an offset, and phase in a busy period that begins at 0."""
+    rows = [
+        (c, m.period_ns, m.jitter_ns, *((0, -m.jitter_ns) if m.offset_ns is None else (1, m.offset_ns)))
+        for m, c in timed
+    ]
+    return np.array(rows, dtype=np.int64).reshape(-1, 5)
 
 
-def _align(message: Message, frame_ns: int, start: int) -> Arrivals:
-    """The message in a busy period that begins at phase `start` of the transaction."""
-    phase = -message.jitter_ns if message.offset_ns is None else message.offset_ns - start
-    return Arrivals.behind(frame_ns, message.period_ns, message.jitter_ns, phase)
+def _aligned(table: Integers, starts: Integers) -> Arrivals:
+    """The messages of a `_table` in busy periods that begin at these phases of the transaction."""
+    cost, period, jitter, moves, phase = table.T
+    return Arrivals.behind(cost, period, jitter, phase - starts[:, None] * moves)
 
 
 def _overloaded(level: Sequence[_Timed], error_interval: int | None, error_cost: int) -> bool:
