@@ -5,7 +5,8 @@ well. So the centroid lies back along its own way, by some tens of micrometres: 
 millimetres of path over the object, which bends the normals that are felt.
 
 Model: with x the way from the mean place of the last `slow_s` to that of the last `quick_s`, the centroid lies
-`most · x / (|x| + reach)` back. It was fitted to scans at one speed; the bound keeps it harmless at others.
+`most · x / (|x| + reach)` back. It was fitted to scans at one speed; the bound keeps it harmless at others. It does not
+know the patch: of 0.1 mm to and fro the centroid shows 68 to 88 % by object, corrected 88 to 109 %.
 """
 
 from __future__ import annotations
