@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from canprobe.bridging import Bridges
+from canprobe.bus.interrupts import interrupts_held
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
@@ -141,8 +142,8 @@ class _Hold:
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
-    """Where :func:`run` puts the files: ``out``, or ``runs/<scene>-<time>``."""
-    return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S}"
+    """Where :func:`run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
+    return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
 
 
 def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement], None]:
@@ -170,7 +171,8 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
     )
     if session.out is not None:
         try:
-            write_files(result, session.out)
+            with interrupts_held():
+                write_files(result, session.out)
             _draw(result, session.out)
         except OSError as error:  # a full disk: what stopped the run counts for more, and the cell is safe
             told = f"{session.out}: not all results could be written: {error.strerror or error}"
@@ -245,7 +247,7 @@ def open_cell(
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
-        out: folder for ``bus.log`` and ``truth.npz``; None writes nothing.
+        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None writes nothing.
         say: called with each step.
         observers, bridge: as for :func:`run`.
         rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle.

@@ -1,9 +1,10 @@
-"""Write columns into an ``.npz`` file, read them, or say what is wrong with it."""
+"""Columns in an ``.npz`` file: written, read, or told what is wrong with it; and files that are whole or not there."""
 
 from __future__ import annotations
 
+import contextlib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,33 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError
 
 
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file that is written whole, under the name that is given to the block, or not at all.
+
+    Args:
+        path: what it is called afterwards; an older one is replaced.
+
+    Raises:
+        OSError: it cannot be written; no part of it is left, nor the older one.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        part.replace(path)
+    except BaseException as error:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+            if isinstance(error, OSError):
+                path.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is not None:
+            error.filename = str(path)
+        raise
+
+
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
-    """Write arrays into exactly this file, compressed: numpy would append ``.npz`` to a name."""
-    with path.open("wb") as file:
+    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name."""
+    with whole_file(path) as part, part.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **columns)
 
 

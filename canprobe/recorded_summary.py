@@ -14,6 +14,7 @@ from canprobe.cell.mapping import map_of_scan, summarise_map
 from canprobe.cell.recording import Recording
 from canprobe.cell.replay import TaskReplay
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.errors import UsageError
 from canprobe.npz_file import read_npz
 from canprobe.planning import Plan
 from canprobe.results import curvature_text, finite_or_none, shape_lines, summarise_shape
@@ -21,6 +22,8 @@ from canprobe.touch.consistency import check_consistency
 
 Array = NDArray[np.float64]
 SCHEMA = 1
+_SCORED = ("kappa", "direction1", "direction2", "contact_normal", "contact_point")
+"""Columns of the truth that estimates are scored against."""
 
 
 def summarise_replay(
@@ -46,7 +49,7 @@ def summarise_replay(
         estimates: by name.
         folder: of the run, for ``truth.npz`` and ``log.npz``; None for a log alone.
     """
-    truth = _arrays(folder / "truth.npz") if folder is not None else {}
+    truth = _truth(folder / "truth.npz") if folder is not None else {}
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
@@ -78,6 +81,18 @@ def _map_summary(plan: Plan, tracker: ShapeTracker) -> dict[str, Any] | None:
 
 def _arrays(path: Path) -> dict[str, Array]:
     return read_npz(path) if path.is_file() else {}
+
+
+def _truth(path: Path) -> dict[str, Array]:
+    """The plant's truth, one row a SYNC."""
+    columns = _arrays(path)
+    for name in _SCORED if columns else ():
+        column = columns.get(name, np.zeros(0))
+        if column.dtype.kind != "f" or column.ndim != 2:
+            raise UsageError(
+                f"{path}: {name}: expected a row of numbers for each SYNC, got {column.dtype} of shape {column.shape}"
+            )
+    return columns
 
 
 def _targets(task: TaskReplay) -> dict[str, float | None]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,6 +16,7 @@ from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, scor
 from canprobe.cell.tasks.regain import losses_text, summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
+from canprobe.npz_file import whole_file, write_npz
 from canprobe.planning import Plan
 from canprobe.scene import Scene
 from canprobe.scene_tool import FILE, calibration_lines, summarise_calibration, tool_text
@@ -338,29 +338,19 @@ def write_files(result: RunResult, out: Path) -> None:
     Raises:
         OSError: one cannot be written; no part of it is left, nor the one of an earlier run.
     """
-    with _whole(out / "summary.json") as path:
+    with whole_file(out / "summary.json") as path:
         document = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False)
         path.write_text(document + "\n", encoding="utf-8")
-    with _whole(out / "scene.toml") as path:
+    with whole_file(out / "scene.toml") as path:
         path.write_text(dump_scene(result.plan.scene), encoding="utf-8")
-    with _whole(out / "log.npz") as path:
-        np.savez_compressed(path, allow_pickle=False, **result.log)
+    write_npz(out / "log.npz", result.log)
     for name in ("surface.npz", FILE):
         (out / name).unlink(missing_ok=True)  # of an earlier run
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
-        (out / FILE).write_text(text, encoding="utf-8")
+        with whole_file(out / FILE) as path:
+            path.write_text(text, encoding="utf-8")
     if result.surface_map is not None:
         save_surface_map(result.surface_map, out / "surface.npz")
-
-
-@contextlib.contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """A file that is written whole in the block, or not there."""
-    try:
-        yield path
-    except OSError:
-        path.unlink(missing_ok=True)
-        raise
 
 
 def _figure(value: float | None, unit: str, digits: int = 2) -> str:

@@ -177,7 +177,7 @@ class TaskSettings:
     turn_max_deg: Annotated[float, Range(0, 180), SCANNING] = (
         90.0  # that the plan may turn it where joints are too slow
     )
-    length_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING] = 36.0  # full size; a circle's diameter
+    length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0  # full size; a circle's diameter
     width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
     wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave
     rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05  # 0: pad follows the normal, 1: fixed orientation

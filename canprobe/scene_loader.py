@@ -6,6 +6,7 @@ goes together in `canprobe.scene_rules`.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import tomllib
@@ -134,8 +135,9 @@ class _Reader:
         except MismatchError as mismatch:
             hint = _did_you_mean(raw, choices_of(annotation)) if isinstance(raw, str) else ""
             return self._complain(f"{section}.{key}", f"expected {mismatch}, got {toml_value(raw)}{hint}")
-        if conditions_of(annotation, ScenePath) and self._folder and (self._folder / value).is_file():
-            value = str((self._folder / value).resolve())
+        if conditions_of(annotation, ScenePath) and self._folder:
+            with contextlib.suppress(OSError):  # a name that no file can have: said where the file is read
+                value = str((self._folder / value).resolve()) if (self._folder / value).is_file() else value
         self._values[section][key] = value
 
     def _check_conditions(self, section: str, annotations: Mapping[str, Any], table: Mapping[str, Any]) -> None:

@@ -5,6 +5,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -28,11 +29,13 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
+from canprobe.npz_file import whole_file
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import BridgeSettings, Scene
 from canprobe.scene_values import need_scene, with_values
+from canprobe.scene_writer import dump_scene
 from canprobe.session_bus import Sink, TrafficCounter, channel_routes, lockstep_bus, open_ports
 
 if TYPE_CHECKING:
@@ -77,6 +80,7 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
     """The section with more bridges in use; an unknown one is a `UsageError`."""
     if not names:
         return settings
+    names = (names,) if isinstance(names, str) else names
     check_bridges(names)
     known = settings or BridgeSettings()
     return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
@@ -97,7 +101,7 @@ class Session:
 
     Args:
         scene: what to bring up, resolved; or the plan of it.
-        out: folder for ``bus.log`` and ``truth.npz``; None keeps no files.
+        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
         say: called with each step.
         observers: called after each cycle with what it saw, said and had on the bus.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
@@ -132,6 +136,7 @@ class Session:
         self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
+        self._entered = False
         self._cell: Cell | None = None
 
     @property
@@ -158,6 +163,9 @@ class Session:
         return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
     def __enter__(self) -> Session:
+        if self._entered:
+            raise UsageError("a session is opened once: open another cell with open_cell(scene)")
+        self._entered = True
         self.started_ns = elapsed_ns()
         hush_canopen()
         for warning in self.plan.warnings:
@@ -227,6 +235,8 @@ class Session:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
+                with contextlib.suppress(OSError), whole_file(self.out / "scene.toml") as path:  # told at the end
+                    path.write_text(dump_scene(self.scene), encoding="utf-8")
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
@@ -297,7 +307,8 @@ class Session:
             self.truth = self.world.recorder.arrays()
             if self.out is not None:
                 try:
-                    self.world.recorder.save(self.out / "truth.npz")
+                    with whole_file(self.out / "truth.npz") as path:
+                        self.world.recorder.save(path)
                 except OSError as error:
                     self._note(f"truth.npz could not be written: {error.strerror or error}")
 

@@ -8,8 +8,10 @@ Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import re
 from collections.abc import Callable, Container, Iterator, Sequence
+from io import FileIO
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol
@@ -47,6 +49,9 @@ class CandumpWriter:
         channel: the name in each line.
         t0_ns: the time on the frames' clock that is written as 0.
 
+    Raises:
+        UsageError: somebody else writes this file just now.
+
     Attributes:
         failure: why nothing is written any more; None while all is well.
     """
@@ -55,7 +60,7 @@ class CandumpWriter:
         self._t0_ns = t0_ns
         self.failure: str | None = None
         self._path = path
-        self._file = open(path, "wb", buffering=0)  # noqa: SIM115 - closed by close
+        self._file = _opened_alone(path)
         self._size = 0
         self._frames: list[tuple[_Format, int, bytes, int]] = []
         self._lines: list[str] = []
@@ -155,12 +160,28 @@ def _format_id(can_id: int) -> str:
     return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
 
 
+def _opened_alone(path: str | Path) -> FileIO:
+    """An empty file to write to, which nobody else can open so before it is closed."""
+    file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise UsageError(f"{path}: another run writes this file; choose another folder") from None
+    except OSError:
+        pass  # a file system without locks
+    with contextlib.suppress(OSError):  # no file but a device
+        file.truncate(0)
+    return file
+
+
 def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
 
     Args:
         path: the log.
         only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
+            A last line without an end, as a logger leaves it that is killed, is passed over where it is torn.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -173,7 +194,8 @@ def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterat
             for number, line in enumerate(file, 1):
                 if only is not None and _id_of(line) not in only:
                     continue
-                if text := line.rstrip("\r\n"):
+                text = line.rstrip("\r\n")
+                if text and (line.endswith("\n") or _LINE.fullmatch(text)):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
+from typing import Any
 
 TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
 """What ends a process from outside: a service that is stopped, a terminal that is closed."""
@@ -17,6 +19,23 @@ class Terminated(KeyboardInterrupt):
 def raise_terminated(_number: int, _frame: FrameType | None) -> None:
     """The handler of both."""
     raise Terminated
+
+
+@contextlib.contextmanager
+def interrupts_held() -> Iterator[None]:
+    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only."""
+    came: list[int] = []
+    before: dict[int, Any] = {}
+    with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
+        for number in (signal.SIGINT, *TERMINATIONS):
+            before[number] = signal.signal(number, lambda n, _: came.append(n))
+    try:
+        yield
+    finally:
+        for held, handler in before.items():
+            signal.signal(held, handler)
+        if came:
+            signal.raise_signal(came[0])
 
 
 class Interrupts:

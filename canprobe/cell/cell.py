@@ -6,6 +6,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters
@@ -102,6 +104,7 @@ class Cell:
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
         self._holding = False
+        self._running = False
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
@@ -185,6 +188,17 @@ class Cell:
         step = controller.step if hasattr(controller, "step") else controller
         if not callable(step):
             raise UsageError(f"controller: expected a function or something with step(measurement), got {controller!r}")
+        if self._running:
+            raise UsageError("the cell runs a controller already, which must not run another one in its step")
+        self._running = True
+        try:
+            self._run(step, controller, progress)
+        finally:
+            self._running = False
+
+    def _run(
+        self, step: Callable[[Measurement], Command], controller: object, progress: Callable[[Measurement], None]
+    ) -> None:
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
         self._tracker = getattr(controller, "shape", None)
         self._enable(getattr(controller, "inspect", None))
@@ -210,6 +224,8 @@ class Cell:
             command = step(measurement)
             if not isinstance(command, Command) or not isinstance(command.columns, dict):
                 raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
+            if not isinstance(command.done, bool | np.bool_):
+                raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
             if not OWN_COLUMNS.isdisjoint(command.columns):
                 taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
                 raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")

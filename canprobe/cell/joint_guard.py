@@ -17,6 +17,8 @@ MEASURED_SHARE = 1.5
 COUNTS = 2
 """Encoder counts by which two readings may differ at rest."""
 _ROUNDING = 1e-9
+_NUMBERS = "fiu"
+"""Kinds of arrays that can be angles."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,9 +84,12 @@ class JointGuard:
         if not self._range or not self._speed:
             return GuardedTarget(q_target)
         try:
-            target = np.asarray(q_target, dtype=np.float64)
+            given = np.asanyarray(q_target)
         except (TypeError, ValueError):
+            given = np.array(None)
+        if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
             return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected 6 angles, rad")
+        target = np.asarray(given, dtype=np.float64)
         wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
         if not all(map(math.isfinite, wanted)):
             return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")

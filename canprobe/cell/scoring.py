@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 
 Array = NDArray[np.float64]
@@ -84,6 +85,10 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
     if not seen:
         return ShapeScore(None, None, None, None, None, None, 0, 0.0 if late else None)
     rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen])
+    if rows.max() >= len(truth["kappa"]):
+        raise UsageError(
+            f"truth: expected a row a SYNC, {rows.max() + 1} at least, got {len(truth['kappa'])}: another run's?"
+        )
     errors, norms, tilts, offsets = [], [], [], []
     for record, row in zip(seen, rows, strict=True):
         T = record.estimate.T_frame_contact

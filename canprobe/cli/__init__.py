@@ -10,6 +10,7 @@ import importlib
 import io
 import os
 import sys
+import traceback
 from collections.abc import Sequence
 
 import canprobe
@@ -34,21 +35,23 @@ COMMANDS = (
 )
 
 _EXAMPLE = """\
-exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure
+exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure,
+70 an error that nobody foresaw, 130 and 143 interrupted
 
 example:
   canprobe run cylinder
 """
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per way of ending
     """Run one command line.
 
     Args:
         argv: arguments without the program's name; those of the process by default.
 
     Returns:
-        The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away.
+        The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away; 70 after
+        an error that nobody foresaw.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     _prepare_streams()
@@ -69,6 +72,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _complain(f"{where}{error.strerror or error}", 3)
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
+    except Exception:
+        traceback.print_exc()
+        return _complain("this is a fault of canprobe itself: please report it with the lines above", 70)
 
 
 def _prepare_streams() -> None:

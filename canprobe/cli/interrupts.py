@@ -1,4 +1,4 @@
-"""SIGTERM and SIGHUP as interrupts, so that all ways of being told to stop take the same safe way out; and when."""
+"""SIGTERM and SIGHUP as interrupts, so that all ways of being told to stop take the same safe way out."""
 
 from __future__ import annotations
 
@@ -25,18 +25,3 @@ def termination_interrupts() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextlib.contextmanager
-def interrupts_held() -> Iterator[None]:
-    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only."""
-    came: list[int] = []
-    numbers = (signal.SIGINT, *TERMINATIONS)
-    before = [signal.signal(number, lambda n, _: came.append(n)) for number in numbers]
-    try:
-        yield
-    finally:
-        for number, handler in zip(numbers, before, strict=True):
-            signal.signal(number, handler)
-        if came:
-            signal.raise_signal(came[0])

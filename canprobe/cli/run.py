@@ -41,6 +41,11 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
+    with termination_interrupts():
+        return _run(args)
+
+
+def _run(args: argparse.Namespace) -> int:
     from canprobe.scene_loader import load_scene
 
     scene = with_realtime(load_scene(args.scene), args.realtime)
@@ -54,20 +59,19 @@ def run(args: argparse.Namespace) -> int:
 
     folder = api.results_folder(scene, args.out)
     try:
-        with termination_interrupts():
-            result = api.run(
-                scene,
-                interface=target.interface,
-                channel=target.channel,
-                sensor_channel=target.sensor_channel,
-                bitrate=target.bitrate,
-                out=folder,
-                seed=args.seed,
-                duration_s=args.duration,
-                progress=progress_bar(),
-                say=say_on_terminal,
-                bridge=args.bridge or (),
-            )
+        result = api.run(
+            scene,
+            interface=target.interface,
+            channel=target.channel,
+            sensor_channel=target.sensor_channel,
+            bitrate=target.bitrate,
+            out=folder,
+            seed=args.seed,
+            duration_s=args.duration,
+            progress=progress_bar(),
+            say=say_on_terminal,
+            bridge=args.bridge or (),
+        )
     except CanprobeError as error:
         if args.json and error.summary is not None:
             print_json(error.summary)

@@ -9,7 +9,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import interrupts_held, termination_interrupts
+from canprobe.bus.interrupts import interrupts_held
+from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
 from canprobe.cli.target import target_of

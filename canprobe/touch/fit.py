@@ -72,10 +72,17 @@ def fit_surface(
     """
     p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
-    if method == "ml":
-        return fit_ml(touches, prior, quadric=quadric)
-    if method == "recursive":
-        return _run_filter(touches, prior, quadric)
+    if method in ("ml", "recursive"):
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):  # what is not finite has no root
+                return (
+                    fit_ml(touches, prior, quadric=quadric) if method == "ml" else _run_filter(touches, prior, quadric)
+                )
+        except np.linalg.LinAlgError as error:
+            raise UsageError(
+                f"sigma_point, sigma_normal: expected those of real noise, got {sigma_point!r} and {sigma_normal!r}, "
+                f"with which the equations cannot be solved in double precision: {error}"
+            ) from error
     if correlation is not None:
         raise UsageError(f"correlation: expected none for {method!r}, which has no noise model, got {correlation}")
     if method == "chord":

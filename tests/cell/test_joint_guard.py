@@ -69,3 +69,14 @@ def test_a_target_too_far_is_approached_at_the_joints_speed(scene, limits):
     assert guard.slowed == 0
     third = np.eye(6)[2] * step
     assert JointGuard(limits).command(q + 3 * third, at(q, 0)).q == pytest.approx(q + third, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [np.ma.masked_all(6), np.zeros(6) + 0j, np.zeros(6, dtype=bool), ["0"] * 6, [None] * 6, [[0.0], [0.0, 0.0]], None],
+    ids=["masked", "complex", "bool", "text", "nothing", "ragged", "None"],
+)
+def test_what_is_no_angle_is_never_sent(scene, limits, given):
+    guard = JointGuard(limits)
+    found = guard.command(given, at(np.radians(scene.arm.start_deg), 1))
+    assert found.q is None and "expected 6" in found.limit

@@ -148,6 +148,21 @@ def test_exit_status_of_every_error(error, status, monkeypatch, capsys):
     assert len(captured.err.splitlines()) == len(expected)
 
 
+def test_an_error_that_nobody_foresaw_is_no_safety_stop(monkeypatch, capsys):
+    monkeypatch.setattr(api, "run", lambda *_, **__: 1 / 0)
+    assert main(["run", "free"]) == 70
+    assert "ZeroDivisionError" in (err := capsys.readouterr().err)
+    assert err.endswith("canprobe: this is a fault of canprobe itself: please report it with the lines above\n")
+
+
+def test_a_run_hears_sigterm_from_its_beginning(monkeypatch, tmp_path):
+    def load(_):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("canprobe.scene_loader.load_scene", load)
+    assert main(["run", "free"]) == 143
+
+
 @pytest.mark.parametrize("command", ["up", "emulate"])
 @pytest.mark.parametrize("interrupt", [KeyboardInterrupt, Terminated])
 def test_an_interrupt_is_the_normal_end_of_what_holds(command, interrupt, monkeypatch):

@@ -18,7 +18,8 @@ SYNCS = "".join(f"({k // 400:010d}.{k % 400 * 2500:06d}) can0 080#\n" for k in r
         ({"bus.log": SYNCS}, ["--scene", "press"], "scene press: task press estimates no shape"),
         ({"bus.log": SYNCS}, ["--scene", "cylinder", "--method", "recursiv"], 'did you mean "recursive"?'),
         ({"bus.log": SYNCS}, ["--scene", "cylinder"], "node 1 (joint 1) was never heard: no TPDO 181h"),
-        ({"bus.log": SYNCS + "(00"}, ["--scene", "cylinder"], "bus.log:11: no candump line: '(00'"),
+        ({"bus.log": SYNCS + "(00\n"}, ["--scene", "cylinder"], "bus.log:11: no candump line: '(00'"),
+        ({"bus.log": SYNCS + "(00"}, ["--scene", "cylinder"], "node 1 (joint 1) was never heard: no TPDO 181h"),
     ],
 )
 def test_what_is_wrong_is_told(tmp_path, capsys, files, words, message):

@@ -6,8 +6,8 @@ import signal
 
 import pytest
 
-from canprobe.bus.interrupts import Terminated
-from canprobe.cli.interrupts import interrupts_held, termination_interrupts
+from canprobe.bus.interrupts import Terminated, interrupts_held
+from canprobe.cli.interrupts import termination_interrupts
 
 
 @pytest.mark.parametrize(

@@ -304,3 +304,11 @@ def test_the_bound_of_one_place_is_infinite(rows):
     )
     assert np.isposinf(np.diag(C)).all()
     assert np.isnan(C[~np.eye(3, dtype=bool)]).all()
+
+
+def test_deviations_that_no_arithmetic_can_bear_are_told():
+    a = np.linspace(-0.2, 0.0, 60)
+    normals = np.stack([np.sin(a), 0.3 * np.sin(20 * a), -np.cos(a)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    with pytest.raises(UsageError, match="expected those of real noise, got 1e-05 and 1e-30"):
+        fit_surface(0.05 * normals, normals, sigma_point=1e-5, sigma_normal=1e-30)
