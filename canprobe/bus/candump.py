@@ -175,13 +175,16 @@ def _opened_alone(path: str | Path) -> FileIO:
     return file
 
 
-def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterator[tuple[int, str, int, bytes]]:
+def read_candump(
+    path: str | Path, only: Container[int] | None = None, *, whole: bool = False
+) -> Iterator[tuple[int, str, int, bytes]]:
     """Read a candump log.
 
     Args:
         path: the log.
         only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
-            A last line without an end, as a logger leaves it that is killed, is passed over where it is torn.
+        whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
+            one.
 
     Yields:
         (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
@@ -195,7 +198,7 @@ def read_candump(path: str | Path, only: Container[int] | None = None) -> Iterat
                 if only is not None and _id_of(line) not in only:
                     continue
                 text = line.rstrip("\r\n")
-                if text and (line.endswith("\n") or _LINE.fullmatch(text)):
+                if text and (whole or line.endswith("\n") or _LINE.fullmatch(text)):
                     yield _parse_line(text, path, number)
     except OSError as error:
         raise UsageError(f"{path}: {error.strerror}") from error

@@ -12,7 +12,7 @@ _EXAMPLE = """\
 The suffix names the form: .log for candump, .blf for Vector's tools, .asc, .trc.
 
 examples:
-  canprobe log runs/cylinder-20260101-120000 --to run.blf
+  canprobe log runs/cylinder-20260101-120000-000 --to run.blf
   canprobe log recorded.blf --to recorded.log
 """
 

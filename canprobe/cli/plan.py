@@ -20,7 +20,7 @@ for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
 examples:
   canprobe plan cylinder
   canprobe plan mine.toml --auto
-  canprobe plan cylinder --measured runs/cylinder-20260101-120000
+  canprobe plan cylinder --measured runs/cylinder-20260101-120000-000
   canprobe plan cylinder --export dbc --export dcf --out config/
   canprobe plan cylinder --figure plan.png
 """

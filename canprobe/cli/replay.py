@@ -13,10 +13,10 @@ _EXAMPLE = """\
 The log of a run gives its online result once more. In any other candump of the same nodes every contact is used.
 
 examples:
-  canprobe replay runs/cylinder-20260101-120000
-  canprobe replay runs/cylinder-20260101-120000 --method ml --method chen1996 --out estimates.npz
+  canprobe replay runs/cylinder-20260101-120000-000
+  canprobe replay runs/cylinder-20260101-120000-000 --method ml --method chen1996 --out estimates.npz
   canprobe replay candump.log --scene cylinder --json
-  canprobe replay runs/cylinder-20260101-120000 --bridge mcap
+  canprobe replay runs/cylinder-20260101-120000-000 --bridge mcap
 """
 
 

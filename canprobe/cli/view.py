@@ -24,8 +24,8 @@ Where a folder is called like a packaged scene, ./NAME is the folder.
 
 examples:
   canprobe view cylinder
-  canprobe view runs/cylinder-20260101-120000 --port 9000 --no-open
-  canprobe view runs/cylinder-20260101-120000 --html cylinder.html
+  canprobe view runs/cylinder-20260101-120000-000 --port 9000 --no-open
+  canprobe view runs/cylinder-20260101-120000-000 --html cylinder.html
 """
 
 

@@ -245,7 +245,7 @@ class _Run:
             self.failures.append(f"crash: {errors.strip().splitlines()[-1]}")
         out = self.folder / "run"
         try:
-            frames = sum(1 for _ in read_candump(out / "bus.log"))
+            frames = sum(1 for _ in read_candump(out / "bus.log", whole=True))
             if not frames:
                 self.failures.append("log: bus.log is empty")
             if not killed and json.loads((out / "summary.json").read_text(encoding="utf-8"))["completed"]:

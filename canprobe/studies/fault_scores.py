@@ -190,7 +190,7 @@ def score_log(session: Session, steps: int) -> list[str]:
     if session.out is None:
         return failures
     try:
-        lines = sum(1 for _ in read_candump(session.out / "bus.log"))
+        lines = sum(1 for _ in read_candump(session.out / "bus.log", whole=True))
     except CanprobeError as error:
         return [*failures, f"log: {error}"]
     frames = sum(counter.frames for counter in session.traffic.values())

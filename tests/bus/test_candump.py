@@ -107,3 +107,16 @@ def test_recording_port_writes_both_directions(tmp_path: Path) -> None:
         (0, 0x201, b"\2"),
         (2_500_000, 0x181, b"\3"),
     ]
+
+
+def test_a_torn_last_line_is_passed_over_unless_the_log_should_be_whole(tmp_path):
+    path, line = tmp_path / "bus.log", "(0000000000.002500) vcan0 080#01\n"
+    path.write_text(line + line[:20])
+    assert len(list(read_candump(path))) == 1
+    with pytest.raises(UsageError, match=r"bus\.log:2: no candump line"):
+        list(read_candump(path, whole=True))
+    path.write_text(line + line.rstrip())  # an editor's last line: not torn
+    assert len(list(read_candump(path))) == len(list(read_candump(path, whole=True))) == 2
+    path.write_text(line[:20] + "\n" + line)
+    with pytest.raises(UsageError, match=r"bus\.log:1: no candump line"):
+        list(read_candump(path))
