@@ -180,7 +180,7 @@ class Cell:
             progress: called after each cycle.
 
         Raises:
-            UsageError: this is no controller, or it returned no `Command`.
+            UsageError: this is no controller, it returned no `Command`, or another one is running.
             SafetyStop: the controller or the supervision stopped the cell.
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
