@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.errors import NodeError, UsageError
+from canprobe.npz_file import write_npz
 from canprobe.protocol.lss import UNCONFIGURED
 from canprobe.rehearsal import rehearse
 from canprobe.scene import Scene
@@ -80,7 +81,7 @@ def emulate(
             )
         finally:
             if truth_path is not None and world.recorder is not None:
-                world.recorder.save(truth_path)
+                write_npz(truth_path, world.recorder.arrays())
 
 
 def emulate_eds(

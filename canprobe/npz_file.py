@@ -1,10 +1,9 @@
-"""Columns in an ``.npz`` file: written, read, or told what is wrong with it; and files that are whole or not there."""
+"""Columns in an ``.npz`` file: written, read, or told what is wrong with it."""
 
 from __future__ import annotations
 
-import contextlib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
-
-
-@contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """A file that is written whole, under the name that is given to the block, or not at all.
-
-    Args:
-        path: what it is called afterwards; an older one is replaced.
-
-    Raises:
-        OSError: it cannot be written; no part of it is left, nor the older one.
-    """
-    part = path.with_name(f".{path.name}.part")
-    try:
-        yield part
-        part.replace(path)
-    except BaseException as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-            if isinstance(error, OSError):
-                path.unlink(missing_ok=True)
-        if isinstance(error, OSError) and error.filename is not None:
-            error.filename = str(path)
-        raise
+from canprobe.whole_file import whole_file
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:

@@ -16,7 +16,7 @@ from canprobe.cell.scoring import ShapeScore, bound_of_scan, score_contact, scor
 from canprobe.cell.tasks.regain import losses_text, summarise_losses
 from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.errors import UsageError
-from canprobe.npz_file import whole_file, write_npz
+from canprobe.npz_file import write_npz
 from canprobe.planning import Plan
 from canprobe.scene import Scene
 from canprobe.scene_tool import FILE, calibration_lines, summarise_calibration, tool_text
@@ -26,6 +26,7 @@ from canprobe.surface_file import save_surface_map
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
 from canprobe.traffic_log import LOG, measure_traffic
+from canprobe.whole_file import write_text
 
 if TYPE_CHECKING:
     import pandas
@@ -338,17 +339,13 @@ def write_files(result: RunResult, out: Path) -> None:
     Raises:
         OSError: one cannot be written; no part of it is left, nor the one of an earlier run.
     """
-    with whole_file(out / "summary.json") as path:
-        document = json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False)
-        path.write_text(document + "\n", encoding="utf-8")
-    with whole_file(out / "scene.toml") as path:
-        path.write_text(dump_scene(result.plan.scene), encoding="utf-8")
+    write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(out / "scene.toml", dump_scene(result.plan.scene))
     write_npz(out / "log.npz", result.log)
     for name in ("surface.npz", FILE):
         (out / name).unlink(missing_ok=True)  # of an earlier run
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
-        with whole_file(out / FILE) as path:
-            path.write_text(text, encoding="utf-8")
+        write_text(out / FILE, text)
     if result.surface_map is not None:
         save_surface_map(result.surface_map, out / "surface.npz")
 

@@ -29,7 +29,7 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
-from canprobe.npz_file import whole_file
+from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
@@ -37,6 +37,7 @@ from canprobe.scene import BridgeSettings, Scene
 from canprobe.scene_values import need_scene, with_values
 from canprobe.scene_writer import dump_scene
 from canprobe.session_bus import Sink, TrafficCounter, channel_routes, lockstep_bus, open_ports
+from canprobe.whole_file import write_text
 
 if TYPE_CHECKING:
     from canprobe.emulator.build import World
@@ -235,8 +236,8 @@ class Session:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
-                with contextlib.suppress(OSError), whole_file(self.out / "scene.toml") as path:  # told at the end
-                    path.write_text(dump_scene(self.scene), encoding="utf-8")
+                with contextlib.suppress(OSError):  # it is written again at the end, and a failure told
+                    write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = t0_ns
@@ -307,8 +308,7 @@ class Session:
             self.truth = self.world.recorder.arrays()
             if self.out is not None:
                 try:
-                    with whole_file(self.out / "truth.npz") as path:
-                        self.world.recorder.save(path)
+                    write_npz(self.out / "truth.npz", self.truth)
                 except OSError as error:
                     self._note(f"truth.npz could not be written: {error.strerror or error}")
 

@@ -53,6 +53,7 @@ COMPOSITION = {
     "recorded_bridges",
     "recorded_summary",
     "npz_file",
+    "whole_file",
     "surface_file",
     "tables",
     "traffic_log",

@@ -39,13 +39,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.set_defaults(run=run)
 
 
+@termination_interrupts()
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
-    with termination_interrupts():
-        return _run(args)
-
-
-def _run(args: argparse.Namespace) -> int:
     from canprobe.scene_loader import load_scene
 
     scene = with_realtime(load_scene(args.scene), args.realtime)

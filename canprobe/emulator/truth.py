@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -70,8 +69,3 @@ class TruthRecorder:
         for name in truths[0] if truths else ():
             columns[name] = np.array([truth[name] for truth in truths])
         return columns
-
-    def save(self, path: Path) -> None:
-        """Write the columns as a compressed npz file, exactly that file: numpy would append `.npz` to a name."""
-        with path.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **self.arrays())

@@ -10,6 +10,7 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe import results
 from canprobe.api import Command, results_folder
 from canprobe.bus.candump import CandumpWriter, read_candump
 from canprobe.errors import UsageError
@@ -79,17 +80,14 @@ def test_one_bridge_may_be_named_as_it_is(free, tmp_path):
 
 @pytest.mark.parametrize("name", ["log.npz", "summary.json", "scene.toml"])
 def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkeypatch, name):
-    from canprobe import npz_file
+    for write in (results.write_text, results.write_npz):
 
-    whole = npz_file.whole_file
+        def interrupted(path, content, write=write):
+            if path.name == name:
+                signal.raise_signal(signal.SIGINT)
+            write(path, content)
 
-    def interrupted(path):
-        if path.name == name:
-            signal.raise_signal(signal.SIGINT)
-        return whole(path)
-
-    monkeypatch.setattr("canprobe.results.whole_file", interrupted)
-    monkeypatch.setattr("canprobe.npz_file.whole_file", interrupted)
+        monkeypatch.setattr(results, write.__name__, interrupted)
     with pytest.raises(KeyboardInterrupt):
         undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert {path.name for path in tmp_path.iterdir()} >= {"summary.json", "log.npz", "scene.toml", "bus.log"}

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -13,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from slow_scene import write_slow_scene
 from waiting import wait_until
 
 from canprobe.bus.candump import read_candump
@@ -22,7 +22,6 @@ from canprobe.bus.socketcan import SocketCanPort
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 
 ROOT = Path(__file__).parents[2]
-SCENES = ROOT / "canprobe" / "scenes"
 CHANNEL = "vcan0"
 PATIENCE_S = 60.0
 DRIVES = (1, 2, 3, 4, 5, 6)
@@ -206,24 +205,10 @@ class Bench:
         self.bus = Bus()
         self.start = Starter(folder)
 
-    def scene(
-        self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", missed_syncs: int = 20
-    ) -> Path:
-        """Write a packaged scene with another rate or patience, with its nodes left to somebody else, or another EDS.
-
-        What does not need 400 Hz runs at 100 Hz: a slow machine must not decide what these tests find. Nothing is
-        drawn: figures take longer than these runs.
-        """
-        extra = "" if emulated else "emulated = false\n"
-        text = re.sub(r"missed_syncs = .*\n", "", (SCENES / f"{name}.toml").read_text())
-        text = text.replace(
-            "[arm]\n", f"[arm]\nmissed_syncs = {missed_syncs}\n{extra}" + (f'eds = "{eds}"\n' if eds else "")
-        )
-        text = text.replace("[sensor]\n", f"[sensor]\n{extra}rate_hz = {rate_hz // 2}\n")
-        text = text.replace("[scene]\n", "[scene]\nfigures = false\n")
+    def scene(self, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", **options: Any) -> Path:
+        """A packaged scene as `write_slow_scene` alters it."""
         path = self.folder / f"{name}-{rate_hz}-{emulated}-{bool(eds)}.toml"
-        path.write_text(f"{text}\n[cycle]\nrate_hz = {rate_hz}\n")
-        return path
+        return write_slow_scene(path, name, rate_hz=rate_hz, emulated=emulated, eds=eds, **options)
 
     def results(self, name: str) -> Results:
         return Results(self.folder / name)

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, Self
 
 import pytest
+from slow_scene import write_slow_scene
 
-import canprobe
 from canprobe.bus.candump import read_candump
 from canprobe.protocol.timing import best_case_bits, worst_case_bits
 
@@ -23,7 +23,6 @@ ON_VCAN0 = ("--bus", "socketcan", "--channel", "vcan0")
 NODES = (5, 16)
 MARKER = 0x7E6
 """Identifier of the frames by which a test sees that candump listens."""
-SCENES = Path(canprobe.__file__).parent / "scenes"
 Frames = list[tuple[int, bytes]]
 
 
@@ -139,21 +138,12 @@ def read_log(path: Path) -> Frames:
 # ---------------------------------------------------------------- a bring-up, seen by candump and read by tshark
 
 
-def slow_scene(path: Path) -> Path:
-    """The scene `press` at 100 Hz with patient drives, as `Bench.scene`: a slow machine must not decide here."""
-    text = re.sub(r"missed_syncs = .*\n", "", (SCENES / "press.toml").read_text())
-    text = text.replace("[arm]\n", "[arm]\nmissed_syncs = 20\n").replace("[sensor]\n", "[sensor]\nrate_hz = 50\n")
-    text = text.replace("[scene]\n", "[scene]\nfigures = false\n")
-    path.write_text(f"{text}\n[cycle]\nrate_hz = 100\n")
-    return path
-
-
 @pytest.fixture(scope="module")
 def bring_up(start_shared: Any, tmp_path_factory: pytest.TempPathFactory) -> tuple[Frames, Frames, Path]:
     """Our log of a bring-up with drives and sensor, candump's of the same, and the path of ours."""
     folder = tmp_path_factory.mktemp("witness")
     with Candump(folder / "candump.log") as candump:
-        scene = slow_scene(folder / "press-slow.toml")
+        scene = write_slow_scene(folder / "press-slow.toml", "press")
         command = start_shared("run", scene, *ON_VCAN0, "--duration", "0.2", "--out", folder / "results")
         status = command.wait()
         assert status == 0, command.err

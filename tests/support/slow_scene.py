@@ -1,0 +1,28 @@
+"""Packaged scenes for tests in real time: what does not need 400 Hz runs slower, and nothing is drawn."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import canprobe
+
+SCENES = Path(canprobe.__file__).parent / "scenes"
+
+
+def write_slow_scene(
+    path: Path, name: str, *, rate_hz: int = 100, emulated: bool = True, eds: str = "", missed_syncs: int = 20
+) -> Path:
+    """Write a packaged scene with another rate or patience, with its nodes left to somebody else, or another EDS.
+
+    A slow machine must not decide what these tests find, and figures take longer than the runs.
+    """
+    extra = "" if emulated else "emulated = false\n"
+    text = re.sub(r"missed_syncs = .*\n", "", (SCENES / f"{name}.toml").read_text())
+    text = text.replace(
+        "[arm]\n", f"[arm]\nmissed_syncs = {missed_syncs}\n{extra}" + (f'eds = "{eds}"\n' if eds else "")
+    )
+    text = text.replace("[sensor]\n", f"[sensor]\n{extra}rate_hz = {rate_hz // 2}\n")
+    text = text.replace("[scene]\n", "[scene]\nfigures = false\n")
+    path.write_text(f"{text}\n[cycle]\nrate_hz = {rate_hz}\n")
+    return path
