@@ -12,20 +12,24 @@ def whole_file(path: Path) -> Iterator[Path]:
     """A file that is written whole, under the name that is given to the block, or not at all.
 
     Args:
-        path: what it is called afterwards; an older one is replaced.
+        path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
 
     Raises:
         OSError: it cannot be written; no part of it is left, nor the older one.
     """
-    part = path.with_name(f".{path.name}.part")
+    if path.exists() and not path.is_file():
+        yield path
+        return
+    whole = path.resolve()
+    part = whole.with_name(f".{whole.name}.part")
     try:
         yield part
-        part.replace(path)
+        part.replace(whole)
     except BaseException as error:
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
             if isinstance(error, OSError):
-                path.unlink(missing_ok=True)
+                whole.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is not None:
             error.filename = str(path)
         raise
