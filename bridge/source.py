@@ -55,9 +55,9 @@ class SampleSource:
         diagnostics = self._health.step(t_ns, received)
         if measurement is None:
             return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
+        self._feel(received.estimate)  # before the contact, as the task does
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
-        self._feel(received.estimate)  # before the next contact, as the task does
         taxels, wrench, contact = self._touch(measurement, t_ns - measurement.t_ns)
         return Sample(
             t_ns,

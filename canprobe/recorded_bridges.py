@@ -117,11 +117,9 @@ class _Observations:
         self._recording = read_recording(path, plan, as_taken=self._as_taken)
         self._drifts = folder is None
         self._estimates = _estimates(result)
-        self._sampled_ns: int | None = None
         self._columns = _columns(folder) if self._ours else {}
 
     def __iter__(self) -> Iterator[Observation]:
-        self._sampled_ns = None
         groups = _frames_by_sync(self._path, self._recording)
         first_ns = self._first_ns()
         before = next(groups)
@@ -152,13 +150,12 @@ class _Observations:
 
     def _command(self, m: Measurement) -> Command | None:
         columns = self._columns.get(m.t_ns, {})
-        estimate = self._estimates.get(self._sampled_ns) if self._sampled_ns is not None else None
-        self._sampled_ns = m.tactile.t_sample_ns if m.tactile is not None else None  # it is answered in the next cycle
+        estimate = self._estimates.get(m.t_ns)
         return Command(columns=columns, estimate=estimate) if columns or estimate is not None else None
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
-    """What the scene's estimator said, by the instant of the sample after which it did, ns."""
+    """What the scene's estimator said, by the time of the cycle, ns."""
     if result is None:
         return {}
     records = next(iter(result.estimates.values()))

@@ -145,7 +145,7 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
         if contact is None:
             continue
         tracker.add(contact)
-        estimate = tracker.answer_at_once()
+        estimate = tracker.answer_at_once(measurement.t_ns * 1e-9)
         if estimate is not None and bool(np.all(estimate.observed)):
             sensing.set_kappa(np.asarray(estimate.kappa))
     return tracker, sensing.dropped

@@ -22,22 +22,20 @@ DOUBTED = 0.5
 _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
-def fuse(motion: SurfaceEstimate, patch: PatchCurvature, length: float) -> SurfaceEstimate:
-    """A motion estimate with what the patch adds to it; the same object where it adds nothing.
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
+    """A motion estimate with what was found with the patch.
 
     Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them.
 
     Args:
-        motion: of an estimator that gives its `evidence`, at the last contact that the patch was given.
-        patch: the images.
+        motion: with its `evidence`.
+        found: of the patch and that evidence.
         length: m, `rank` takes curvatures below 1/length for flat; the memory of the estimator.
 
     Returns:
         The estimate; its `method` ends in "+patch" where the patch gave at least `NAMED`, and a note says how much.
     """
-    found = None if motion.evidence is None else patch.fuse(motion.T_frame_contact, motion.evidence)
-    if found is None or motion.evidence is None:
-        return motion
+    assert motion.evidence is not None
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
     data = motion.information if has_prior else motion.evidence.information
     decision = _decide(data + found.patch, found.q, length)
@@ -65,7 +63,7 @@ def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float)
     Args:
         contact: the last one; place and normal are its.
         patch: the images.
-        length: m, see `fuse`.
+        length: m, see `with_patch`.
     """
     T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
     found = patch.fuse(T)

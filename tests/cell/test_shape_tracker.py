@@ -49,37 +49,54 @@ def taken(tracker, times):
         tracker.add(contact(t, 25e-3 * t))
 
 
-def test_an_answer_of_one_part_is_there_at_once_and_once():
-    tracker = ShapeTracker(InOne(), every=2)
-    taken(tracker, [0.0])
-    assert tracker.answer() is None
-    taken(tracker, [0.005])
-    assert tracker.answer() is not None and tracker.answer() is None
-
-
 def answered(tracker, times, calls=2):
     """Whether an answer was there: after each contact, over so many cycles."""
     found = []
     for t in times:
         taken(tracker, [t])
-        found.append([tracker.answer() is not None for _ in range(calls)])
+        found.append([tracker.answer(t + 0.1 * k) is not None for k in range(calls)])
     return found
 
 
-def test_one_part_is_worked_out_after_each_contact():
+def test_a_cycle_takes_a_contact_or_answers():
+    estimator = InOne()
+    tracker = ShapeTracker(estimator, every=2)
+    taken(tracker, [0.0])
+    assert estimator.n == 0, "the cycle that feels a contact does no more"
+    assert tracker.answer(0.0) is None and estimator.n == 1
+    assert tracker.answer(0.0) is None
+    assert answered(tracker, [0.005, 0.01], calls=3) == [[False, True, False], [False] * 3]
+
+
+def test_one_part_is_worked_out_between_two_contacts():
     tracker = ShapeTracker(InThree(), every=4)
     found = answered(tracker, [0.005 * k for k in range(12)])
     assert [k for k, calls in enumerate(found) if any(calls)] == [5, 9]
-    assert all(calls[1] is False for calls in found), "in the cycle after the contact"
+    assert all(calls[0] is False for calls in found), "in the cycle that takes none"
+
+
+def test_contacts_that_come_in_every_cycle_leave_every_second_for_an_answer():
+    estimator = InThree()
+    tracker = ShapeTracker(estimator, every=8)
+    found = answered(tracker, [0.0025 * k for k in range(24)], calls=1)
+    assert [k for k, calls in enumerate(found) if any(calls)] == [11, 19]
+    assert estimator.n == 24
+
+
+def test_contacts_faster_than_cycles_are_all_taken():
+    estimator = InOne()
+    tracker = ShapeTracker(estimator, every=2)
+    taken(tracker, [0.001 * k for k in range(7)])
+    tracker.answer(0.0)
+    assert estimator.n == 7
 
 
 def test_an_answer_stands_at_the_contact_after_which_it_was_due():
     tracker = ShapeTracker(InThree(), every=2)
-    taken(tracker, [0.0, 0.005])
-    tracker.answer()
-    assert answered(tracker, [0.01, 0.011]) == [[False, False], [True, False]]
+    taken(tracker, [0.0])
+    assert answered(tracker, [0.005, 0.01, 0.011]) == [[False, False], [False, False], [False, True]]
     (record,) = tracker.records
-    assert record.told_s == 0.011
+    assert record.told_s == 0.111
     assert record.t_s == 0.005 and record.travelled_m == pytest.approx(25e-3 * 0.005)
 
 
@@ -90,11 +107,11 @@ def test_what_is_due_meanwhile_is_begun_afterwards():
     assert found == [False, False, True, False, False, True, False] and estimator.asked == 2
 
 
-def test_a_new_contact_makes_an_unfinished_answer_void():
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_new_contact_makes_an_unfinished_answer_void(begun):
     estimator = InThree()
     tracker = ShapeTracker(estimator, every=2)
-    taken(tracker, [0.0, 0.005])
-    tracker.answer()
+    answered(tracker, [0.0, 0.005], calls=2 if begun else 1)
     assert answered(tracker, [1.0], calls=4) == [[False] * 4]
     assert estimator.resets == 1 and not tracker.records
 
@@ -103,7 +120,7 @@ def test_a_diverged_answer_starts_the_estimator_afresh():
     estimator = InThree(curvature=2.0 * SHARPEST)
     tracker = ShapeTracker(estimator, every=1)
     taken(tracker, [0.0])
-    assert tracker.answer_at_once() is None
+    assert tracker.answer_at_once(0.0) is None
     assert tracker.restarts == 1 and estimator.resets == 1 and not tracker.records
 
 

@@ -31,7 +31,7 @@ class ShapeRecord:
         t_s: instant of its last sample, on the cycle's clock, s.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
-        told_s: instant of the contact in the cycle after which it was told, s.
+        told_s: instant of the cycle in which it was told, s.
     """
 
     t_s: float
@@ -43,9 +43,9 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    A contact is taken and an answer worked out by calls of their own: together they take longer than either, and the
-    loop has a cycle between two images for the answer. It comes in parts, one after each contact, as the whole would
-    hold up its cycle; a later part may know a contact more than the first.
+    Each is too long a work to come on top of another: a contact is taken in the cycle after the one that felt it, and
+    an answer worked out in parts, one in each cycle that has no contact to take. Where every cycle has one, every
+    second works out a part as well. A later part may know contacts that the first did not.
 
     Args:
         estimator: the online estimator.
@@ -68,30 +68,55 @@ class ShapeTracker:
         self._every = max(1, every)
         self._gap_s = gap_s
         self._last: ContactSample | None = None
+        self._waiting: ContactSample | None = None
+        self._put_off = False
         self._due = False
         self._answering: Answering | None = None
         self._place = (0.0, 0.0)
-        self._turn = False
 
     def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
+        """Hear of one contact."""
+        if self._waiting is not None:
+            self._take(self._waiting)
         if self._last is not None:
             if sample.t_s - self._last.t_s > self._gap_s:
                 self._estimator.reset()
-                self._answering = None
+                self._due, self._answering = False, None
             else:
                 self.travelled_m += float(np.linalg.norm(sample.p_base - self._last.p_base))
-        self._last = sample
         self.samples.append(sample)
-        self._estimator.add(sample)
-        self._due = len(self.samples) % self._every == 0
-        self._turn = True
+        self._last = self._waiting = sample
 
-    def answer(self) -> SurfaceEstimate | None:
-        """Work on the estimate that is due; it, once, at the contact after which it was due, where it can be given."""
-        if not self._turn:
-            return None
-        self._turn = False
+    def answer(self, t_s: float) -> SurfaceEstimate | None:
+        """A cycle's work: take the last contact, or a part of the estimate that is due; it, once, when it is there.
+
+        Args:
+            t_s: instant of the cycle, s.
+        """
+        if self._waiting is not None:
+            self._take(self._waiting)
+            self._put_off = not self._put_off
+            if self._put_off:
+                return None
+        self._put_off = False
+        return self._work(t_s)
+
+    def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
+        """All parts of the estimate that is due, in the cycle at an instant (s)."""
+        if self._waiting is not None:
+            self._take(self._waiting)
+        estimate = self._work(t_s)
+        while self._answering is not None:
+            estimate = self._work(t_s)
+        return estimate
+
+    def _take(self, sample: ContactSample) -> None:
+        self._waiting = None
+        self._estimator.add(sample)
+        self._due = self._due or len(self.samples) % self._every == 0
+
+    def _work(self, t_s: float) -> SurfaceEstimate | None:
+        """One part of the estimate that is due or under way."""
         if self._answering is None:
             if not self._due or self._last is None:
                 return None
@@ -102,18 +127,10 @@ class ShapeTracker:
             next(self._answering)
         except StopIteration as end:
             self._answering = None
-            return self._told(end.value)
+            return self._told(end.value, t_s)
         return None
 
-    def answer_at_once(self) -> SurfaceEstimate | None:
-        """All parts of the estimate that is due."""
-        estimate = self.answer()
-        while self._answering is not None:
-            self._turn = True
-            estimate = self.answer()
-        return estimate
-
-    def _told(self, estimate: SurfaceEstimate | None) -> SurfaceEstimate | None:
+    def _told(self, estimate: SurfaceEstimate | None, t_s: float) -> SurfaceEstimate | None:
         """An estimate with its place on record; None where it has diverged."""
         if estimate is None:
             return None
@@ -121,8 +138,7 @@ class ShapeTracker:
             self.restarts += 1
             self._estimator.reset()
             return None
-        assert self._last is not None
-        self.records.append(ShapeRecord(*self._place, estimate, self._last.t_s))
+        self.records.append(ShapeRecord(*self._place, estimate, t_s))
         return estimate
 
 
@@ -138,5 +154,5 @@ def replay_samples(estimator: Estimator, samples: Sequence[ContactSample], every
     tracker = ShapeTracker(estimator, every)
     for sample in samples:
         tracker.add(sample)
-        tracker.answer_at_once()
+        tracker.answer_at_once(sample.t_s)
     return tracker.records

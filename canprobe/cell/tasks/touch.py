@@ -113,7 +113,7 @@ class TouchTask(ProbingTask):
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
         self._pass_time(measurement.t_ns)
-        self._take_answer()
+        self._take_answer(measurement.t_ns * 1e-9)
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
@@ -170,9 +170,9 @@ class TouchTask(ProbingTask):
             self._servo.surface.raise_by(rise)
             self._depth0 += rise
 
-    def _take_answer(self) -> None:
+    def _take_answer(self, t_s: float) -> None:
         """What the estimator says about the contact of the cycle before."""
-        estimate = self._estimate = self.shape.answer() if self.shape is not None else None
+        estimate = self._estimate = self.shape.answer(t_s) if self.shape is not None else None
         contact = self._contact
         if estimate is None or contact is None or self._servo is None:
             return

@@ -6,7 +6,7 @@ from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.estimators.base import Answering, Dropped, Estimator, answering, whole
 from canprobe.touch.patch_curvature import PatchCurvature
-from canprobe.touch.patch_fusion import fuse, patch_estimate
+from canprobe.touch.patch_fusion import patch_estimate, with_patch
 
 
 class PatchedEstimator:
@@ -42,12 +42,18 @@ class PatchedEstimator:
         return whole(self.answering())
 
     def answering(self) -> Answering:
-        """The same in two parts: that of the motion, then the patch's, which takes as long."""
+        """The same in parts: those of the motion, what the patch says, and both together."""
         motion = yield from answering(self._motion)
-        if motion is not None:
-            yield
-            return fuse(motion, self.patch, self._length)
-        return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
+        if motion is None:
+            return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
+        if motion.evidence is None:
+            return motion
+        yield
+        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        if found is None:
+            return motion
+        yield
+        return with_patch(motion, found, self._length)
 
     def reset(self) -> None:
         """Forget everything but the settings."""

@@ -19,10 +19,10 @@ from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Dropped, Gate
+from canprobe.touch.estimators.base import Answering, Dropped, Gate, whole
 from canprobe.touch.estimators.change import ChangeTest
 from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
-from canprobe.touch.estimators.filter_answer import filter_estimate
+from canprobe.touch.estimators.filter_answer import filter_answering
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.estimators.start import Start
@@ -125,20 +125,26 @@ class RecursiveEstimator:
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact that is no outlier; None before the contact has moved."""
+        return whole(self.answering())
+
+    def answering(self) -> Answering:
+        """The same in parts, which all speak of what was known at the first."""
         if self._last is None or self._spread.weight == 0.0:
             return None
         # what has not settled is not called observed
         certain = float(self._settled) / self._gate.sigma_point**2
-        return filter_estimate(
-            self._filter,
-            self._last.point,
-            self._spread.covariance * certain,
-            innovation=self._change.innovation,
-            distance=min(self._travel.total, self._memory),
-            samples=self._spread.weight,
-            prior=self._prior.name,
-            notes=self._notes(),
-            expected=None if self._quadric else self._expected(),
+        return (
+            yield from filter_answering(
+                self._filter.still(),
+                self._last.point,
+                self._spread.covariance * certain,
+                innovation=self._change.innovation,
+                distance=min(self._travel.total, self._memory),
+                samples=self._spread.weight,
+                prior=self._prior.name,
+                notes=self._notes(),
+                expected=None if self._quadric else self._expected(),
+            )
         )
 
     def _expected(self) -> Expected:
