@@ -43,9 +43,9 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    Each is too long a work to come on top of another: a contact is taken in the cycle after the one that felt it, and
-    an answer worked out in parts, one in each cycle that has no contact to take. Where every cycle has one, every
-    second works out a part as well. A later part may know contacts that the first did not.
+    Each is too long a work to come on top of another. A contact is taken in the cycle after the one that felt it. An
+    answer is worked out in parts, one a contact: in the cycle that takes it, or in the next where taking it was work
+    itself. A later part may know contacts that the first did not.
 
     Args:
         estimator: the online estimator.
@@ -69,7 +69,7 @@ class ShapeTracker:
         self._gap_s = gap_s
         self._last: ContactSample | None = None
         self._waiting: ContactSample | None = None
-        self._put_off = False
+        self._owed = False
         self._due = False
         self._answering: Answering | None = None
         self._place = (0.0, 0.0)
@@ -94,11 +94,12 @@ class ShapeTracker:
             t_s: instant of the cycle, s.
         """
         if self._waiting is not None:
-            self._take(self._waiting)
-            self._put_off = not self._put_off
-            if self._put_off:
+            owed, self._owed = self._owed, True
+            if self._take(self._waiting) and not owed:
                 return None
-        self._put_off = False
+        if not self._owed:
+            return None
+        self._owed = False
         return self._work(t_s)
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
@@ -110,10 +111,11 @@ class ShapeTracker:
             estimate = self._work(t_s)
         return estimate
 
-    def _take(self, sample: ContactSample) -> None:
+    def _take(self, sample: ContactSample) -> bool:
+        """Whether it was work."""
         self._waiting = None
-        self._estimator.add(sample)
         self._due = self._due or len(self.samples) % self._every == 0
+        return self._estimator.add(sample)
 
     def _work(self, t_s: float) -> SurfaceEstimate | None:
         """One part of the estimate that is due or under way."""

@@ -56,8 +56,12 @@ class Estimator(Protocol):
     def dropped(self) -> Dropped:
         """Samples that were not used."""
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
+    def add(self, sample: ContactSample) -> bool:
+        """Take one contact; a sample that cannot be used is dropped and counted, never an error.
+
+        Returns:
+            Whether that was more work than keeping it: a loop had better not work on an answer as well.
+        """
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
@@ -180,11 +184,12 @@ class WindowEstimator:
         self._samples: deque[ContactSample] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
+    def add(self, sample: ContactSample) -> bool:
+        """Take one contact; never more work than that."""
         if self._gate.passes(sample, self.dropped):
             self._samples.append(sample)
             self._answer = None
+        return False
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""

@@ -50,9 +50,9 @@ class FollowingEstimator:
         """Samples that were not used."""
         return self._inner.dropped
 
-    def add(self, sample: ContactSample) -> None:
+    def add(self, sample: ContactSample) -> bool:
         """Take one contact."""
-        self._inner.add(sample)
+        return self._inner.add(sample)
 
     def reset(self) -> None:
         """Forget everything but the settings."""
@@ -65,10 +65,11 @@ class FollowingEstimator:
         return whole(self.answering())
 
     def answering(self) -> Answering:
-        """The same in the parts of the estimator inside."""
+        """The same in the parts of the estimator inside, and one more."""
         answer = yield from answering(self._inner)
         if answer is None or answer.rank < 3:
             return answer
+        yield
         if self._place is not None:
             self._travelled += float(np.linalg.norm(answer.point - self._place))
         self._place = answer.point

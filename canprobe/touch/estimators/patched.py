@@ -29,13 +29,14 @@ class PatchedEstimator:
         """Samples that were not used, by neither sensor."""
         return self._motion.dropped
 
-    def add(self, sample: ContactSample) -> None:
+    def add(self, sample: ContactSample) -> bool:
         """Take one contact with its moments."""
         before = self._motion.dropped.total
-        self._motion.add(sample)
+        worked = self._motion.add(sample)
         if self._motion.dropped.total == before:
             self._last = sample
             self.patch.add(sample)
+        return worked
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""

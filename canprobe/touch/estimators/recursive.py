@@ -110,10 +110,10 @@ class RecursiveEstimator:
         self._settled = False
         self._doubtful = 0.0
 
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
+    def add(self, sample: ContactSample) -> bool:
+        """Take one contact; at the end of a step, which is work, all of it."""
         if not self._gate.passes(sample, self.dropped):
-            return
+            return False
         touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
@@ -122,6 +122,7 @@ class RecursiveEstimator:
         if moved > 0.0:
             self._step(moved)
             self._pending.clear()
+        return moved > 0.0
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact that is no outlier; None before the contact has moved."""
