@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 
 INK, FAINT = "#1f2933", "#d9dee4"
 OURS, PLAIN, THIRD = "#0f6e84", "#b7791f", "#c2410c"
+CROWDED = 500.0
+"""Width of an axis from which its labels would run into each other at 1, 2 and 5."""
 
 
 def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
@@ -51,7 +53,8 @@ def _histogram(axes: Axes, what: str, series: dict[str, Times]) -> None:
         for (name, v), colour in zip(values.items(), (OURS, PLAIN), strict=False):
             axes.hist(v, bins=bins, weights=np.full(len(v), 100 / len(v)), color=colour, alpha=0.75, label=name)
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        wide = bins[-1] > CROWDED * bins[0]
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
         axes.xaxis.set_major_formatter(ScalarFormatter())
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_yscale("log")

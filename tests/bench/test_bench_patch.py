@@ -13,7 +13,7 @@ from canprobe.cell.tasks.patch_fits import moment_model
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimators import make_estimator
 from canprobe.touch.patch_curvature import PatchCurvature
-from canprobe.touch.patch_fusion import fuse, patch_estimate
+from canprobe.touch.patch_fusion import patch_estimate, with_patch
 from canprobe.touch.patch_image import MomentImage
 
 MODEL = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
@@ -52,7 +52,8 @@ def test_bench_fuse(benchmark, patch):
     motion = make_estimator("recursive", sigma_point=1e-4, sigma_normal=4e-3, probe_radius=0.04)
     for i in range(300):
         motion.add(touch(i))
-    answer = benchmark(fuse, motion.estimate(), patch, 0.02)
+    estimate = motion.estimate()
+    answer = benchmark(lambda: with_patch(estimate, patch.fuse(estimate.T_frame_contact, estimate.evidence), 0.02))
     assert answer.method == "recursive+patch"
     assert math.isclose(answer.kappa[0], 27.8, abs_tol=0.5)
 

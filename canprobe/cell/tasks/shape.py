@@ -45,7 +45,7 @@ class ShapeTracker:
 
     Each is too long a work to come on top of another. A contact is taken in the cycle after the one that felt it. An
     answer is worked out in parts, one a contact: in the cycle that takes it, or in the next where taking it was work
-    itself. A later part may know contacts that the first did not.
+    itself. It is the answer at the contact after which it was due, whatever comes meanwhile.
 
     Args:
         estimator: the online estimator.

@@ -77,7 +77,7 @@ Answering = Generator[None, None, SurfaceEstimate | None]
 def answering(estimator: Estimator) -> Answering:
     """The answer of any estimator, in as many parts as it has: one, or those of its own `answering`.
 
-    Samples may be added between two parts.
+    Samples may be added between two parts; the answer is that of the first.
     """
     parts: Callable[[], Answering] = getattr(estimator, "answering", None) or partial(_in_one, estimator)
     return parts()

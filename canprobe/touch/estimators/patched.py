@@ -44,13 +44,15 @@ class PatchedEstimator:
 
     def answering(self) -> Answering:
         """The same in parts: those of the motion, what the patch says, and both together."""
+        patch = self.patch.still()
         motion = yield from answering(self._motion)
         if motion is None:
             return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
         if motion.evidence is None:
             return motion
         yield
-        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        found = patch.fuse(motion.T_frame_contact, motion.evidence)
+        self.patch.begin_at(patch)
         if found is None:
             return motion
         yield
