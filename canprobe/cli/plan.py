@@ -6,9 +6,9 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
-from canprobe.errors import PlanError, UsageError
+from canprobe.errors import CanprobeError, PlanError, UsageError
 
 if TYPE_CHECKING:
     from canprobe.planning import Plan
@@ -96,10 +96,23 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _scene_beside(log: Path) -> str | None:
+    """Name of the scene that ran, where the log is a run's."""
+    from canprobe.scene_loader import load_scene
+
+    path = (log if log.is_dir() else log.parent) / "scene.toml"
+    try:
+        return load_scene(path).name if path.is_file() else None
+    except CanprobeError:  # of another version, or anything
+        return None
+
+
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     """Print what was measured on each bus; 3 where it is not what was planned."""
     from canprobe.traffic_log import measure_traffic
 
+    if (ran := _scene_beside(log)) not in (None, plan.scene.name):
+        say(f"canprobe: {log} is a run of scene {ran}, set beside the plan of {plan.scene.name}")
     several = len(plan.buses) > 1
     measured = {bus.channel: measure_traffic(log, plan, channel=bus.channel if several else None) for bus in plan.buses}
     if as_json:

@@ -67,11 +67,14 @@ def test_the_summary_says_the_same(press):
 def test_plan_measured_on_the_command_line(press, capsys):
     _, folder = press
     assert main(["plan", "press", "--measured", str(folder)]) == 0
-    assert "drive TPDO" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "drive TPDO" in captured.out and not captured.err
     assert main(["plan", "press", "--measured", str(folder / "bus.log"), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["can0"]["as_planned"] is True
     assert main(["plan", "free", "--measured", str(folder)]) == 3
-    assert "not in the plan: 511h" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "not in the plan: 511h" in captured.out
+    assert captured.err == f"canprobe: {folder} is a run of scene press, set beside the plan of free\n"
 
 
 def test_logs_that_cannot_be_measured(press, tmp_path):
