@@ -34,6 +34,7 @@ COMMANDS = (
     "eds",
 )
 
+_WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 _EXAMPLE = """\
 exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure,
 70 an error that nobody foresaw, 130 and 143 interrupted
@@ -69,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
         return 141
     except OSError as error:
         where = f"{error.filename}: " if error.filename is not None else ""
-        return _complain(f"{where}{error.strerror or error}", 3)
+        return _complain(f"{where}{error.strerror or error}", 2 if where and isinstance(error, _WRONG_PATH) else 3)
     except KeyboardInterrupt as interrupt:
         return 143 if isinstance(interrupt, Terminated) else 130
     except Exception:
