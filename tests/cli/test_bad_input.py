@@ -164,7 +164,7 @@ def test_wrong_use(words, text, tmp_path):
 
 def test_a_folder_that_cannot_be_made(tmp_path):
     (tmp_path / "file").write_text("")
-    (line,) = lines_of(tmp_path, 3, "run", "press", "--out", "file/results")
+    (line,) = lines_of(tmp_path, 2, "run", "press", "--out", "file/results")
     assert line == "canprobe: file/results: Not a directory"
 
 
@@ -220,9 +220,9 @@ def test_closed_standard_streams(words, status, out, tmp_path):
 def test_truth_and_store_that_have_no_place_are_told_before_anything_is_served(tmp_path):
     (tmp_path / "file").write_text("")
     emulate = ("emulate", "press", "--bus", "virtual", "--channel", "x")
-    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", ".")
+    (line,) = lines_of(tmp_path, 2, *emulate, "--truth", ".")
     assert line == "canprobe: .: Is a directory"
-    (line,) = lines_of(tmp_path, 3, *emulate, "--store", "file")
+    (line,) = lines_of(tmp_path, 2, *emulate, "--store", "file")
     assert line == "canprobe: file: File exists"
-    (line,) = lines_of(tmp_path, 3, *emulate, "--truth", "file/truth.npz")
+    (line,) = lines_of(tmp_path, 2, *emulate, "--truth", "file/truth.npz")
     assert line.startswith("canprobe: file")
