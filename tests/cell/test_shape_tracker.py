@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.tasks.shape import SHARPEST, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import PARTS, SHARPEST, ShapeTracker, replay_samples
 
 
 def contact(t_s, x=0.0):
@@ -38,10 +38,14 @@ class InOne:
         return estimate(self._curvature)
 
 
-class InThree(InOne):
+class InParts(InOne):
+    def __init__(self, parts=3, **options):
+        super().__init__(**options)
+        self._parts = parts
+
     def answering(self):
-        yield
-        yield
+        for _ in range(self._parts - 1):
+            yield
         return self.estimate()
 
 
@@ -69,21 +73,29 @@ def test_the_cycle_after_a_contact_takes_it_and_answers():
 
 
 def test_one_part_is_worked_out_after_each_contact():
-    tracker = ShapeTracker(InThree(), every=4)
-    found = answered(tracker, [0.005 * k for k in range(12)])
-    assert [k for k, calls in enumerate(found) if any(calls)] == [5, 9]
+    tracker = ShapeTracker(InParts(), every=PARTS)
+    found = answered(tracker, [0.005 * k for k in range(18)])
+    assert [k for k, calls in enumerate(found) if any(calls)] == [7, 13]
     assert all(calls[1] is False for calls in found)
 
 
+@pytest.mark.parametrize(("every", "later"), [(1, 0), (2, 1), (3, 2), (4, 2), (5, 2), (6, 5), (100, 5)])
+def test_an_answer_is_there_before_the_next_is_due(every, later):
+    tracker = ShapeTracker(InParts(PARTS), every)
+    found = answered(tracker, [0.005 * k for k in range(2 * every + PARTS)])
+    first, second, *_ = [k for k, calls in enumerate(found) if any(calls)]
+    assert (first, second) == (every - 1 + later, 2 * every - 1 + later)
+
+
 def test_where_a_contact_is_work_the_part_waits_for_the_next_cycle():
-    tracker = ShapeTracker(InThree(work=(4, 5, 10)), every=4)
-    found = answered(tracker, [0.005 * k for k in range(12)])
-    assert found[5] == [True, False] and found[9] == [False, True]
+    tracker = ShapeTracker(InParts(work=(6, 7, 14)), every=PARTS)
+    found = answered(tracker, [0.005 * k for k in range(17)])
+    assert found[7] == [True, False] and found[13] == [False, True]
     assert sum(map(sum, found)) == 2
 
 
 def test_contacts_that_are_all_work_and_come_in_every_cycle_leave_every_second_for_an_answer():
-    estimator = InThree(work=range(100))
+    estimator = InParts(work=range(100))
     tracker = ShapeTracker(estimator, every=8)
     found = answered(tracker, [0.0025 * k for k in range(24)], calls=1)
     assert [k for k, calls in enumerate(found) if any(calls)] == [11, 19]
@@ -99,32 +111,32 @@ def test_contacts_faster_than_cycles_are_all_taken():
 
 
 def test_an_answer_stands_at_the_contact_after_which_it_was_due():
-    tracker = ShapeTracker(InThree(), every=2)
-    taken(tracker, [0.0])
-    assert answered(tracker, [0.005, 0.01, 0.011]) == [[False, False], [False, False], [True, False]]
+    tracker = ShapeTracker(InParts(), every=PARTS)
+    taken(tracker, [0.005 * k for k in range(PARTS - 1)])
+    assert answered(tracker, [0.025, 0.03, 0.031]) == [[False, False], [False, False], [True, False]]
     (record,) = tracker.records
-    assert record.told_s == 0.011
-    assert record.t_s == 0.005 and record.travelled_m == pytest.approx(25e-3 * 0.005)
+    assert record.told_s == 0.031
+    assert record.t_s == 0.025 and record.travelled_m == pytest.approx(25e-3 * 0.025)
 
 
 def test_what_is_due_meanwhile_is_begun_afterwards():
-    estimator = InThree()
-    tracker = ShapeTracker(estimator, every=1)
-    found = [any(calls) for calls in answered(tracker, [0.005 * k for k in range(7)])]
-    assert found == [False, False, True, False, False, True, False] and estimator.asked == 2
+    estimator = InParts(8)
+    tracker = ShapeTracker(estimator, every=PARTS)
+    found = [any(calls) for calls in answered(tracker, [0.005 * k for k in range(21)])]
+    assert [k for k, there in enumerate(found) if there] == [12, 20] and estimator.asked == 2
 
 
 @pytest.mark.parametrize("begun", [True, False])
 def test_a_new_contact_makes_an_unfinished_answer_void(begun):
-    estimator = InThree(work=() if begun else (2,))
-    tracker = ShapeTracker(estimator, every=2)
-    answered(tracker, [0.0, 0.005], calls=1)
+    estimator = InParts(work=() if begun else (PARTS,))
+    tracker = ShapeTracker(estimator, every=PARTS)
+    answered(tracker, [0.005 * k for k in range(PARTS)], calls=1)
     assert answered(tracker, [1.0], calls=4) == [[False] * 4]
     assert estimator.resets == 1 and not tracker.records
 
 
 def test_a_diverged_answer_starts_the_estimator_afresh():
-    estimator = InThree(curvature=2.0 * SHARPEST)
+    estimator = InParts(curvature=2.0 * SHARPEST)
     tracker = ShapeTracker(estimator, every=1)
     taken(tracker, [0.0])
     assert tracker.answer_at_once(0.0) is None
@@ -133,5 +145,5 @@ def test_a_diverged_answer_starts_the_estimator_afresh():
 
 def test_recorded_contacts_are_answered_one_by_one():
     samples = [contact(0.005 * k) for k in range(10)]
-    for estimator in (InOne(), InThree()):
+    for estimator in (InOne(), InParts()):
         assert [r.t_s for r in replay_samples(estimator, samples, 3)] == [s.t_s for s in samples[2::3]]

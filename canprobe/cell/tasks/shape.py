@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from canprobe.touch.estimators.base import Answering
 
 
+PARTS = 6
+"""Of the longest answer: where fewer contacts come between two answers, several are worked out after each."""
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
@@ -44,8 +46,8 @@ class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
     Each is too long a work to come on top of another. A contact is taken in the cycle after the one that felt it. An
-    answer is worked out in parts, one a contact: in the cycle that takes it, or in the next where taking it was work
-    itself. It is the answer at the contact after which it was due, whatever comes meanwhile.
+    answer is worked out in parts, one a contact (see `PARTS`): in the cycle that takes it, or in the next where taking
+    it was work itself. It is the answer at the contact after which it was due, whatever comes meanwhile.
 
     Args:
         estimator: the online estimator.
@@ -66,6 +68,7 @@ class ShapeTracker:
         self.restarts = 0
         self._estimator = estimator
         self._every = max(1, every)
+        self._at_once = -(-PARTS // self._every)
         self._gap_s = gap_s
         self._last: ContactSample | None = None
         self._waiting: ContactSample | None = None
@@ -100,7 +103,12 @@ class ShapeTracker:
         if not self._owed:
             return None
         self._owed = False
-        return self._work(t_s)
+        estimate = self._work(t_s)
+        for _ in range(self._at_once - 1):
+            if self._answering is None:
+                break
+            estimate = self._work(t_s)
+        return estimate
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
         """All parts of the estimate that is due, in the cycle at an instant (s)."""
