@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 from canprobe.cli import main
 from canprobe.errors import StudyError, UsageError
@@ -244,20 +245,19 @@ def test_a_pool_that_is_left_by_an_exception_is_ended(demo):
     assert pids and all(gone(pid) for pid in pids)
 
 
-def hear_nothing():
-    """What a run makes of SIGTERM: a wish to stop it, after which its worker goes on."""
+def hear_nothing(deaf):
+    """What a run makes of SIGTERM: a wish to stop it, after which its worker goes on; makes a file once it is deaf."""
     signal.signal(signal.SIGTERM, lambda *_: None)
+    deaf.touch()
     while True:
         signal.pause()
 
 
-def test_workers_that_do_not_hear_are_ended_too(demo):
+def test_workers_that_do_not_hear_are_ended_too(demo, tmp_path):
     with pytest.raises(KeyError), process_pool(1) as pool:
         pid = pool.submit(os.getpid).result()
-        deaf = [pool.submit(hear_nothing) for _ in range(3)]
-        while not deaf[0].running():
-            pass
-        time.sleep(0.2)
+        deaf = [pool.submit(hear_nothing, tmp_path / "deaf") for _ in range(3)]
+        wait_until((tmp_path / "deaf").exists, lambda: not deaf[0].done(), deaf[0].exception)
         raise KeyError
     assert gone(pid)
     assert deaf[2].cancelled()
