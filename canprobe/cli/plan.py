@@ -98,12 +98,11 @@ def run(args: argparse.Namespace) -> int:
 
 def _scene_beside(log: Path) -> str | None:
     """Name of the scene that ran, where the log is a run's."""
-    from canprobe.scene_loader import load_scene
+    from canprobe.recorded import scene_of
 
-    path = (log if log.is_dir() else log.parent) / "scene.toml"
     try:
-        return load_scene(path).name if path.is_file() else None
-    except CanprobeError:  # of another version, or anything
+        return scene_of(log, log if log.is_dir() else log.parent, None).name
+    except CanprobeError:  # none, of another version, or anything
         return None
 
 

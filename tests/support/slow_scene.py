@@ -5,9 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import canprobe
-
-SCENES = Path(canprobe.__file__).parent / "scenes"
+from canprobe.scene_loader import scenes_folder
 
 
 def write_slow_scene(
@@ -18,7 +16,7 @@ def write_slow_scene(
     A slow machine must not decide what these tests find, and figures take longer than the runs.
     """
     extra = "" if emulated else "emulated = false\n"
-    text = re.sub(r"missed_syncs = .*\n", "", (SCENES / f"{name}.toml").read_text())
+    text = re.sub(r"missed_syncs = .*\n", "", (scenes_folder() / f"{name}.toml").read_text())
     text = text.replace(
         "[arm]\n", f"[arm]\nmissed_syncs = {missed_syncs}\n{extra}" + (f'eds = "{eds}"\n' if eds else "")
     )

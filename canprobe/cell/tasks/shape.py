@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import repeat
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,9 +46,10 @@ class ShapeRecord:
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    Each is too long a work to come on top of another. A contact is taken in the cycle after the one that felt it. An
-    answer is worked out in parts, one a contact (see `PARTS`): in the cycle that takes it, or in the next where taking
-    it was work itself. It is the answer at the contact after which it was due, whatever comes meanwhile.
+    Sensing, taking a contact and answering are each too long to come on top of one another. A contact is taken in the
+    cycle after the one that felt it. An answer is worked out in parts, one a contact (see `PARTS`): in the cycle that
+    takes it, or in the next where taking it was work itself. It is the answer at the contact after which it was due,
+    whatever comes meanwhile.
 
     Args:
         estimator: the online estimator.
@@ -103,21 +105,13 @@ class ShapeTracker:
         if not self._owed:
             return None
         self._owed = False
-        estimate = self._work(t_s)
-        for _ in range(self._at_once - 1):
-            if self._answering is None:
-                break
-            estimate = self._work(t_s)
-        return estimate
+        return self._work(t_s, repeat(None, self._at_once))
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
         """All parts of the estimate that is due, in the cycle at an instant (s)."""
         if self._waiting is not None:
             self._take(self._waiting)
-        estimate = self._work(t_s)
-        while self._answering is not None:
-            estimate = self._work(t_s)
-        return estimate
+        return self._work(t_s, repeat(None))
 
     def _take(self, sample: ContactSample) -> bool:
         """Whether it was work."""
@@ -125,19 +119,20 @@ class ShapeTracker:
         self._due = self._due or len(self.samples) % self._every == 0
         return self._estimator.add(sample)
 
-    def _work(self, t_s: float) -> SurfaceEstimate | None:
-        """One part of the estimate that is due or under way."""
+    def _work(self, t_s: float, parts: Iterable[None]) -> SurfaceEstimate | None:
+        """So many parts of the estimate that is due or under way, or fewer if it has no more."""
         if self._answering is None:
             if not self._due or self._last is None:
                 return None
             self._due = False
             self._place = self._last.t_s, self.travelled_m
             self._answering = answering(self._estimator)
-        try:
-            next(self._answering)
-        except StopIteration as end:
-            self._answering = None
-            return self._told(end.value, t_s)
+        for _ in parts:
+            try:
+                next(self._answering)
+            except StopIteration as end:
+                self._answering = None
+                return self._told(end.value, t_s)
         return None
 
     def _told(self, estimate: SurfaceEstimate | None, t_s: float) -> SurfaceEstimate | None:

@@ -171,7 +171,7 @@ class TouchTask(ProbingTask):
             self._depth0 += rise
 
     def _take_answer(self, t_s: float) -> None:
-        """What the estimator says about the contact of the cycle before."""
+        """What the estimator says, if an answer is there in this cycle."""
         estimate = self._estimate = self.shape.answer(t_s) if self.shape is not None else None
         contact = self._contact
         if estimate is None or contact is None or self._servo is None:
