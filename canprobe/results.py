@@ -316,6 +316,7 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
         "slowed_cycles": getattr(controller, "slowed", 0),
         "dropped_frames": cell.counters.overruns,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
+        "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
         "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
     }
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from canprobe.bus.clock import VirtualClock
 from canprobe.bus.port import Port
 from canprobe.cell.bringup import BringUpTimes
 from canprobe.cell.cell import Cell
@@ -61,6 +62,7 @@ def make_cell(
         heartbeat_ns=HEARTBEAT_PRODUCED_MS * 1_000_000,
         master_id=MASTER_NODE_ID,
         looks_ns=plan.traffic.budget.looks_ns,
+        on_arrival=not isinstance(port.clock, VirtualClock),
     )
     drives = make_drives(plan)
     return Cell(

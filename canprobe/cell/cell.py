@@ -177,6 +177,8 @@ class Cell:
                 cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
                 the contact to it; without, the cell takes the probe off the object itself. Where it has ``inspect(q)``
                 it sees the joint angles (6,), rad, before the drives are enabled, and may say why they must not be.
+                Where it has ``update()`` that is called when the commands of a step are out: for work that the next
+                step needs and these commands need not wait for.
             progress: called after each cycle.
 
         Raises:
@@ -200,6 +202,7 @@ class Cell:
         self, step: Callable[[Measurement], Command], controller: object, progress: Callable[[Measurement], None]
     ) -> None:
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
+        update: Callable[[], None] | None = getattr(controller, "update", None)
         self._tracker = getattr(controller, "shape", None)
         self._enable(getattr(controller, "inspect", None))
         assert self.cycle is not None
@@ -210,6 +213,9 @@ class Cell:
                 command = self._ask(_hold if held else step, measurement, interrupts)
                 command = self._guarded(measurement, command, retreat)
                 self.cycle.end(command)
+                if update is not None:
+                    self._update(update)
+                self.cycle.count_work()
                 self._record(measurement, command)
                 progress(measurement)
                 if command.stop_reason is not None:
@@ -230,6 +236,14 @@ class Cell:
                 taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
                 raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
             return command
+        except BaseException as error:
+            self._lift_off(error)
+            raise
+
+    def _update(self, update: Callable[[], None]) -> None:
+        """The controller's work after its commands; what it raises ends the run off the object."""
+        try:
+            update()
         except BaseException as error:
             self._lift_off(error)
             raise

@@ -31,8 +31,8 @@ class CycleSettings:
         heartbeat_ns: between two heartbeats of the master, however late its cycles are.
         master_id: node id of the master's heartbeat.
         looks_ns: times after SYNC went out at which TPDOs are looked for, until all are in; then they are late.
-            Waking up for each frame costs more than it gains: on one processor every wake-up takes it from the sender,
-            so that many looks for a late TPDO make it later still. No RPDO is latched before the next SYNC anyway.
+        on_arrival: on a clock that goes on by itself: do not wait for the next look once all are in. Before the first
+            look nobody is woken by them: a real bus brings one after the other, and most are in by then.
     """
 
     period_ns: int
@@ -40,14 +40,23 @@ class CycleSettings:
     heartbeat_ns: int
     master_id: int
     looks_ns: tuple[int, ...]
+    on_arrival: bool
 
 
 @dataclass(slots=True)
 class CycleStatistics:
-    """What the cycle counted and timed: an entry a cycle, and a computing time every ``TIMED_CYCLES``."""
+    """What the cycle counted and timed.
+
+    Attributes:
+        overruns: SYNCs that went out more than half a period late.
+        period_error_ns: of every SYNC behind its deadline.
+        response_ns: from the last TPDO in to the RPDOs out, of every cycle of `TIMED_CYCLES`.
+        compute_ns: the same with what the controller does once the RPDOs are out.
+    """
 
     overruns: int = 0
     period_error_ns: MutableSequence[int] = field(default_factory=list)
+    response_ns: MutableSequence[int] = field(default_factory=list)
     compute_ns: MutableSequence[int] = field(default_factory=list)
 
     @classmethod
@@ -55,7 +64,7 @@ class CycleStatistics:
         """With the times of the last cycles only; None for all."""
         if cycles is None:
             return cls()
-        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles))
+        return cls(0, deque(maxlen=cycles), deque(maxlen=cycles), deque(maxlen=cycles))
 
 
 class Cycle:
@@ -123,13 +132,27 @@ class Cycle:
             self._deadline += error // self._s.period_ns * self._s.period_ns
 
     def _collect(self) -> None:
-        port, clock, intake = self._port, self._port.clock, self._intake
-        for look_ns in self._s.looks_ns:
-            clock.sleep_until_ns(self.sync_ns + look_ns)
-            self._route(port.drain())
-            if intake.complete:
-                break
+        port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._s.looks_ns
+        if self._s.on_arrival and self._drives is not None:
+            self._route(port.drain())  # nodes that go first on this processor have answered by now
+            if not intake.complete:
+                self._collect_on_arrival(self.sync_ns + looks_ns[0], self.sync_ns + looks_ns[-1])
+        else:
+            for look_ns in looks_ns:
+                clock.sleep_until_ns(self.sync_ns + look_ns)
+                self._route(port.drain())
+                if intake.complete:
+                    break
         intake.end()
+
+    def _collect_on_arrival(self, first_ns: int, last_ns: int) -> None:
+        """Look at a time, then whenever something comes, until all TPDOs are in or another time is over."""
+        port, clock, intake = self._port, self._port.clock, self._intake
+        clock.sleep_until_ns(first_ns)
+        self._route(port.drain())
+        while not intake.complete and clock.now_ns() < last_ns:
+            port.wait(last_ns)
+            self._route(port.drain())
 
     def _route(self, frames: list[TimedFrame]) -> None:
         watch = self._watch
@@ -155,5 +178,10 @@ class Cycle:
         if frames:
             self._port.send_batch(frames)
         if self._started_ns:
-            self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)
+            self.statistics.response_ns.append(elapsed_ns() - self._started_ns)
         self._deadline += self._s.period_ns
+
+    def count_work(self) -> None:
+        """The controller has done all that it does in this cycle."""
+        if self._started_ns:
+            self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)

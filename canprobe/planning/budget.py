@@ -1,7 +1,8 @@
 """The cycle as one transaction behind SYNC: TPDOs, controller, RPDOs, and how much of the period they leave.
 
 A node queues its TPDOs when it has received the SYNC. The cell looks for them at fixed shares of the period and once at
-the time by which the last one must be in; the controller starts at the first look that can find them all, takes at most
+the time by which the last one must be in; in real time, after the first look, at each that comes. So the controller
+starts when the last one comes, but not before the first look, or at the next look; it takes at most
 the scene's `cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those
 on the SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
 
@@ -110,7 +111,7 @@ def controller_starts(messages: CycleMessages, looks: Sequence[int], feedback_ns
     """Earliest and latest start of the controller after the SYNC, ns."""
     if not messages.feedback:
         return looks[0], looks[0]
-    earliest = next((look for look in looks if look >= messages.best_feedback_ns), looks[-1])
+    earliest = min(max(looks[0], messages.best_feedback_ns), looks[-1])
     return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 

@@ -22,7 +22,8 @@ class CycleTimes:
     Attributes:
         period_ns: of SYNC, as asked.
         lateness_ns: of each SYNC behind its deadline (n,), ns.
-        compute_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
+        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
+        compute_ns: the same with the controller's work once the RPDOs are out (m,), ns.
         latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
         overruns: cycles woken more than half a period late.
         missed: TPDOs that a cycle did without.
@@ -32,6 +33,7 @@ class CycleTimes:
 
     period_ns: int
     lateness_ns: Times
+    response_ns: Times
     compute_ns: Times
     latency_ns: Times
     overruns: int

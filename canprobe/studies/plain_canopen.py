@@ -127,6 +127,7 @@ class _PlainCycle:
         return CycleTimes(
             period_ns=period_ns,
             lateness_ns=np.array(lateness, np.int64),
+            response_ns=nothing,
             compute_ns=nothing,
             latency_ns=nothing,
             overruns=sum(late > period_ns // 2 for late in lateness),

@@ -13,6 +13,7 @@ import numpy as np
 
 from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.open import open_port
+from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.child import EmulatorChild
@@ -43,7 +44,7 @@ class Measured:
 
 def measure_scan(seconds: float) -> Measured:
     """The scene `cylinder` with servo and estimator."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL, duration_s=seconds)
+    scene = _scene(seconds)
     return _measured("whole controller", scene, lambda session: make_task(session.plan))
 
 
@@ -52,21 +53,46 @@ def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
     from canprobe.studies.plain_canopen import run_plain
 
     scene = holding_scene("window", rate_hz)
-    with served(CHANNEL):
+    with served(CHANNEL, in_realtime=True), realtime(MASTER_PRIORITY, _unheard):
         times = run_plain(make_plan(scene), CHANNEL, seconds)
     return Measured("plain canopen", "window", rate_hz, times)
+
+
+def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
+    """A loop that wakes at every deadline and does nothing: what the machine itself misses."""
+    clock, period_ns = MonotonicClock(), round(1e9 / rate_hz)
+    lateness, nothing = [], np.zeros(0, np.int64)
+    with realtime(MASTER_PRIORITY, _unheard):
+        begin_ns = deadline_ns = clock.now_ns() + period_ns
+        for _ in range(round(seconds * rate_hz)):
+            clock.sleep_until_ns(deadline_ns)
+            late_ns = clock.now_ns() - deadline_ns
+            lateness.append(late_ns)
+            deadline_ns += period_ns * (1 + late_ns // period_ns)
+    times = CycleTimes(
+        period_ns=period_ns,
+        lateness_ns=np.array(lateness, np.int64),
+        response_ns=nothing,
+        compute_ns=nothing,
+        latency_ns=nothing,
+        overruns=sum(late > period_ns // 2 for late in lateness),
+        missed=0,
+        seconds=(clock.now_ns() - begin_ns) * 1e-9,
+        processor_share=None,
+    )
+    return Measured("bare clock", "none", rate_hz, times)
 
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
     """The joints held where they stand, at any rate."""
     scene = holding_scene(mode, rate_hz)
-    with served(CHANNEL):
+    with served(CHANNEL, in_realtime=True):
         return _measured("hold", scene, lambda _: Hold(int(seconds * rate_hz)))
 
 
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
     """Six drives and the sensor at half their rate, none of them started by the session."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
+    scene = _scene()
     scene = replace(scene, bus=replace(scene.bus, bitrate=WIRE_BITRATE))  # no CAN has it, so no scene may ask for it
     real = with_real_nodes(replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz)))
     assert real.sensor is not None
@@ -78,6 +104,16 @@ def with_real_nodes(scene: Scene) -> Scene:
     assert scene.arm is not None and scene.sensor is not None
     arm = replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS)
     return replace(scene, arm=arm, sensor=replace(scene.sensor, emulated=False))
+
+
+def _scene(seconds: float | None = None, channel: str = CHANNEL, *, in_realtime: bool = True) -> Scene:
+    """The scene `cylinder`; in real time with the processor and the memory, as far as they are to be had."""
+    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel, duration_s=seconds)
+    return replace(scene, cycle=replace(scene.cycle, realtime=in_realtime))
+
+
+def _unheard(_: str) -> None:
+    """What is not permitted was said by the first case."""
 
 
 class Hold:
@@ -96,9 +132,9 @@ class Hold:
 
 
 @contextmanager
-def served(channel: str, child: EmulatorChild | None = None) -> Iterator[None]:
+def served(channel: str, child: EmulatorChild | None = None, *, in_realtime: bool = False) -> Iterator[None]:
     """The nodes of `cylinder` in their process; they take rates and mappings from the master, not from their scene."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel)
+    scene = _scene(channel=channel, in_realtime=in_realtime)
     child = child or EmulatorChild(scene, None, channel)
     port = open_port("socketcan", channel, scene.bus.bitrate, MonotonicClock())
     try:
@@ -135,6 +171,7 @@ def _times(session: Session, folder: Path, used_s: float) -> CycleTimes:
     return CycleTimes(
         period_ns=period_ns,
         lateness_ns=np.array(cycle.statistics.period_error_ns, np.int64),
+        response_ns=np.array(cycle.statistics.response_ns, np.int64),
         compute_ns=np.array(cycle.statistics.compute_ns, np.int64),
         latency_ns=answer_latencies(folder / "bus.log", cell.drives.feedback_ids, period_ns),
         overruns=cycle.statistics.overruns,

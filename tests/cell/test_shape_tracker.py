@@ -1,4 +1,4 @@
-"""When the estimator in the loop is asked, and how its answer comes in parts."""
+"""When the estimator in the loop works, and how its answer comes in parts."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from canprobe.cell.tasks.shape import PARTS, SHARPEST, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import BEHIND, PARTS, SHARPEST, ShapeTracker, replay_samples
 
 
 def contact(t_s, x=0.0):
@@ -21,129 +21,163 @@ def estimate(curvature=10.0):
 
 
 class InOne:
-    """Tells an answer that names how many samples it rests on."""
+    """Answers at once; remembers of how many contacts it knew."""
 
-    def __init__(self, curvature=10.0, work=()):
-        self.n, self.resets, self.asked, self._curvature, self._work = 0, 0, 0, curvature, work
+    def __init__(self, curvature=10.0):
+        self.n, self.resets, self.knew, self._curvature = 0, 0, [], curvature
 
     def add(self, _):
         self.n += 1
-        return self.n in self._work
 
     def reset(self):
         self.n, self.resets = 0, self.resets + 1
 
     def estimate(self):
-        self.asked += 1
+        self.knew.append(self.n)
         return estimate(self._curvature)
 
 
 class InParts(InOne):
-    def __init__(self, parts=3, **options):
+    """Answers in so many parts, the first of which knows; contacts whose number is in `work` are taken in three."""
+
+    def __init__(self, parts=3, work=(), **options):
         super().__init__(**options)
-        self._parts = parts
+        self._parts, self._work = parts, work
+        self.begun = self._now = 0
+
+    def adding(self, _):
+        self.n += 1
+        self.begun += 1
+        for _ in range(2 if self.n in self._work else 0):
+            self._count()
+            yield
+        if self.n in self._work:
+            self._count()
+        self.begun -= 1
 
     def answering(self):
+        assert self.begun == 0, "asked in the middle of taking a contact"
+        found = self.estimate()
         for _ in range(self._parts - 1):
+            self._count()
             yield
-        return self.estimate()
+        self._count()
+        return found
+
+    def _count(self):
+        self._now += 1
+
+    def parts_since(self):
+        """Worked out since this was last asked."""
+        now, self._now = self._now, 0
+        return now
 
 
-def taken(tracker, times):
-    for t in times:
-        tracker.add(contact(t, 25e-3 * t))
+def cycle(tracker, t_s, *, felt):
+    """One cycle of a loop: ask, feel or not, work; whether an answer was there."""
+    told = tracker.answer(t_s) is not None
+    if felt:
+        tracker.add(contact(t_s, 25e-3 * t_s))
+    tracker.work()
+    return told
 
 
-def answered(tracker, times, calls=2):
-    """Whether an answer was there: after each contact, over so many cycles."""
-    found = []
-    for t in times:
-        taken(tracker, [t])
-        found.append([tracker.answer(t + 0.1 * k) is not None for k in range(calls)])
-    return found
+def answered(tracker, contacts, every=2):
+    """At which of the contacts, felt in every second cycle, an answer was told first."""
+    told = [cycle(tracker, 2.5e-3 * k, felt=k % every == 0) for k in range(every * contacts)]
+    return [k / every for k, there in enumerate(told) if there]
 
 
-def test_the_cycle_after_a_contact_takes_it_and_answers():
+def test_the_cycle_after_a_contact_takes_it_and_the_next_one_tells():
     estimator = InOne()
     tracker = ShapeTracker(estimator, every=2)
-    taken(tracker, [0.0])
+    cycle(tracker, 0.0, felt=True)
     assert estimator.n == 0, "the cycle that feels a contact does no more"
-    assert tracker.answer(0.0) is None and estimator.n == 1
-    assert answered(tracker, [0.005, 0.01], calls=3) == [[True, False, False], [False] * 3]
+    cycle(tracker, 0.0025, felt=False)
+    assert estimator.n == 1
+    assert [cycle(tracker, 0.005 + 0.0025 * k, felt=k == 0) for k in range(5)] == [False, False, True, False, False]
 
 
-def test_one_part_is_worked_out_after_each_contact():
-    tracker = ShapeTracker(InParts(), every=PARTS)
-    found = answered(tracker, [0.005 * k for k in range(18)])
-    assert [k for k, calls in enumerate(found) if any(calls)] == [7, 13]
-    assert all(calls[1] is False for calls in found)
+def test_one_part_of_an_answer_is_worked_out_for_each_contact():
+    tracker = ShapeTracker(InParts(3), every=PARTS)
+    assert answered(tracker, 3 * PARTS) == [PARTS + 2, 2 * PARTS + 2]
 
 
-@pytest.mark.parametrize(("every", "later"), [(1, 0), (2, 1), (3, 2), (4, 2), (5, 2), (6, 5), (100, 5)])
+@pytest.mark.parametrize(("every", "later"), [(1, 0), (2, 1), (3, 2), (4, 3), (5, 3), (6, 3), (7, 3), (8, 7), (100, 7)])
 def test_an_answer_is_there_before_the_next_is_due(every, later):
     tracker = ShapeTracker(InParts(PARTS), every)
-    found = answered(tracker, [0.005 * k for k in range(2 * every + PARTS)])
-    first, second, *_ = [k for k, calls in enumerate(found) if any(calls)]
-    assert (first, second) == (every - 1 + later, 2 * every - 1 + later)
+    first, second, *_ = answered(tracker, 2 * every + PARTS + 1)
+    assert (first, second) == (every + later, 2 * every + later)
 
 
-def test_where_a_contact_is_work_the_part_waits_for_the_next_cycle():
-    tracker = ShapeTracker(InParts(work=(6, 7, 14)), every=PARTS)
-    found = answered(tracker, [0.005 * k for k in range(17)])
-    assert found[7] == [True, False] and found[13] == [False, True]
-    assert sum(map(sum, found)) == 2
+@pytest.mark.parametrize("every", [2, 1])
+def test_no_cycle_has_more_than_a_part_of_each(every):
+    """Also where a contact is felt in every cycle."""
+    estimator = InParts(PARTS, work=range(3, 1000, 4))
+    tracker = ShapeTracker(estimator, every=PARTS)
+    most = told = 0
+    for k in range(400):
+        told += cycle(tracker, 2.5e-3 * k, felt=k % every == 0)
+        most = max(most, estimator.parts_since())
+    assert most == 2 and told >= 400 // (every * PARTS) - 2
+    assert estimator.n >= 400 // every - BEHIND - 2
 
 
-def test_contacts_that_are_all_work_and_come_in_every_cycle_leave_every_second_for_an_answer():
-    estimator = InParts(work=range(100))
-    tracker = ShapeTracker(estimator, every=8)
-    found = answered(tracker, [0.0025 * k for k in range(24)], calls=1)
-    assert [k for k, calls in enumerate(found) if any(calls)] == [11, 19]
-    assert estimator.n == 24
+def test_contacts_that_are_all_work_are_taken_and_answered_all_the_same():
+    estimator = InParts(PARTS, work=range(1000))
+    tracker = ShapeTracker(estimator, every=PARTS)
+    told = answered(tracker, 80)
+    assert len(told) >= 8 and estimator.n >= 80 - 3 * BEHIND, "three parts each: they wait until three are worked out"
 
 
 def test_contacts_faster_than_cycles_are_all_taken():
     estimator = InOne()
     tracker = ShapeTracker(estimator, every=2)
-    taken(tracker, [0.001 * k for k in range(7)])
-    tracker.answer(0.0)
+    for k in range(7):
+        tracker.add(contact(0.001 * k))
+    tracker.work()
+    tracker.work()
     assert estimator.n == 7
 
 
 def test_an_answer_stands_at_the_contact_after_which_it_was_due():
-    tracker = ShapeTracker(InParts(), every=PARTS)
-    taken(tracker, [0.005 * k for k in range(PARTS - 1)])
-    assert answered(tracker, [0.025, 0.03, 0.031]) == [[False, False], [False, False], [True, False]]
+    work = (PARTS - 1, PARTS, PARTS + 1)
+    estimator = InParts(3, work=work)
+    tracker = ShapeTracker(estimator, every=PARTS)
+    told = answered(tracker, 2 * PARTS)
     (record,) = tracker.records
-    assert record.told_s == 0.031
-    assert record.t_s == 0.025 and record.travelled_m == pytest.approx(25e-3 * 0.025)
+    assert estimator.knew[0] == PARTS, "it knows of no contact that was felt later"
+    assert record.told_s == pytest.approx(5e-3 * told[0])
+    assert record.t_s == pytest.approx(5e-3 * (PARTS - 1))
+    assert record.travelled_m == pytest.approx(25e-3 * 5e-3 * (PARTS - 1))
 
 
 def test_what_is_due_meanwhile_is_begun_afterwards():
-    estimator = InParts(8)
+    estimator = InParts(PARTS + 2)
     tracker = ShapeTracker(estimator, every=PARTS)
-    found = [any(calls) for calls in answered(tracker, [0.005 * k for k in range(21)])]
-    assert [k for k, there in enumerate(found) if there] == [12, 20] and estimator.asked == 2
+    told = answered(tracker, 4 * PARTS)
+    assert told == [2 * PARTS + 1, 3 * PARTS + 3]
+    assert estimator.knew == [PARTS, 2 * PARTS + 1, 3 * PARTS + 3]
 
 
-@pytest.mark.parametrize("begun", [True, False])
-def test_a_new_contact_makes_an_unfinished_answer_void(begun):
-    estimator = InParts(work=() if begun else (PARTS,))
+@pytest.mark.parametrize("work", [(), (PARTS,)])
+def test_a_new_contact_after_a_gap_makes_everything_unfinished_void(work):
+    estimator = InParts(work=work)
     tracker = ShapeTracker(estimator, every=PARTS)
-    answered(tracker, [0.005 * k for k in range(PARTS)], calls=1)
-    assert answered(tracker, [1.0], calls=4) == [[False] * 4]
-    assert estimator.resets == 1 and not tracker.records
+    answered(tracker, PARTS)
+    assert not any(cycle(tracker, 1.0 + 2.5e-3 * k, felt=k == 0) for k in range(8))
+    assert estimator.resets == 1 and estimator.n == 1 and not tracker.records
 
 
 def test_a_diverged_answer_starts_the_estimator_afresh():
-    estimator = InParts(curvature=2.0 * SHARPEST)
-    tracker = ShapeTracker(estimator, every=1)
-    taken(tracker, [0.0])
-    assert tracker.answer_at_once(0.0) is None
+    estimator = InParts(work=(9,), curvature=2.0 * SHARPEST)
+    tracker = ShapeTracker(estimator, every=PARTS)
+    assert answered(tracker, PARTS + 4) == []
     assert tracker.restarts == 1 and estimator.resets == 1 and not tracker.records
+    assert estimator.n >= 2, "it goes on with the contacts that come"
 
 
 def test_recorded_contacts_are_answered_one_by_one():
     samples = [contact(0.005 * k) for k in range(10)]
-    for estimator in (InOne(), InParts()):
+    for estimator in (InOne(), InParts(work=(2, 3, 6))):
         assert [r.t_s for r in replay_samples(estimator, samples, 3)] == [s.t_s for s in samples[2::3]]

@@ -3,12 +3,14 @@
 import importlib.resources
 import math
 import re
+from types import SimpleNamespace
 
 import pytest
 from scenes import change, reasons, refused, ways_out
 
 from canprobe.planning import make_plan
 from canprobe.planning.abilities import Abilities
+from canprobe.planning.budget import controller_starts
 from canprobe.planning.identifiers import identifier_problems
 from canprobe.planning.model import PlannedPdo
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
@@ -352,6 +354,13 @@ def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
     assert budget.slack_ns == plan.sync.period_ns - commands * 1000
     assert budget.bus_ns + budget.compute_ns + budget.slack_ns == plan.sync.period_ns
     assert budget.feedback_ns in budget.looks_ns
+
+
+@pytest.mark.parametrize(("best_us", "starts_us"), [(300, (625, 1145)), (900, (900, 1145))])
+def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(best_us, starts_us):
+    messages = SimpleNamespace(feedback=("some",), best_feedback_ns=best_us * 1000)
+    starts = controller_starts(messages, (625_000, 1_145_000, 1_500_000), 1_145_000)
+    assert starts == tuple(us * 1000 for us in starts_us)
 
 
 def test_a_controller_that_takes_too_long_is_refused(cylinder):

@@ -32,10 +32,11 @@ def test_no_sync_no_latency(tmp_path):
     assert len(answer_latencies(log_of(tmp_path, (0, "181#00")), frozenset({0x181}), 2_500_000)) == 0
 
 
-def times(cycles, overruns, seconds, compute_us=()):
+def times(cycles, overruns, seconds, response_us=(), compute_us=()):
     return CycleTimes(
         period_ns=2_500_000,
         lateness_ns=np.zeros(cycles, np.int64),
+        response_ns=np.array(response_us, np.int64) * 1000,
         compute_ns=np.array(compute_us, np.int64) * 1000,
         latency_ns=np.zeros(0, np.int64),
         overruns=overruns,
@@ -47,8 +48,9 @@ def times(cycles, overruns, seconds, compute_us=()):
 
 def test_findings_tell_rates_and_shares():
     measured = [
-        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [750])),
+        Measured("whole controller", "window", 400.0, times(4001, 2, 10.0, [500], [750])),
         Measured("plain canopen", "window", 400.0, times(1001, 900, 10.0)),
+        Measured("bare clock", "none", 400.0, times(4000, 1, 10.0)),
         Measured("hold", "features", 400.0, times(4001, 0, 10.0)),
         Measured("hold", "features", 500.0, times(4001, 40, 10.0)),
         Measured("hold", "image", 400.0, times(401, 0, 1.0), ended="node 1: lost"),
@@ -56,7 +58,8 @@ def test_findings_tell_rates_and_shares():
     text = "\n".join(findings(measured))
     assert "whole controller at 400 Hz for 10 s: 5.0 overruns in 10 000 cycles (goal 1), 400.0 cycles" in text
     assert "100.0 cycles a second held" in text
-    assert "p99 is 30 % of the period" in text
+    assert "does nothing: 2.5 overruns in 10 000 cycles" in text
+    assert "p99 is 20 % of the period until the commands are out, 30 % with" in text
     assert "features: 400 Hz held without overruns of 400, 500 Hz" in text
     assert "image: no rate held" in text
 

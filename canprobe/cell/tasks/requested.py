@@ -59,6 +59,11 @@ class RequestedTask:
             return replace(command, done=False)
         return command
 
+    def update(self) -> None:
+        """What the task does once its commands are out."""
+        if self._task is not None and (update := getattr(self._task, "update", None)) is not None:
+            update()
+
     def _take(self, kind: str, value: float | None) -> None:
         if kind == "stop":
             self._stopping = self._task is not None

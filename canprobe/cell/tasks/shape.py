@@ -2,24 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import repeat
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from canprobe.touch.estimators.base import answering
+from canprobe.touch.estimators.base import adding, answering
 
 if TYPE_CHECKING:
     from canprobe.touch.contact import ContactSample
     from canprobe.touch.estimate import SurfaceEstimate
     from canprobe.touch.estimators import Estimator
-    from canprobe.touch.estimators.base import Answering
+    from canprobe.touch.estimators.base import Adding, Answering
 
 
-PARTS = 6
+PARTS = 8
 """Of the longest answer: where fewer contacts come between two answers, several are worked out after each."""
+BEHIND = 4
+"""Contacts that may wait before more than a part of taking them is worked out for each."""
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
@@ -43,13 +45,21 @@ class ShapeRecord:
     told_s: float
 
 
+class _Felt(NamedTuple):
+    """A contact that waits to be taken, its number in the scan and how far the path had come (m)."""
+
+    sample: ContactSample
+    number: int
+    travelled_m: float
+
+
 class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
-    Sensing, taking a contact and answering are each too long to come on top of one another. A contact is taken in the
-    cycle after the one that felt it. An answer is worked out in parts, one a contact (see `PARTS`): in the cycle that
-    takes it, or in the next where taking it was work itself. It is the answer at the contact after which it was due,
-    whatever comes meanwhile.
+    The estimator has more to do after some contacts than fits on top of a cycle's other work, so it is done in parts,
+    one of each kind for every contact: taking contacts, which may lag (`BEHIND`), and working out an answer, which is
+    that at the contact after which it was due, whatever is felt meanwhile. The cycle that felt a contact does none of
+    it, unless one is felt in every cycle.
 
     Args:
         estimator: the online estimator.
@@ -70,81 +80,110 @@ class ShapeTracker:
         self.restarts = 0
         self._estimator = estimator
         self._every = max(1, every)
-        self._at_once = -(-PARTS // self._every)
+        self._parts = -(-PARTS // self._every)
         self._gap_s = gap_s
-        self._last: ContactSample | None = None
-        self._waiting: ContactSample | None = None
-        self._owed = False
+        self._forget()
+
+    def _forget(self) -> None:
+        """Let go of everything under way."""
+        self._waiting: deque[_Felt] = deque()
+        self._taking: Adding | None = None
+        self._taken: _Felt | None = None
         self._due = False
-        self._answering: Answering | None = None
-        self._place = (0.0, 0.0)
+        self._answering: tuple[Answering, _Felt] | None = None
+        self._found: tuple[SurfaceEstimate, _Felt] | None = None
+        self._felt, self._owed = False, 0
 
     def add(self, sample: ContactSample) -> None:
         """Hear of one contact."""
-        if self._waiting is not None:
-            self._take(self._waiting)
-        if self._last is not None:
-            if sample.t_s - self._last.t_s > self._gap_s:
+        if self.samples:
+            last = self.samples[-1]
+            if sample.t_s - last.t_s > self._gap_s:
                 self._estimator.reset()
-                self._due, self._answering = False, None
+                self._forget()
             else:
-                self.travelled_m += float(np.linalg.norm(sample.p_base - self._last.p_base))
+                self.travelled_m += float(np.linalg.norm(sample.p_base - last.p_base))
         self.samples.append(sample)
-        self._last = self._waiting = sample
+        self._waiting.append(_Felt(sample, len(self.samples), self.travelled_m))
+        self._felt = True
+        self._owed += 1
+
+    def work(self) -> None:
+        """A cycle's share of the work; `answer` tells what came of it."""
+        felt, self._felt = self._felt, False
+        while self._owed > felt:
+            self._owed -= 1
+            self._take_on()
+            for _ in range(self._parts):
+                self._answer_part()
 
     def answer(self, t_s: float) -> SurfaceEstimate | None:
-        """A cycle's work: take the last contact, or a part of the estimate that is due; it, once, when it is there.
+        """The estimate, once, that has been found since it was last asked for.
 
         Args:
-            t_s: instant of the cycle, s.
+            t_s: instant of the cycle in which it is told, s.
         """
-        if self._waiting is not None:
-            owed, self._owed = self._owed, True
-            if self._take(self._waiting) and not owed:
-                return None
-        if not self._owed:
+        if self._found is None:
             return None
-        self._owed = False
-        return self._work(t_s, repeat(None, self._at_once))
+        (estimate, at), self._found = self._found, None
+        self.records.append(ShapeRecord(at.sample.t_s, at.travelled_m, estimate, t_s))
+        return estimate
 
     def answer_at_once(self, t_s: float) -> SurfaceEstimate | None:
-        """All parts of the estimate that is due, in the cycle at an instant (s)."""
-        if self._waiting is not None:
-            self._take(self._waiting)
-        return self._work(t_s, repeat(None))
+        """Take every contact; the estimate, if one is due, in the cycle at an instant (s)."""
+        while self._waiting:
+            self._take_part()
+        while self._may_begin or self._answering is not None:
+            self._answer_part()
+        return self.answer(t_s)
 
-    def _take(self, sample: ContactSample) -> bool:
-        """Whether it was work."""
-        self._waiting = None
-        self._due = self._due or len(self.samples) % self._every == 0
-        return self._estimator.add(sample)
+    def _take_on(self) -> None:
+        """A part of taking contacts, or as many as it takes not to fall behind, and every contact that is no work."""
+        left = 1 + (len(self._waiting) - 1) // BEHIND
+        while self._waiting and left and not self._may_begin:
+            left -= self._take_part()
 
-    def _work(self, t_s: float, parts: Iterable[None]) -> SurfaceEstimate | None:
-        """So many parts of the estimate that is due or under way, or fewer if it has no more."""
-        if self._answering is None:
-            if not self._due or self._last is None:
-                return None
+    def _take_part(self) -> bool:
+        """A part of taking the oldest contact; False where it was the only one."""
+        begun = self._taking is None
+        if self._taking is None:
+            self._taking = adding(self._estimator, self._waiting[0].sample)
+        for _ in self._taking:
+            return True
+        self._taking = None
+        self._taken = self._waiting.popleft()
+        self._due = self._due or self._taken.number % self._every == 0
+        return not begun
+
+    @property
+    def _may_begin(self) -> bool:
+        """Whether an answer is due and none under way; it begins with what is known before another contact is taken."""
+        return self._due and self._answering is None and self._taking is None
+
+    def _answer_part(self) -> None:
+        """A part of the answer that is under way or may begin."""
+        if self._may_begin and self._taken is not None:
             self._due = False
-            self._place = self._last.t_s, self.travelled_m
-            self._answering = answering(self._estimator)
-        for _ in parts:
-            try:
-                next(self._answering)
-            except StopIteration as end:
-                self._answering = None
-                return self._told(end.value, t_s)
-        return None
+            self._answering = answering(self._estimator), self._taken
+        if self._answering is None:
+            return
+        parts, at = self._answering
+        try:
+            next(parts)
+        except StopIteration as end:
+            self._answering = None
+            self._keep(end.value, at)
 
-    def _told(self, estimate: SurfaceEstimate | None, t_s: float) -> SurfaceEstimate | None:
-        """An estimate with its place on record; None where it has diverged."""
+    def _keep(self, estimate: SurfaceEstimate | None, at: _Felt) -> None:
+        """An estimate to be told; where it has diverged the estimator starts afresh."""
         if estimate is None:
-            return None
+            return
         if has_diverged(estimate):
             self.restarts += 1
             self._estimator.reset()
-            return None
-        self.records.append(ShapeRecord(*self._place, estimate, t_s))
-        return estimate
+            self._taking = None
+            return
+        self._found = estimate, at
 
 
 def has_diverged(estimate: SurfaceEstimate) -> bool:

@@ -82,6 +82,7 @@ class TouchTask(ProbingTask):
         self._pole0: Vector = np.zeros(3)
         self._shape_columns: dict[str, float | Vector] = {}
         self._estimate: SurfaceEstimate | None = None
+        self._updated = True
 
     @property
     def scan_cycles(self) -> tuple[int, int] | None:
@@ -107,6 +108,8 @@ class TouchTask(ProbingTask):
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle of the task."""
+        self.update()
+        self._updated = False
         if self._motion is None:
             assert measurement.q is not None
             self._motion = self._motion_from(measurement.q)
@@ -121,6 +124,12 @@ class TouchTask(ProbingTask):
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
         return self._command(pose, self._estimate)
+
+    def update(self) -> None:
+        """The estimator's work after a step, once: when the commands are out, or else before the next step."""
+        if not self._updated and self.shape is not None:
+            self.shape.work()
+        self._updated = True
 
     # sensing and supervision
 

@@ -7,7 +7,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from canprobe.touch.batch import Touches, make_touches
 from canprobe.touch.contact import ContactSample, Doubt
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.noise import make_noise
+
+Result = TypeVar("Result")
 
 
 @dataclass(slots=True)
@@ -56,12 +58,8 @@ class Estimator(Protocol):
     def dropped(self) -> Dropped:
         """Samples that were not used."""
 
-    def add(self, sample: ContactSample) -> bool:
-        """Take one contact; a sample that cannot be used is dropped and counted, never an error.
-
-        Returns:
-            Whether that was more work than keeping it: a loop had better not work on an answer as well.
-        """
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact; a sample that cannot be used is dropped and counted, never an error."""
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
@@ -70,8 +68,21 @@ class Estimator(Protocol):
         """Forget everything but the settings: contact was lost, or the array was reset."""
 
 
+Adding = Generator[None, None, None]
+"""The taking of a contact in parts. Between them the estimator is asked nothing and told nothing."""
 Answering = Generator[None, None, SurfaceEstimate | None]
 """An answer in parts: each `next` works out one, the last returns it."""
+
+
+def adding(estimator: Estimator, sample: ContactSample) -> Adding:
+    """Take a contact in as many parts as an estimator has for it: one, or those of its own `adding`."""
+    parts: Callable[[ContactSample], Adding] = getattr(estimator, "adding", None) or partial(_added, estimator)
+    return parts(sample)
+
+
+def _added(estimator: Estimator, sample: ContactSample) -> Adding:
+    yield from ()
+    estimator.add(sample)
 
 
 def answering(estimator: Estimator) -> Answering:
@@ -88,14 +99,14 @@ def _in_one(estimator: Estimator) -> Answering:
     return estimator.estimate()
 
 
-def whole(parts: Answering) -> SurfaceEstimate | None:
-    """The answer once all of its parts are worked out."""
+def whole(parts: Generator[None, None, Result]) -> Result:
+    """What comes out once all parts are worked out."""
     while True:
         try:
             next(parts)
         except StopIteration as end:
-            answer: SurfaceEstimate | None = end.value
-            return answer
+            result: Result = end.value
+            return result
 
 
 class Gate:
@@ -184,12 +195,11 @@ class WindowEstimator:
         self._samples: deque[ContactSample] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
-    def add(self, sample: ContactSample) -> bool:
-        """Take one contact; never more work than that."""
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
         if self._gate.passes(sample, self.dropped):
             self._samples.append(sample)
             self._answer = None
-        return False
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""

@@ -51,7 +51,7 @@ def filter_answering(
     notes: tuple[str, ...],
     expected: Expected | None,
 ) -> Answering:
-    """The answer at the foot of a point, in three parts.
+    """The answer at the foot of a point, in up to five parts.
 
     Args:
         state: of the filter; it must not change between the parts.
@@ -91,6 +91,7 @@ def _answered(
     """With the sandwich covariance, amended where all is observed."""
     place = state.place(point)
     a = anchor(state.c, state.T, place, state.length)
+    yield
     tangent = a.T_frame_contact[:3, :2]
     flat = tangent.T @ spread @ tangent
     q = a.M[6:] @ state.inverse / UNIT[:, None]
@@ -103,6 +104,7 @@ def _answered(
         notes = misfit_notes(amended.misfit, trusted=amended.trusted)
         if not amended.trusted:
             return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
+        yield
         a = anchor(amended.c, state.T, place, state.length)
         noise += state.root @ amended.covariance @ state.root.T
     return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)

@@ -18,7 +18,7 @@ import numpy as np
 from canprobe.touch._arrays import Array
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate, is_umbilic
-from canprobe.touch.estimators.base import Answering, Dropped, Estimator, answering, whole
+from canprobe.touch.estimators.base import Adding, Answering, Dropped, Estimator, adding, answering, whole
 from canprobe.touch.evidence import TO_Q
 
 SPAN = 0.5
@@ -50,9 +50,13 @@ class FollowingEstimator:
         """Samples that were not used."""
         return self._inner.dropped
 
-    def add(self, sample: ContactSample) -> bool:
+    def add(self, sample: ContactSample) -> None:
         """Take one contact."""
-        return self._inner.add(sample)
+        self._inner.add(sample)
+
+    def adding(self, sample: ContactSample) -> Adding:
+        """The same in the parts of the estimator inside."""
+        return adding(self._inner, sample)
 
     def reset(self) -> None:
         """Forget everything but the settings."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Answering, Dropped, Estimator, answering, whole
+from canprobe.touch.estimators.base import Adding, Answering, Dropped, Estimator, adding, answering, whole
 from canprobe.touch.patch_curvature import PatchCurvature
 from canprobe.touch.patch_fusion import patch_estimate, with_patch
 
@@ -29,14 +29,17 @@ class PatchedEstimator:
         """Samples that were not used, by neither sensor."""
         return self._motion.dropped
 
-    def add(self, sample: ContactSample) -> bool:
+    def add(self, sample: ContactSample) -> None:
         """Take one contact with its moments."""
+        whole(self.adding(sample))
+
+    def adding(self, sample: ContactSample) -> Adding:
+        """The same in the parts of the motion."""
         before = self._motion.dropped.total
-        worked = self._motion.add(sample)
+        yield from adding(self._motion, sample)
         if self._motion.dropped.total == before:
             self._last = sample
             self.patch.add(sample)
-        return worked
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""

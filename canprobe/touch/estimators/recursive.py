@@ -19,7 +19,7 @@ from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Answering, Dropped, Gate, whole
+from canprobe.touch.estimators.base import Adding, Answering, Dropped, Gate, whole
 from canprobe.touch.estimators.change import ChangeTest
 from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
 from canprobe.touch.estimators.filter_answer import filter_answering
@@ -110,19 +110,22 @@ class RecursiveEstimator:
         self._settled = False
         self._doubtful = 0.0
 
-    def add(self, sample: ContactSample) -> bool:
-        """Take one contact; at the end of a step, which is work, all of it."""
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        whole(self.adding(sample))
+
+    def adding(self, sample: ContactSample) -> Adding:
+        """The same in parts, of which only the last contact of a step has more than one."""
         if not self._gate.passes(sample, self.dropped):
-            return False
+            return
         touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
         moved = self._travel.add(sample.p_base)
         self._pending.append(_Pending(touch, self._travel.weight))
         if self._last is None or self._travel.weight == 1.0:
             self._last = touch
         if moved > 0.0:
-            self._step(moved)
+            yield from self._step(moved)
             self._pending.clear()
-        return moved > 0.0
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact that is no outlier; None before the contact has moved."""
@@ -160,11 +163,12 @@ class RecursiveEstimator:
         notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
         return (*notes, *self._gate.notes())
 
-    def _step(self, moved: float) -> None:
+    def _step(self, moved: float) -> Adding:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
         if compared and any([self._change.take(square, caution) for square in compared.squares]):
+            yield
             explained = self._explained(compared.equations)
             if explained is None:
                 self._change.alarm()
@@ -174,9 +178,14 @@ class RecursiveEstimator:
             else:
                 compared = explained
         if self._start is not None:
-            self._begin_with(self._start, moved)
+            yield
+            yield from self._beginning(self._start, moved)
         elif compared:
+            yield
             self._absorb(compared, moved)
+            yield
+            if self._last is not None:
+                self._filter.follow(self._last.point)
 
     def _compared(self) -> _Compared:
         found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
@@ -201,17 +210,16 @@ class RecursiveEstimator:
         root = np.sqrt(self._weigh(moved, weight) * weight)[:, None]
         rows, residuals = compared.equations
         self._filter.take(rows * root[:, :, None], residuals * root, moved)
-        if self._last is not None:
-            self._filter.follow(self._last.point)
 
-    def _begin_with(self, start: Start, moved: float) -> None:
+    def _beginning(self, start: Start, moved: float) -> Adding:
         """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
         crowd = self._weigh(moved, np.ones(len(self._pending)))
         wider = 1.0 / math.sqrt(crowd)
         touches = [p.touch for p in self._pending]
-        start.add(
+        yield from start.adding(
             [t._replace(sigma_point=wider * t.sigma_point, sigma_normal=wider * t.sigma_normal) for t in touches], moved
         )
+        yield
         self._settled = start.settled
         found = start.solution
         if found is None:
