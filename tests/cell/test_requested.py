@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -87,3 +88,12 @@ def test_what_is_asked_before_the_start_holds_for_the_task_that_comes(press):
 
 def q0():
     return np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
+
+
+def test_what_a_task_does_once_its_commands_are_out_is_passed_on():
+    worked = []
+    task = SimpleNamespace(step=lambda _: Command(), update=lambda: worked.append(True))
+    RequestedTask(task, None, (), 2.5e-3).update()
+    assert worked == [True]
+    for without in (None, SimpleNamespace(step=lambda _: Command())):
+        RequestedTask(without, None, (), 2.5e-3).update()

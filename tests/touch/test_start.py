@@ -8,8 +8,8 @@ import pytest
 from canprobe.touch import linearised as one_step
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimators import make_estimator
-from canprobe.touch.estimators.equations import Touch, batch_design
 from canprobe.touch.estimators.base import whole
+from canprobe.touch.estimators.equations import Touch, batch_design
 from canprobe.touch.estimators.start import LAST, MOST, Start, isolation
 from canprobe.touch.nonlinear import fit
 from canprobe.touch.prior import Prior
