@@ -61,14 +61,12 @@ def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
 def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
     """A loop that wakes at every deadline and does nothing: what the machine itself misses."""
     clock, period_ns = MonotonicClock(), round(1e9 / rate_hz)
-    lateness, nothing = [], np.zeros(0, np.int64)
+    deadlines, lateness, nothing = [clock.now_ns() + period_ns], [], np.zeros(0, np.int64)
     with realtime(MASTER_PRIORITY, _unheard):
-        begin_ns = deadline_ns = clock.now_ns() + period_ns
         for _ in range(round(seconds * rate_hz)):
-            clock.sleep_until_ns(deadline_ns)
-            late_ns = clock.now_ns() - deadline_ns
-            lateness.append(late_ns)
-            deadline_ns += period_ns * (1 + late_ns // period_ns)
+            clock.sleep_until_ns(deadlines[-1])
+            lateness.append(clock.now_ns() - deadlines[-1])
+            deadlines.append(deadlines[-1] + period_ns * (1 + lateness[-1] // period_ns))
     times = CycleTimes(
         period_ns=period_ns,
         lateness_ns=np.array(lateness, np.int64),
@@ -77,7 +75,7 @@ def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
         latency_ns=nothing,
         overruns=sum(late > period_ns // 2 for late in lateness),
         missed=0,
-        seconds=(clock.now_ns() - begin_ns) * 1e-9,
+        seconds=(deadlines[-2] - deadlines[0]) * 1e-9,
         processor_share=None,
     )
     return Measured("bare clock", "none", rate_hz, times)

@@ -108,14 +108,15 @@ class ShapeTracker:
         self._felt = True
         self._owed += 1
 
-    def work(self) -> None:
-        """A cycle's share of the work; `answer` tells what came of it."""
+    def work(self) -> SurfaceEstimate | None:
+        """A cycle's share of the work; the estimate that it came to, which `answer` has yet to tell."""
         felt, self._felt = self._felt, False
         while self._owed > felt:
             self._owed -= 1
             self._take_on()
             for _ in range(self._parts):
                 self._answer_part()
+        return None if self._found is None else self._found[0]
 
     def answer(self, t_s: float) -> SurfaceEstimate | None:
         """The estimate, once, that has been found since it was last asked for.

@@ -116,7 +116,7 @@ class TouchTask(ProbingTask):
             self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
         self._cycle = measurement.cycle
         self._pass_time(measurement.t_ns)
-        self._take_answer(measurement.t_ns * 1e-9)
+        self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None
         self._sense(measurement)
         self._watch(measurement)
         pose = _STEPS[self.phase](self)
@@ -127,8 +127,8 @@ class TouchTask(ProbingTask):
 
     def update(self) -> None:
         """The estimator's work after a step, once: when the commands are out, or else before the next step."""
-        if not self._updated and self.shape is not None:
-            self.shape.work()
+        if not self._updated and self.shape is not None and (estimate := self.shape.work()) is not None:
+            self._follow(estimate)
         self._updated = True
 
     # sensing and supervision
@@ -179,11 +179,10 @@ class TouchTask(ProbingTask):
             self._servo.surface.raise_by(rise)
             self._depth0 += rise
 
-    def _take_answer(self, t_s: float) -> None:
-        """What the estimator says, if an answer is there in this cycle."""
-        estimate = self._estimate = self.shape.answer(t_s) if self.shape is not None else None
+    def _follow(self, estimate: SurfaceEstimate) -> None:
+        """Go by an estimate from now on."""
         contact = self._contact
-        if estimate is None or contact is None or self._servo is None:
+        if contact is None or self._servo is None:
             return
         self._shape_columns = {
             "kappa_per_m": np.where(estimate.observed, estimate.kappa, np.nan),
