@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from canprobe.touch.estimators.base import Adding, Answering
 
 
-PARTS = 8
-"""Of the longest answer: where fewer contacts come between two answers, several are worked out after each."""
+PARTS = 7
+"""Of the longest answer: where fewer contacts come between two answers, several are worked out after each. One contact
+is left of the eight between two answers by default, as none begins while a contact is being taken."""
 BEHIND = 4
 """Contacts that may wait before more than a part of taking them is worked out for each."""
 GAP_S = 0.1

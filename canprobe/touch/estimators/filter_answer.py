@@ -51,7 +51,7 @@ def filter_answering(
     notes: tuple[str, ...],
     expected: Expected | None,
 ) -> Answering:
-    """The answer at the foot of a point, in up to five parts.
+    """The answer at the foot of a point, in up to four parts.
 
     Args:
         state: of the filter; it must not change between the parts.
@@ -61,7 +61,6 @@ def filter_answering(
         expected: of the samples, to allow for what a quadric leaves out (`left_out`); None: the surface is one exactly.
     """
     found = yield from _answered(state, point, spread, expected)
-    yield
     a, decision = found.anchor, found.decision
     deviation = a.M @ found.deviation
     covariance = curvature_covariance(a.c, deviation)
