@@ -135,8 +135,8 @@ def test_contacts_faster_than_cycles_are_all_taken():
     tracker = ShapeTracker(estimator, every=2)
     for k in range(7):
         tracker.add(contact(0.001 * k))
-    tracker.work()
-    tracker.work()
+    for _ in range(5):
+        tracker.work()
     assert estimator.n == 7
 
 
@@ -150,6 +150,20 @@ def test_an_answer_stands_at_the_contact_after_which_it_was_due():
     assert record.told_s == pytest.approx(5e-3 * told[0])
     assert record.t_s == pytest.approx(5e-3 * (PARTS - 1))
     assert record.travelled_m == pytest.approx(25e-3 * 5e-3 * (PARTS - 1))
+
+
+def test_long_cycles_have_several_rounds_of_work():
+    """Half the rate, half the contacts until an answer is there: it is no older."""
+    once, twice = (answered(ShapeTracker(InParts(PARTS), PARTS + 1, n), 3 * PARTS)[0] for n in (1, 2))
+    assert (once, twice) == (2 * PARTS, PARTS + 4)
+
+
+def test_cycles_without_a_contact_go_on_with_the_work():
+    """As of a slow sensor, or once a scan is over."""
+    tracker = ShapeTracker(InParts(PARTS), every=1)
+    cycle(tracker, 0.0, felt=True)
+    tracker._parts = 1
+    assert [cycle(tracker, 2.5e-3 * k, felt=False) for k in range(1, PARTS + 3)] == [False] * PARTS + [True, False]
 
 
 def test_what_is_due_meanwhile_is_begun_afterwards():

@@ -14,7 +14,7 @@ from canprobe.cell.supervision import Limits
 from canprobe.cell.tasks.calibration import PAD_LAG, array_calibration
 from canprobe.cell.tasks.probe_motion import MotionBounds, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import ROUND_S, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.cell.tasks.touch_settings import TouchSettings
 from canprobe.planning.model import Plan
@@ -210,7 +210,8 @@ def make_shape_tracker(scene: Scene) -> ShapeTracker | None:
     """The estimator of a scene that asks for a shape, None of one that does not."""
     if scene.shape is None or scene.task.kind != "scan":
         return None
-    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene))
+    rounds = max(1, round(1.0 / (scene.cycle.rate_hz * ROUND_S)))
+    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene), rounds)
 
 
 def estimates_of(scene: Scene, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:

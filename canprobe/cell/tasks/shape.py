@@ -23,6 +23,8 @@ PARTS = 7
 is left of the eight between two answers by default, as none begins while a contact is being taken."""
 BEHIND = 4
 """Contacts that may wait before more than a part of taking them is worked out for each."""
+ROUND_S = 2.5e-3
+"""Of a cycle, for which a part of each is cut."""
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
@@ -58,13 +60,14 @@ class ShapeTracker:
     """Feeds an estimator with the contacts of a scan and keeps what it said.
 
     The estimator has more to do after some contacts than fits on top of a cycle's other work, so it is done in parts,
-    one of each kind for every contact: taking contacts, which may lag (`BEHIND`), and working out an answer, which is
-    that at the contact after which it was due, whatever is felt meanwhile. The cycle that felt a contact does none of
-    it, unless one is felt in every cycle.
+    one of each kind in a cycle: taking contacts, which may lag (`BEHIND`), and working out an answer, which is that at
+    the contact after which it was due, whatever is felt meanwhile. The cycle that felt a contact does none of it,
+    unless the one before felt one too.
 
     Args:
         estimator: the online estimator.
         every: samples between two answers.
+        rounds: how often a cycle may do so; a long one more often.
         gap_s: time without a contact after which the estimator starts afresh.
 
     Attributes:
@@ -74,7 +77,7 @@ class ShapeTracker:
         restarts: how often the estimator diverged and started afresh.
     """
 
-    def __init__(self, estimator: Estimator, every: int, gap_s: float = GAP_S) -> None:
+    def __init__(self, estimator: Estimator, every: int, rounds: int = 1, gap_s: float = GAP_S) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
@@ -82,6 +85,7 @@ class ShapeTracker:
         self._estimator = estimator
         self._every = max(1, every)
         self._parts = -(-PARTS // self._every)
+        self._rounds = rounds
         self._gap_s = gap_s
         self._forget()
 
@@ -93,7 +97,7 @@ class ShapeTracker:
         self._due = False
         self._answering: tuple[Answering, _Felt] | None = None
         self._found: tuple[SurfaceEstimate, _Felt] | None = None
-        self._felt, self._owed = False, 0
+        self._felt = False, False  # in the cycle before, in this one
 
     def add(self, sample: ContactSample) -> None:
         """Hear of one contact."""
@@ -106,14 +110,12 @@ class ShapeTracker:
                 self.travelled_m += float(np.linalg.norm(sample.p_base - last.p_base))
         self.samples.append(sample)
         self._waiting.append(_Felt(sample, len(self.samples), self.travelled_m))
-        self._felt = True
-        self._owed += 1
+        self._felt = self._felt[0], True
 
     def work(self) -> SurfaceEstimate | None:
         """A cycle's share of the work; the estimate that it came to, which `answer` has yet to tell."""
-        felt, self._felt = self._felt, False
-        while self._owed > felt:
-            self._owed -= 1
+        (before, felt), self._felt = self._felt, (self._felt[1], False)
+        for _ in range(self._rounds if before or not felt else 0):
             self._take_on()
             for _ in range(self._parts):
                 self._answer_part()
