@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -29,6 +29,8 @@ from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 if TYPE_CHECKING:
     from canprobe.cell.lift_off import LiftOff
     from canprobe.touch.patch import Patch
+
+Result = TypeVar("Result")
 
 WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
@@ -210,11 +212,11 @@ class Cell:
             while True:
                 measurement = self.cycle.begin()
                 held = self._supervise(measurement, retreat)
-                command = self._ask(_hold if held else step, measurement, interrupts)
+                command = self._or_lift_off(self._ask, _hold if held else step, measurement, interrupts)
                 command = self._guarded(measurement, command, retreat)
                 self.cycle.end(command)
                 if update is not None:
-                    self._update(update)
+                    self._or_lift_off(update)
                 self.cycle.count_work()
                 self._record(measurement, command)
                 progress(measurement)
@@ -224,26 +226,27 @@ class Cell:
                     return
 
     def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
-        """What the controller wants; an interrupt, or what it raises or gives instead, ends the run off the object."""
-        try:
-            interrupts.take()
-            command = step(measurement)
-            if not isinstance(command, Command) or not isinstance(command.columns, dict):
-                raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
-            if not isinstance(command.done, bool | np.bool_):
-                raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
-            if not OWN_COLUMNS.isdisjoint(command.columns):
-                taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
-                raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
-            return command
-        except BaseException as error:
-            self._lift_off(error)
-            raise
+        """What the controller wants.
 
-    def _update(self, update: Callable[[], None]) -> None:
-        """The controller's work after its commands; what it raises ends the run off the object."""
+        Raises:
+            KeyboardInterrupt: an interrupt came.
+            UsageError: the controller gives something else.
+        """
+        interrupts.take()
+        command = step(measurement)
+        if not isinstance(command, Command) or not isinstance(command.columns, dict):
+            raise UsageError(f"controller: expected its step to return a Command, got {command!r}")
+        if not isinstance(command.done, bool | np.bool_):
+            raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
+        if not OWN_COLUMNS.isdisjoint(command.columns):
+            taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
+            raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
+        return command
+
+    def _or_lift_off(self, work: Callable[..., Result], *arguments: object) -> Result:
+        """What the controller's work returns; what it raises ends the run off the object."""
         try:
-            update()
+            return work(*arguments)
         except BaseException as error:
             self._lift_off(error)
             raise

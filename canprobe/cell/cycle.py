@@ -105,7 +105,7 @@ class Cycle:
         self._other = other
         self._sync = SyncCounter(settings.sync_overflow)
         self._deadline = self.t_first_ns
-        self._started_ns = 0
+        self._started_ns = self._sent_ns = 0
 
     def begin(self) -> Measurement:
         """Sleep to the deadline, send SYNC, collect the answers."""
@@ -177,11 +177,11 @@ class Cycle:
             frames.append(pack_heartbeat(self._s.master_id, NmtState.OPERATIONAL))
         if frames:
             self._port.send_batch(frames)
-        if self._started_ns:
-            self.statistics.response_ns.append(elapsed_ns() - self._started_ns)
+        self._sent_ns = elapsed_ns() if self._started_ns else 0
         self._deadline += self._s.period_ns
 
     def count_work(self) -> None:
         """The controller has done all that it does in this cycle."""
         if self._started_ns:
+            self.statistics.response_ns.append(self._sent_ns - self._started_ns)
             self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)

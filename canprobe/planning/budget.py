@@ -2,9 +2,9 @@
 
 A node queues its TPDOs when it has received the SYNC. The cell looks for them at fixed shares of the period and once at
 the time by which the last one must be in; in real time, after the first look, at each that comes. So the controller
-starts when the last one comes, but not before the first look, or at the next look; it takes at most
-the scene's `cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those
-on the SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
+starts when the last one comes, but not before the first look, or at the next look; it takes at most the scene's
+`cycle.compute_us`, and its RPDOs follow. Their latest queueing hangs on the TPDOs' response times and those on the
+SYNC's: the analysis is repeated until nothing moves (Palencia and González Harbour 1998, dynamic offsets).
 
 Where nodes send their oldest frame first, what has to wait behind its own node's heartbeat hangs on no phase: the bound
 for FIFO queues, which knows no offsets, takes the place of the one for priority queues.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.candump import read_candump
+from canprobe.bus.clock import Clock
 from canprobe.protocol.frames import SYNC_ID
 
 Times = NDArray[np.int64]
@@ -41,6 +43,30 @@ class CycleTimes:
     seconds: float
     processor_share: float | None
 
+    @classmethod
+    def of_wakes(
+        cls,
+        period_ns: int,
+        lateness: Sequence[int],
+        seconds: float,
+        *,
+        missed: int = 0,
+        processor_share: float | None = None,
+    ) -> CycleTimes:
+        """Of a loop of which no more is known than how late it woke each time, ns."""
+        nothing = np.zeros(0, np.int64)
+        return cls(
+            period_ns=period_ns,
+            lateness_ns=np.array(lateness, np.int64),
+            response_ns=nothing,
+            compute_ns=nothing,
+            latency_ns=nothing,
+            overruns=sum(late > period_ns // 2 for late in lateness),
+            missed=missed,
+            seconds=seconds,
+            processor_share=processor_share,
+        )
+
     @property
     def cycles(self) -> int:
         """Cycles that were begun."""
@@ -50,6 +76,21 @@ class CycleTimes:
     def rate_hz(self) -> float:
         """Cycles a second, as held."""
         return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+
+def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
+    """Wake at so many deadlines, a period apart, and add how late each was (ns); missed ones are passed over.
+
+    Yields:
+        The deadline, ns, or the last one that has passed by then.
+    """
+    deadline_ns = clock.now_ns() + period_ns
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        lateness.append(clock.now_ns() - deadline_ns)
+        deadline_ns += lateness[-1] // period_ns * period_ns
+        yield deadline_ns
+        deadline_ns += period_ns
 
 
 def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:

@@ -11,14 +11,13 @@ from contextlib import contextmanager
 from typing import Any
 
 import canopen
-import numpy as np
 
 from canprobe.bus.clock import MonotonicClock
 from canprobe.cell.bringup import NodeSetup
 from canprobe.cell.configuration import make_setups
 from canprobe.planning import Plan
 from canprobe.protocol.sync import SyncCounter
-from canprobe.studies.cycle_times import CycleTimes, processor_seconds, share_of
+from canprobe.studies.cycle_times import CycleTimes, processor_seconds, share_of, woken
 
 _ENABLING = (6, 7, 15)
 _CYCLES_A_STEP = 20
@@ -80,17 +79,10 @@ class _PlainCycle:
 
     def run(self, word: int, cycles: int) -> list[int]:
         """Cycle; returns the lateness of each SYNC, ns."""
-        period_ns, lateness = self._plan.sync.period_ns, []
-        clock = self._clock
-        deadline = clock.now_ns() + period_ns
-        for _ in range(cycles):
-            clock.sleep_until_ns(deadline)
-            late = clock.now_ns() - deadline
-            lateness.append(late)
-            if late > period_ns // 2:
-                deadline += late // period_ns * period_ns
-            self._once(word, deadline + int(_WAIT_SHARE * period_ns))
-            deadline += period_ns
+        period_ns = self._plan.sync.period_ns
+        lateness: list[int] = []
+        for deadline_ns in woken(self._clock, period_ns, cycles, lateness):
+            self._once(word, deadline_ns + int(_WAIT_SHARE * period_ns))
         return lateness
 
     def _once(self, word: int, until_ns: int) -> None:
@@ -123,15 +115,6 @@ class _PlainCycle:
         while (left_ns := seconds * 1e9 - (clock.now_ns() - begin_ns)) > 0:
             lateness += self.run(_ENABLING[-1], min(200, int(left_ns / period_ns) + 1))
         passed_s = (clock.now_ns() - begin_ns) * 1e-9
-        nothing = np.zeros(0, np.int64)
-        return CycleTimes(
-            period_ns=period_ns,
-            lateness_ns=np.array(lateness, np.int64),
-            response_ns=nothing,
-            compute_ns=nothing,
-            latency_ns=nothing,
-            overruns=sum(late > period_ns // 2 for late in lateness),
-            missed=self.missed,
-            seconds=passed_s,
-            processor_share=share_of(used_s, passed_s),
+        return CycleTimes.of_wakes(
+            period_ns, lateness, passed_s, missed=self.missed, processor_share=share_of(used_s, passed_s)
         )

@@ -22,7 +22,7 @@ from canprobe.planning import make_plan
 from canprobe.scene import Scene, TactileModeName
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
-from canprobe.studies.cycle_times import CycleTimes, answer_latencies, processor_seconds, share_of
+from canprobe.studies.cycle_times import CycleTimes, answer_latencies, processor_seconds, share_of, woken
 
 CHANNEL = "vcan0"
 PATIENT_SYNCS = 250
@@ -60,24 +60,10 @@ def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
 
 def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
     """A loop that wakes at every deadline and does nothing: what the machine itself misses."""
-    clock, period_ns = MonotonicClock(), round(1e9 / rate_hz)
-    deadlines, lateness, nothing = [clock.now_ns() + period_ns], [], np.zeros(0, np.int64)
+    period_ns, lateness = round(1e9 / rate_hz), list[int]()
     with realtime(MASTER_PRIORITY, _unheard):
-        for _ in range(round(seconds * rate_hz)):
-            clock.sleep_until_ns(deadlines[-1])
-            lateness.append(clock.now_ns() - deadlines[-1])
-            deadlines.append(deadlines[-1] + period_ns * (1 + lateness[-1] // period_ns))
-    times = CycleTimes(
-        period_ns=period_ns,
-        lateness_ns=np.array(lateness, np.int64),
-        response_ns=nothing,
-        compute_ns=nothing,
-        latency_ns=nothing,
-        overruns=sum(late > period_ns // 2 for late in lateness),
-        missed=0,
-        seconds=(deadlines[-2] - deadlines[0]) * 1e-9,
-        processor_share=None,
-    )
+        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * rate_hz), lateness))
+    times = CycleTimes.of_wakes(period_ns, lateness, (deadlines[-1] - deadlines[0]) * 1e-9)
     return Measured("bare clock", "none", rate_hz, times)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
-from canprobe.studies.cycle_times import CycleTimes, answer_latencies
+from canprobe.studies.cycle_times import CycleTimes, answer_latencies, woken
 from canprobe.studies.realtime import findings
 from canprobe.studies.realtime_cases import PATIENT_SYNCS, Measured, holding_scene
 
@@ -74,3 +74,21 @@ def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():
     scene = holding_scene("features", 800.0)
     assert scene.emulated_node_ids == () and scene.arm.missed_syncs == PATIENT_SYNCS
     assert (scene.cycle.rate_hz, scene.sensor.rate_hz, scene.sensor.mode) == (800.0, 400.0, "features")
+
+
+def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
+    class Clock:
+        now = 0
+        naps = iter((0, 100, 2600, 0))
+
+        def now_ns(self):
+            return self.now
+
+        def sleep_until_ns(self, t_ns):
+            self.now = max(self.now, t_ns) + next(self.naps)
+
+    lateness: list[int] = []
+    assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
+    assert lateness == [0, 100, 2600, 0]
+    times = CycleTimes.of_wakes(1000, lateness, 5e-6)
+    assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
