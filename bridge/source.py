@@ -15,7 +15,7 @@ from canprobe.cell.measurement import Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.tasks.calibration import array_calibration
 from canprobe.cell.tasks.sensing import ContactSensing, patch_of
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.planning.model import Plan
 from canprobe.robot.kinematics import forward
 from canprobe.robot.puma260 import MODELS

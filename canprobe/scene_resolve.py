@@ -40,6 +40,7 @@ from canprobe.scene_setup import (
     Touch,
     Truth,
 )
+from canprobe.scene_values import need_scene
 from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import make_strategy
 
@@ -54,8 +55,10 @@ def resolve(scene: Scene) -> Setup:
         scene: as `load_scene` gave it, or changed since.
 
     Raises:
+        UsageError: this is no scene.
         PlanError: the object that the scene describes is none.
     """
+    need_scene(scene)
     arm = _arm(scene.arm) if scene.arm is not None else None
     array = _array(scene.sensor) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()

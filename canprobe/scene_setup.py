@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +35,10 @@ from canprobe.touch.servo import SurfaceGains
 from canprobe.touch.strategy import Strategy
 
 Floats = NDArray[np.float64]
+Bus = BusSettings
+BringUp = BringUpSettings
+Bridges = BridgeSettings
+ArrayMode = TactileModeName
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 
 
@@ -100,7 +104,7 @@ class Array:
     eds: str
     emulated: bool
     serial: int | None
-    mode: TactileModeName
+    mode: ArrayMode
     window: int | Auto
     rate_hz: float
     full_scale: float
@@ -358,13 +362,13 @@ class Setup:
     title: str
     seed: int
     figures: bool
-    bus: BusSettings
+    bus: Bus
     rate_hz: float
     realtime: bool
     compute_ns: int
     limits: SafetyLimits
-    bring_up: BringUpSettings
-    bridge: BridgeSettings | None
+    bring_up: BringUp
+    bridge: Bridges | None
     arm: Arm | None
     array: Array | None
     probe: Probe
@@ -373,9 +377,9 @@ class Setup:
     truth: Truth
 
     @property
-    def touches(self) -> bool:
-        """The task touches an object."""
-        return isinstance(self.task, Touch | Calibrate)
+    def touch(self) -> Touch | Calibrate | None:
+        """The task, where it touches an object."""
+        return self.task if isinstance(self.task, Touch | Calibrate) else None
 
     @property
     def shape(self) -> Shape | None:
@@ -388,12 +392,18 @@ class Setup:
         nodes = (*(self.arm.drives if self.arm is not None else ()), *((self.array,) if self.array is not None else ()))
         return tuple(sorted(node.node_id for node in nodes if node.emulated))
 
-    def with_arm(self, arm: Arm) -> Setup:
-        """With another arm, in the task too."""
-        assert not isinstance(self.task, Listen)
+    def with_bus(self, **values: Any) -> Setup:
+        """With other values of the bus."""
+        return replace(self, bus=replace(self.bus, **values))
+
+    def with_arm(self, **values: Any) -> Setup:
+        """With other values of the arm, in the task too."""
+        assert self.arm is not None and not isinstance(self.task, Listen)
+        arm = replace(self.arm, **values)
         return replace(self, arm=arm, task=replace(self.task, arm=arm))
 
-    def with_array(self, array: Array) -> Setup:
-        """With another array, in the task too."""
-        assert not isinstance(self.task, Free)
+    def with_array(self, **values: Any) -> Setup:
+        """With other values of the array, in the task too."""
+        assert self.array is not None and not isinstance(self.task, Free)
+        array = replace(self.array, **values)
         return replace(self, array=array, task=replace(self.task, array=array))

@@ -16,7 +16,7 @@ from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.meshes import Array
 from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigma, true_kappa
 from canprobe.bridge.view.recorded_taxels import read_taxels
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
 from canprobe.results import SCHEMA
 from canprobe.scene import Scene

@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.bridge.view.colours import Colours, scale
 from canprobe.bridge.view.meshes import Array
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.touch.objects import PlacedShape
 
 SPACING_M = 4e-4

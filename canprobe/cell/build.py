@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.port import Port
 from canprobe.cell.bringup import BringUpTimes
@@ -24,9 +22,7 @@ from canprobe.planning.model import (
     Plan,
 )
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import BringUpSettings, ProbeSettings
-from canprobe.scene_geometry import T_flange_probe
+from canprobe.scene_setup import BringUp, Calibrate, Free, Listen
 
 if TYPE_CHECKING:
     from canprobe.cell.lift_off import LiftOff
@@ -72,10 +68,10 @@ def make_cell(
         drives=drives,
         tactile=make_tactile(plan),
         limits=limits_of(plan),
-        patch_from=patch_from(plan.scene) if plan.scene.arm is not None else None,
+        patch_from=patch_from(plan.setup) if plan.setup.arm is not None else None,
         lift_from=_lift_from(plan, drives),
         say=say,
-        times=times or _times(plan.scene.bring_up),
+        times=times or _times(plan.setup.bring_up),
         log_failure=log_failure,
         observers=observers,
         rows_kept=rows_kept,
@@ -83,17 +79,16 @@ def make_cell(
 
 
 def _lift_from(plan: Plan, drives: DriveGroup | None) -> Callable[[Callable[[int], bool]], LiftOff] | None:
-    scene = plan.scene
-    if scene.arm is None or scene.sensor is None or drives is None:
+    arm, flange_probe = plan.setup.arm, plan.setup.probe.T_flange_probe
+    if arm is None or plan.setup.array is None or drives is None:
         return None
     from canprobe.cell.lift_off import LiftOff
 
-    flange_probe = T_flange_probe(scene.probe or ProbeSettings())
-    model, period_s = MODELS[scene.arm.model], plan.sync.period_ns * 1e-9
-    return lambda obeys: LiftOff(drives, model, flange_probe, period_s, obeys)
+    period_s = plan.sync.period_ns * 1e-9
+    return lambda obeys: LiftOff(drives, arm.model, flange_probe, period_s, obeys)
 
 
-def _times(settings: BringUpSettings) -> BringUpTimes:
+def _times(settings: BringUp) -> BringUpTimes:
     return BringUpTimes(
         listen=settings.listen_s,
         boot_up=settings.boot_up_s,
@@ -106,7 +101,7 @@ def _times(settings: BringUpSettings) -> BringUpTimes:
 
 def make_drives(plan: Plan) -> DriveGroup | None:
     """The plan's drives as one; None without an arm."""
-    arm = plan.scene.arm
+    arm = plan.setup.arm
     if arm is None:
         return None
     axes = tuple(
@@ -114,12 +109,12 @@ def make_drives(plan: Plan) -> DriveGroup | None:
         for n in arm.node_ids
     )
     repeat = max(1, COMMAND_REPEAT_NS // plan.sync.period_ns)
-    return DriveGroup(axes, MODELS[arm.model], repeat)
+    return DriveGroup(axes, arm.model, repeat)
 
 
 def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceiver | None:
     """The receiver of the plan's sensor, None without one; ``sync_overflow`` where it is not the plan's."""
-    sensor = plan.scene.sensor
+    sensor = plan.setup.array
     if sensor is None:
         return None
     pdos = plan.pdos_of(sensor.node_id, "tpdo")
@@ -133,21 +128,16 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
 
 def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
-    task = plan.scene.task
-    period_s = plan.sync.period_ns * 1e-9
-    if task.kind == "free":
+    period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
+    if isinstance(task, Free):
         from canprobe.cell.tasks.untouched import FreeTask
 
-        return FreeTask(np.radians(task.swing_deg), task.swing_period_s, task.duration_s, period_s)
-    if task.kind == "listen":
+        return FreeTask(task.swing, task.period_s, task.duration_s, period_s)
+    if isinstance(task, Listen):
         from canprobe.cell.tasks.calibration import array_calibration
         from canprobe.cell.tasks.untouched import ListenTask
 
-        assert plan.scene.sensor is not None
-        calibration = array_calibration(plan.scene.sensor.full_scale_kpa * 1e3)
-        return ListenTask(calibration, task.duration_s, period_s, limits_of(plan))
+        return ListenTask(array_calibration(task.array.full_scale), task.duration_s, period_s, limits_of(plan))
     from canprobe.cell.tasks.build import make_calibrate_task, make_touch_task
 
-    if task.kind == "calibrate":
-        return make_calibrate_task(plan, period_s)
-    return make_touch_task(plan, period_s)
+    return make_calibrate_task(plan, task) if isinstance(task, Calibrate) else make_touch_task(plan, task)

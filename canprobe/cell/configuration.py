@@ -31,8 +31,7 @@ from canprobe.planning.model import (
 from canprobe.planning.wire_bits import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
-from canprobe.robot.puma260 import MODELS, Array, PumaModel
-from canprobe.scene import TOUCH_KINDS
+from canprobe.robot.puma260 import Array, PumaModel
 
 INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
@@ -112,9 +111,9 @@ def _one_pdo(pdo: PlannedPdo, dictionary: Any) -> list[Write]:
 
 
 def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
-    scene, arm = plan.scene, plan.scene.arm
+    setup, arm = plan.setup, plan.setup.arm
     assert arm is not None and plan.sync.interpolation_100us is not None
-    model, axis = MODELS[arm.model], arm.node_ids.index(node.node_id)
+    model, axis = arm.model, arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
     window = round(float(model.counts[axis, axis]) * np.radians(FOLLOWING_WINDOW_DEG))
     dictionary = load_eds(node.eds, node.node_id)
@@ -125,7 +124,7 @@ def _drive_writes(plan: Plan, node: PlannedNode) -> list[Write]:
         Write(0x60C2, 2, -4),
         Write(0x6065, 0, window),
         Write(0x6066, 0, FOLLOWING_TIMEOUT_MS),
-        Write(0x607F, 0, motor_speed_limit(model, axis, scene.limits.joint_speed_share, plan.sync.period_ns)),
+        Write(0x607F, 0, motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)),
         Write(0x607D, 1, int(low[axis])),
         Write(0x607D, 2, int(high[axis])),
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE),
@@ -153,22 +152,22 @@ def software_limits(model: PumaModel) -> tuple[Array, Array]:
 
 
 def _sensor_writes(plan: Plan, dictionary: Any) -> list[Write]:
-    sensor = plan.scene.sensor
+    sensor = plan.setup.array
     assert sensor is not None
     writes = [Write(0x2000, 0, TactileMode[sensor.mode.upper()])]
     if sensor.mode == "window" and has_window_size(dictionary):
         writes.append(Write(WINDOW_SIZE, 0, int(sensor.window)))
     # nothing touches the array yet; a listening cell knows no such moment
-    if plan.scene.task.kind in TOUCH_KINDS:
+    if plan.setup.touch is not None:
         writes.append(Write(0x2003, 0, TARE, read_back=False))
     return writes
 
 
 def _sensor_given(plan: Plan, dictionary: Any) -> tuple[Given, ...]:
     """An array of another full scale would have its force read wrong by the ratio of the two."""
-    sensor = plan.scene.sensor
+    sensor = plan.setup.array
     assert sensor is not None
     if not has_full_scale(dictionary):
         return ()
-    pascals = round(sensor.full_scale_kpa * 1e3)
+    pascals = round(sensor.full_scale)
     return (Given(FULL_SCALE, 0, pascals, "sensor.full_scale_kpa", "force would be read wrong by their ratio"),)

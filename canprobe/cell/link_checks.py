@@ -49,7 +49,7 @@ class Expected:
 
 def expected_of(plan: Plan, channel: str) -> Expected:
     """What a plan wants: after a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO."""
-    bus = plan.scene.bus
+    bus = plan.setup.bus
     rpdos = {pdo.cob_id for pdo in plan.pdos if pdo.channel == channel and pdo.direction == "rpdo"}
     return Expected(bus.bitrate, bus.data_bitrate if bus.fd is True else None, 2 * (len(rpdos) + 2))
 

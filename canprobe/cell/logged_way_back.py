@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 from canprobe.cell.lift_off import WayBack
 from canprobe.cell.log_cycles import LogCycle
 from canprobe.planning.model import Plan
-from canprobe.robot.puma260 import MODELS, PumaModel, joints_to_counts
-from canprobe.scene import ProbeSettings
-from canprobe.scene_geometry import T_flange_probe
+from canprobe.robot.puma260 import PumaModel, joints_to_counts
 
 Vector = NDArray[np.float64]
 TARGET_TOLERANCE = 1
@@ -35,10 +33,11 @@ class LoggedWayBack:
     """
 
     def __init__(self, plan: Plan) -> None:
-        assert plan.scene.arm is not None
+        arm = plan.setup.arm
+        assert arm is not None
         self.steps: list[tuple[LogCycle, Vector]] = []
-        self._model = MODELS[plan.scene.arm.model]
-        self._flange_probe = T_flange_probe(plan.scene.probe or ProbeSettings())
+        self._model = arm.model
+        self._flange_probe = plan.setup.probe.T_flange_probe
         self._period_s = plan.sync.period_ns * 1e-9
 
     @property

@@ -94,16 +94,16 @@ class Monitor:
         self._plan = plan
         channels = [bus.channel for bus in plan.buses]
         self._view = CellView("+".join(channels))
-        self._speed_up = plan.scene.bus.data_bitrate / plan.scene.bus.bitrate
+        self._speed_up = plan.setup.bus.data_bitrate / plan.setup.bus.bitrate
         roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
-        arm = plan.scene.arm
+        arm = plan.setup.arm
         self._model = MODELS[arm.model] if arm is not None else None
         axes = enumerate(arm.node_ids if arm is not None else ())
         self._feedback = {plan.pdos_of(n, "tpdo")[0].cob_id: (i, n, plan.pdos_of(n, "tpdo")[0].layout) for i, n in axes}
         self._counts: list[int | None] = [None] * 6
         self._tactile = make_tactile(plan)
-        self._patch_from = patch_from(plan.scene)
+        self._patch_from = patch_from(plan.setup)
         self._heard: dict[int, int] = {}
         self._first_ns: int | None = None
         self._recent: dict[str, deque[tuple[int, float]]] = {channel: deque() for channel in channels}
@@ -187,7 +187,7 @@ class Monitor:
             self._syncs.popleft()
         span_s = min(1.0, max(view.t_s, 1e-3))
         view.frames_per_s = sum(map(len, self._recent.values())) / span_s
-        whole = self._plan.scene.bus.bitrate * span_s
+        whole = self._plan.setup.bus.bitrate * span_s
         view.load = {channel: sum(bits for _, bits in recent) / whole for channel, recent in self._recent.items()}
         view.sync_hz = len(self._syncs) / span_s
         if len(self._syncs) > 2:

@@ -159,6 +159,6 @@ def _check_syncs(recording: Recording, plan: Plan) -> None:
     period = float(np.median(steps))
     if abs(period - plan.sync.period_ns) > RATE_TOLERANCE * plan.sync.period_ns:
         raise UsageError(
-            f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.scene.name} has one every"
+            f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.setup.name} has one every"
             f" {plan.sync.period_ns * 1e-6:.3f} ms; set cycle.rate_hz"
         )

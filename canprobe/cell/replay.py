@@ -18,7 +18,7 @@ from canprobe.cell.tasks.build import make_sensing, make_shape_tracker
 from canprobe.cell.tasks.shape import ShapeTracker
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.planning.model import Plan
-from canprobe.robot.puma260 import MODELS
+from canprobe.scene_setup import Touch
 
 Vector = NDArray[np.float64]
 OWN_COUNTS = 20
@@ -96,10 +96,10 @@ class _Comparison:
     """Recorded targets beside those of the replay."""
 
     def __init__(self, plan: Plan) -> None:
-        assert plan.scene.arm is not None
+        assert plan.setup.arm is not None
         self.hold_cycles = limits_of(plan).hold_cycles
         self.parted_s: float | None = None
-        self._model = MODELS[plan.scene.arm.model]
+        self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
         self._differences: list[int] = []
         self._away = 0
@@ -133,8 +133,9 @@ def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracke
     Returns:
         The tracker; and how many contacts could not be placed for want of the joints of their instant.
     """
-    sensing = make_sensing(plan.scene)
-    tracker = make_shape_tracker(plan.scene)
+    assert isinstance(plan.setup.task, Touch)
+    sensing = make_sensing(plan.setup.task)
+    tracker = make_shape_tracker(plan.setup)
     assert tracker is not None
     for cycle in cycles:
         measurement = cycle.measurement

@@ -1,4 +1,4 @@
-"""Scene → plan: which nodes and PDOs a scene needs, whether they fit, what is left out and why."""
+"""Setup → plan: which nodes and PDOs a scene needs, whether they fit, what is left out and why."""
 
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan, PlannedNode, PlannedPdo

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from canprobe.errors import UsageError
-from canprobe.scene import Scene
+from canprobe.scene_setup import Setup
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,9 +81,9 @@ def check_bridges(names: Iterable[str]) -> None:
             raise UsageError(f"bridge {name}: needs {', '.join(info.missing)}: {info.pip}")
 
 
-def unavailable_bridges(scene: Scene) -> tuple[tuple[str, str], ...]:
+def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Bridges that the scene asks for and cannot have here, as (what, why)."""
-    used = scene.bridge.use if scene.bridge is not None else ()
+    used = setup.bridge.use if setup.bridge is not None else ()
     return tuple(
         (f"bridge {name}", f"{', '.join(BRIDGES[name].missing)} not installed: {BRIDGES[name].pip}")
         for name in used
@@ -91,7 +91,7 @@ def unavailable_bridges(scene: Scene) -> tuple[tuple[str, str], ...]:
     )
 
 
-def bridge_outputs(scene: Scene) -> tuple[str, ...]:
+def bridge_outputs(setup: Setup) -> tuple[str, ...]:
     """The files that the scene's bridges write."""
-    used = scene.bridge.use if scene.bridge is not None else ()
+    used = setup.bridge.use if setup.bridge is not None else ()
     return tuple(output for name in used if (output := BRIDGES[name].output) is not None)

@@ -12,38 +12,38 @@ from __future__ import annotations
 import math
 
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene import TOUCH_KINDS, ProbeSettings, Scene
+from canprobe.scene_setup import Probe, Setup
 
 PITCH_M = 1.5875e-3
 FOLLOWING_TAXELS = 0.75
 """By how much the contact's centroid may be off the middle of the window before the window moves."""
 
 
-def patch_radius_m(force_n: float, probe: ProbeSettings) -> float:
+def patch_radius_m(force_n: float, probe: Probe) -> float:
     """Radius of the contact patch on a plane, m."""
-    radius = probe.radius_mm * 1e-3
-    depth = math.sqrt(force_n / (math.pi * probe.stiffness_n_m3 * radius))
-    return math.sqrt(2.0 * radius * depth)
+    depth = math.sqrt(force_n / (math.pi * probe.stiffness * probe.radius))
+    return math.sqrt(2.0 * probe.radius * depth)
 
 
-def patch_across_taxels(force_n: float, probe: ProbeSettings) -> float:
+def patch_across_taxels(force_n: float, probe: Probe) -> float:
     """Diameter of the contact patch on a plane, in taxels."""
     return 2.0 * patch_radius_m(force_n, probe) / PITCH_M
 
 
-def taxels_needed(force_n: float, probe: ProbeSettings) -> float:
+def taxels_needed(force_n: float, probe: Probe) -> float:
     """Taxels along a window that always holds the patch."""
     return patch_across_taxels(force_n, probe) + 2.0 * FOLLOWING_TAXELS
 
 
-def window_choices(scene: Scene) -> tuple[tuple[int, str], ...]:
+def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
     """Windows by preference, with the reason; without a force to hold the largest first."""
-    if scene.probe is None or scene.task.kind not in TOUCH_KINDS:
+    touch = setup.touch
+    if touch is None:
         return tuple((side, "the largest that fits; nothing is pressed") for side in reversed(WINDOWS))
-    force, needed = scene.task.force_n, taxels_needed(scene.task.force_n, scene.probe)
+    needed = taxels_needed(touch.force, touch.probe)
     patch = (
-        f"at {force:g} N the patch on a plane has {2e3 * patch_radius_m(force, scene.probe):.1f} mm across and asks for"
-        f" {needed:.1f} taxels with {FOLLOWING_TAXELS:g} on each side for following it"
+        f"at {touch.force:g} N the patch on a plane has {2e3 * patch_radius_m(touch.force, touch.probe):.1f} mm across"
+        f" and asks for {needed:.1f} taxels with {FOLLOWING_TAXELS:g} on each side for following it"
     )
     enough = [side for side in WINDOWS if side >= needed]
     less = [side for side in reversed(WINDOWS) if side < needed]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 from canprobe.planning.contact_window import FOLLOWING_TAXELS, PITCH_M, patch_radius_m
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene import TOUCH_KINDS, ProbeSettings, Scene
+from canprobe.scene_setup import Probe, Setup
 
 TOLERATED = 0.05
 """Share of the force that a window may miss without a warning; the array itself errs by as much."""
@@ -26,7 +26,7 @@ _STEPS = 200
 _HALVINGS = 40
 
 
-def measured_share(force_n: float, probe: ProbeSettings, side: int, off_taxels: float = FOLLOWING_TAXELS) -> float:
+def measured_share(force_n: float, probe: Probe, side: int, off_taxels: float = FOLLOWING_TAXELS) -> float:
     """Share of a force that a window feels.
 
     Args:
@@ -48,7 +48,7 @@ def _column(x: float, radius: float, half: float) -> float:
     return 2.0 * height * (1.0 - (x / radius) ** 2) - 2.0 / 3.0 * height**3 / radius**2
 
 
-def true_force_n(force_n: float, probe: ProbeSettings, side: int, most_n: float) -> float | None:
+def true_force_n(force_n: float, probe: Probe, side: int, most_n: float) -> float | None:
     """The force that presses where a window measures `force_n`, at the most; None where it is above `most_n`."""
     if most_n * measured_share(most_n, probe, side) < force_n:
         return None
@@ -75,30 +75,30 @@ class CutPatch:
     ways: tuple[str, ...]
 
 
-def cut_patch(scene: Scene) -> CutPatch | None:
+def cut_patch(setup: Setup) -> CutPatch | None:
     """What the window of a scene misses; None where it feels nearly all of the force, or nothing is pressed."""
-    sensor, probe, task = scene.sensor, scene.probe, scene.task
-    if sensor is None or sensor.mode != "window" or probe is None or task.kind not in TOUCH_KINDS:
+    touch = setup.touch
+    if touch is None or touch.array.mode != "window":
         return None
-    side, most = int(sensor.window), scene.limits.force_max_n
-    share = measured_share(task.force_n, probe, side)
+    force, probe, side, most = touch.force, touch.probe, int(touch.array.window), setup.limits.force_max
+    share = measured_share(force, probe, side)
     if share >= 1.0 - TOLERATED:
         return None
-    across = 2.0 * patch_radius_m(task.force_n, probe) / PITCH_M
+    across = 2.0 * patch_radius_m(force, probe) / PITCH_M
     cuts = (
         f"sensor.window = {side} cuts the contact patch, which is {across:.1f} taxels across on a plane at "
-        f"{task.force_n:g} N; as little as {100 * share:.0f} % of that force lies inside"
+        f"{force:g} N; as little as {100 * share:.0f} % of that force lies inside"
     )
     if side >= CARRIED_SIDE and share >= CARRIED_SHARE:
         carried = f"the rest is carried on from there, and the force errs by up to {100 * CARRIED_ERROR:.0f} %"
-        return CutPatch(f"{cuts}; {carried}", task.force_n * (1.0 + CARRIED_ERROR), _ways(scene, probe))
-    true_n = true_force_n(task.force_n, probe, side, most)
+        return CutPatch(f"{cuts}; {carried}", force * (1.0 + CARRIED_ERROR), _ways(force, probe))
+    true_n = true_force_n(force, probe, side, most)
     presses = f"more than limits.force_max_n = {most:g} N" if true_n is None else f"up to {true_n:.2g} N"
-    unfelt = f"and where the window measures {task.force_n:g} N, {presses} can press"
-    return CutPatch(f"{cuts}, {unfelt}", true_n, _ways(scene, probe))
+    unfelt = f"and where the window measures {force:g} N, {presses} can press"
+    return CutPatch(f"{cuts}, {unfelt}", true_n, _ways(force, probe))
 
 
-def _ways(scene: Scene, probe: ProbeSettings) -> tuple[str, ...]:
-    enough = [side for side in WINDOWS if measured_share(scene.task.force_n, probe, side) >= 1.0 - TOLERATED]
+def _ways(force: float, probe: Probe) -> tuple[str, ...]:
+    enough = [side for side in WINDOWS if measured_share(force, probe, side) >= 1.0 - TOLERATED]
     larger = f"sensor.window = {enough[0]}" if enough else 'sensor.mode = "image"'
     return larger, "a smaller task.force_n"

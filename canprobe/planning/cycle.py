@@ -3,32 +3,32 @@
 from __future__ import annotations
 
 from canprobe.planning.model import SYNC_OVERFLOW, SyncPlan
-from canprobe.scene import Scene
+from canprobe.scene_setup import Setup
 
 INTERPOLATION_US = 100  # 60C2h with index −4
 INTERPOLATION_MAX = 255  # 60C2h:01 is an UNSIGNED8
 _TOLERANCE = 1e-5  # of a rate written with six digits
 
 
-def plan_sync(scene: Scene) -> tuple[SyncPlan, list[str]]:
+def plan_sync(setup: Setup) -> tuple[SyncPlan, list[str]]:
     """The SYNC of a scene, and why its period cannot be had.
 
     Source: CiA 301 object 1006h (period in µs), CiA 402 object 60C2h (interpolation period, here n·10⁻⁴ s).
     """
-    step_us = 1 if scene.arm is None else INTERPOLATION_US
-    period_us = max(1, round(1e6 / scene.cycle.rate_hz / step_us)) * step_us
-    exact = abs(period_us * scene.cycle.rate_hz / 1e6 - 1) < _TOLERANCE
+    step_us = 1 if setup.arm is None else INTERPOLATION_US
+    period_us = max(1, round(1e6 / setup.rate_hz / step_us)) * step_us
+    exact = abs(period_us * setup.rate_hz / 1e6 - 1) < _TOLERANCE
     units = period_us // INTERPOLATION_US
     problems = []
     if not exact:
-        problems.append(_not_representable(scene.cycle.rate_hz, step_us))
-    if scene.arm is not None and units > INTERPOLATION_MAX:
+        problems.append(_not_representable(setup.rate_hz, step_us))
+    if setup.arm is not None and units > INTERPOLATION_MAX:
         slowest = 1e6 / (INTERPOLATION_MAX * INTERPOLATION_US)
         problems.append(
-            f"cycle.rate_hz = {scene.cycle.rate_hz:g}: 60C2h holds at most {INTERPOLATION_MAX}·10⁻⁴ s; "
+            f"cycle.rate_hz = {setup.rate_hz:g}: 60C2h holds at most {INTERPOLATION_MAX}·10⁻⁴ s; "
             f"take {slowest:.1f} Hz or more"
         )
-    interpolation = None if scene.arm is None else units
+    interpolation = None if setup.arm is None else units
     return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW, interpolation), problems
 
 
@@ -42,18 +42,18 @@ def _not_representable(rate_hz: float, step_us: int) -> str:
     )
 
 
-def plan_ratio(scene: Scene) -> tuple[int, list[str]]:
+def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
     """How many SYNCs make one tactile frame (18xxh:02), and why the rate cannot be had."""
-    if scene.sensor is None:
+    if setup.array is None:
         return 1, []
-    exact = scene.cycle.rate_hz / scene.sensor.rate_hz
+    exact = setup.rate_hz / setup.array.rate_hz
     ratio = max(1, round(exact))
     if abs(exact / ratio - 1) < _TOLERANCE and SYNC_OVERFLOW % ratio == 0:
         return ratio, []
     fitting = [count for count in range(1, SYNC_OVERFLOW + 1) if SYNC_OVERFLOW % count == 0]
     near = sorted(fitting, key=lambda count: abs(count - exact))[:2]
-    rates = " or ".join(f"{scene.cycle.rate_hz / count:.6g}" for count in sorted(near))
+    rates = " or ".join(f"{setup.rate_hz / count:.6g}" for count in sorted(near))
     return min(ratio, SYNC_OVERFLOW), [
-        f"sensor.rate_hz = {scene.sensor.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
+        f"sensor.rate_hz = {setup.array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
         f"counter runs to {SYNC_OVERFLOW}, so cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it; take {rates} Hz"
     ]

@@ -18,19 +18,18 @@ from canprobe.planning.model import (
     PlannedPdo,
 )
 from canprobe.planning.timeline import Slot, timeline
-from canprobe.scene import Scene
 
 SCHEMA = 1
 
 
 def plan_dict(plan: Plan) -> dict[str, Any]:
     """Every field of the plan; what does not apply is None."""
-    bus = plan.scene.bus
+    bus = plan.setup.bus
     return {
         "schema": SCHEMA,
-        "scene": plan.scene.name,
+        "scene": plan.setup.name,
         "fits": True,
-        "title": plan.scene.title,
+        "title": plan.setup.title,
         "bus": {
             "interface": bus.interface,
             "channel": bus.channel,
@@ -55,7 +54,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "offline_estimators": list(plan.offline_estimators),
         "strategy": plan.strategy,
         "fidelity": plan.fidelity,
-        "bridges": list(plan.scene.bridge.use) if plan.scene.bridge is not None else [],
+        "bridges": list(plan.setup.bridge.use) if plan.setup.bridge is not None else [],
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
@@ -63,11 +62,11 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
     }
 
 
-def refused_dict(scene: Scene, problems: Sequence[str], ways_out: Sequence[str]) -> dict[str, Any]:
+def refused_dict(name: str, problems: Sequence[str], ways_out: Sequence[str]) -> dict[str, Any]:
     """What is said of a scene that does not fit."""
     return {
         "schema": SCHEMA,
-        "scene": scene.name,
+        "scene": name,
         "fits": False,
         "problems": list(problems),
         "ways_out": list(ways_out),

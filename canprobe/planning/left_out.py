@@ -8,51 +8,50 @@ from collections.abc import Callable
 from canprobe.planning.bridges import bridge_outputs
 from canprobe.planning.contact_window import patch_across_taxels
 from canprobe.planning.cut_patch import measured_share
-from canprobe.scene import TOUCH_KINDS, Scene
+from canprobe.scene_setup import Setup, Touch
 
-_Reason = Callable[[Scene], str | None]
-
-
-def _no_arm(scene: Scene) -> str | None:
-    return None if scene.arm else f'no [arm]: task.kind = "{scene.task.kind}" moves nothing'
+_Reason = Callable[[Setup], str | None]
 
 
-def _no_sensor(scene: Scene) -> str | None:
-    return None if scene.sensor else f'no [sensor]: task.kind = "{scene.task.kind}" feels nothing'
+def _no_arm(setup: Setup) -> str | None:
+    return None if setup.arm else f'no [arm]: task.kind = "{setup.kind}" moves nothing'
 
 
-def _no_image(scene: Scene) -> str | None:
-    if scene.sensor is None or scene.sensor.mode == "image":
+def _no_sensor(setup: Setup) -> str | None:
+    return None if setup.array else f'no [sensor]: task.kind = "{setup.kind}" feels nothing'
+
+
+def _no_image(setup: Setup) -> str | None:
+    if setup.array is None or setup.array.mode == "image":
         return None
-    return _by_window(scene) if scene.sensor.mode == "window" else _by_sensor(scene)
+    return _by_window(setup, setup.array.window) if setup.array.mode == "window" else _by_sensor(setup)
 
 
-def _by_window(scene: Scene) -> str:
-    assert scene.sensor is not None
-    side = scene.sensor.window
+def _by_window(setup: Setup, side: int | str) -> str:
+    touch = setup.touch
     name = f"the {side}×{side} window round the contact"
-    if scene.probe is None or scene.task.kind not in TOUCH_KINDS or isinstance(side, str):
+    if touch is None or isinstance(side, str):
         return f"{name} is sent"
-    if side >= patch_across_taxels(scene.task.force_n, scene.probe):
+    if side >= patch_across_taxels(touch.force, touch.probe):
         return f"{name} holds the patch"
-    outside = 1.0 - measured_share(scene.task.force_n, scene.probe, side)
+    outside = 1.0 - measured_share(touch.force, touch.probe, side)
     return f"{name} is sent, with up to {100 * outside:.0f} % of the force outside"
 
 
-def _no_window(scene: Scene) -> str | None:
-    if scene.sensor is None or scene.sensor.mode == "window":
+def _no_window(setup: Setup) -> str | None:
+    if setup.array is None or setup.array.mode == "window":
         return None
-    return "the full image is sent" if scene.sensor.mode == "image" else _by_sensor(scene)
+    return "the full image is sent" if setup.array.mode == "image" else _by_sensor(setup)
 
 
-def _by_sensor(scene: Scene) -> str | None:
-    if scene.sensor is None or scene.sensor.mode != "features":
+def _by_sensor(setup: Setup) -> str | None:
+    if setup.array is None or setup.array.mode != "features":
         return None
     return 'sensor.mode = "features": the sensor computes force, centroid and moments itself'
 
 
-def _no_shape(scene: Scene) -> str | None:
-    if scene.shape is not None:
+def _no_shape(setup: Setup) -> str | None:
+    if setup.shape is not None:
         return None
     why = {
         "press": "one touch without motion shows no shape",
@@ -60,70 +59,69 @@ def _no_shape(scene: Scene) -> str | None:
         "listen": "nothing moves",
         "free": "nothing is touched",
     }
-    return why.get(scene.task.kind, "no [shape]")
+    return why.get(setup.kind, "no [shape]")
 
 
-def _no_patch(scene: Scene) -> str | None:
-    if scene.shape is None:
+def _no_patch(setup: Setup) -> str | None:
+    if setup.shape is None:
         return None
-    return "shape.patch = false" if not scene.shape.patch else _by_sensor(scene)
+    return "shape.patch = false" if not setup.shape.patch else _by_sensor(setup)
 
 
-def _no_strategy(scene: Scene) -> str | None:
+def _no_strategy(setup: Setup) -> str | None:
     why = {
         "press": "the probe holds still",
         "calibrate": "no surface is followed",
         "listen": "nothing moves",
         "free": "the joints swing, no surface is followed",
     }
-    return why.get(scene.task.kind)
+    return why.get(setup.kind)
 
 
-def _no_servo(scene: Scene) -> str | None:
-    return None if scene.servo is not None else f'task.kind = "{scene.task.kind}" controls no force'
+def _no_servo(setup: Setup) -> str | None:
+    return None if isinstance(setup.task, Touch) else f'task.kind = "{setup.kind}" controls no force'
 
 
-def _no_emulator(scene: Scene) -> str | None:
-    return None if scene.emulated_node_ids else "every node is real"
+def _no_emulator(setup: Setup) -> str | None:
+    return None if setup.emulated_node_ids else "every node is real"
 
 
-def _no_truth(scene: Scene) -> str | None:
-    if scene.emulated_node_ids and (scene.object is not None or scene.task.kind == "free"):
+def _no_truth(setup: Setup) -> str | None:
+    if setup.emulated_node_ids and (setup.truth.object is not None or setup.kind == "free"):
         return None
-    return "no emulated node" if not scene.emulated_node_ids else "no [object]: nothing to compare with"
+    return "no emulated node" if not setup.emulated_node_ids else "no [object]: nothing to compare with"
 
 
-def _no_dynamics(scene: Scene) -> str | None:
-    ideal = scene.plant is not None and scene.plant.fidelity == "ideal"
-    emulated_arm = scene.arm is not None and scene.arm.emulated and ideal
+def _no_dynamics(setup: Setup) -> str | None:
+    emulated_arm = setup.arm is not None and setup.arm.drives[0].emulated and setup.truth.fidelity == "ideal"
     return 'plant.fidelity = "ideal": each drive tracks as a second-order system' if emulated_arm else None
 
 
-def _no_figure(scene: Scene) -> str | None:
-    if not scene.scene.figures:
+def _no_figure(setup: Setup) -> str | None:
+    if not setup.figures:
         return "scene.figures = false"
     if importlib.util.find_spec("matplotlib") is not None:
         return None
     return "the study extra is not installed: pip install 'canprobe[study]'"
 
 
-def _no_page(scene: Scene) -> str | None:
-    if not scene.scene.figures:
+def _no_page(setup: Setup) -> str | None:
+    if not setup.figures:
         return "scene.figures = false"
-    if scene.task.kind == "listen":
+    if setup.kind == "listen":
         return 'task.kind = "listen": nothing moves'
     if importlib.util.find_spec("viser") is not None:
         return None
     return "the view extra is not installed: pip install 'canprobe[view]'"
 
 
-def _no_bridge(scene: Scene) -> str | None:
-    return None if scene.bridge is not None and scene.bridge.use else "no [bridge]: no other tool is fed"
+def _no_bridge(setup: Setup) -> str | None:
+    return None if setup.bridge is not None and setup.bridge.use else "no [bridge]: no other tool is fed"
 
 
 def _switch(name: str) -> _Reason:
-    def reason(scene: Scene) -> str | None:
-        off = scene.plant is not None and scene.sensor is not None and not getattr(scene.plant, name)
+    def reason(setup: Setup) -> str | None:
+        off = setup.array is not None and name in setup.truth.without
         return f"plant.{name} = false" if off else None
 
     return reason
@@ -156,24 +154,24 @@ _TABLE: tuple[tuple[str, _Reason], ...] = (
 )
 
 
-def left_out(scene: Scene) -> tuple[tuple[str, str], ...]:
+def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Everything that this scene leaves out, as (what, why)."""
-    reasons = ((what, reason(scene)) for what, reason in _TABLE)
+    reasons = ((what, reason(setup)) for what, reason in _TABLE)
     return tuple((what, why) for what, why in reasons if why is not None)
 
 
-def outputs(scene: Scene) -> tuple[str, ...]:
+def outputs(setup: Setup) -> tuple[str, ...]:
     """The files that a run of this scene writes."""
     files = ["summary.json", "log.npz", "bus.log", "scene.toml"]
-    if _no_truth(scene) is None:
+    if _no_truth(setup) is None:
         files.append("truth.npz")
-    if scene.task.kind == "calibrate":
+    if setup.kind == "calibrate":
         files.append("tool.toml")
-    mapped = _no_shape(scene) is None
+    mapped = _no_shape(setup) is None
     if mapped:
         files.append("surface.npz")
-    if _no_figure(scene) is None:
+    if _no_figure(setup) is None:
         files += ["report.png", "surface.png"] if mapped else ["report.png"]
-    if _no_page(scene) is None:
+    if _no_page(setup) is None:
         files.append("report.html")
-    return (*files, *bridge_outputs(scene))
+    return (*files, *bridge_outputs(setup))

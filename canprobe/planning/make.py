@@ -1,4 +1,4 @@
-"""`make_plan`: everything that follows from a scene, or every reason why it cannot be carried out."""
+"""`make_plan`: everything that follows from a setup, or every reason why it cannot be carried out."""
 
 from __future__ import annotations
 
@@ -26,39 +26,36 @@ from canprobe.planning.model import (
 from canprobe.planning.needs import missing_bitrate, missing_objects
 from canprobe.planning.open_keys import candidates
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
+from canprobe.planning.reach import check_motion
 from canprobe.planning.traffic import plan_traffic
-from canprobe.planning.turning import plan_motion
 from canprobe.planning.warnings import plan_warnings
 from canprobe.planning.ways_out import ways_out
-from canprobe.scene import Scene
-from canprobe.scene_values import need_scene
+from canprobe.scene_setup import Array, Drive, Setup, Touch
 
 SYNC_COUNTER = 0x1019
 
 
-def make_plan(scene: Scene) -> Plan:
-    """Derive the plan of a scene; what the scene leaves open ("auto") is chosen so that it fits.
+def make_plan(setup: Setup) -> Plan:
+    """Derive the plan of a setup; what it leaves open ("auto") is chosen so that it fits.
 
     Args:
-        scene: as `load_scene` gave it.
+        setup: of a scene; see `canprobe.scene_resolve.resolve`.
 
     Returns:
-        Nodes, PDOs, bus load, what is left out and why. Its scene has nothing open any more.
+        Nodes, PDOs, bus load, what is left out and why. Its setup has nothing open any more.
 
     Raises:
-        UsageError: this is no scene.
-        PlanError: with every reason why the scene does not fit, its numbers and the ways out.
+        PlanError: with every reason why the setup does not fit, its numbers and the ways out.
     """
-    need_scene(scene)
-    devices, problems = _devices(scene)
-    found = _choose(scene, devices) if not problems else None
+    devices, problems = _devices(setup)
+    found = _choose(setup, devices) if not problems else None
     ways: list[str] = []
     if found is not None:
         problems += found.reasons()
         ways += found.ways_out()
-        scene = found.scene
-    scene, joint_speeds, unreachable, turn = plan_motion(scene)
-    cut = cut_patch(scene) if found is not None else None
+        setup = found.setup
+    joint_speeds, unreachable = check_motion(setup)
+    cut = cut_patch(setup) if found is not None else None
     if cut is not None and cut.true_n is None:
         problems.append(cut.text)
         ways += cut.ways if not ways else ()
@@ -66,22 +63,23 @@ def make_plan(scene: Scene) -> Plan:
     if problems or found is None:
         raise PlanError(problems, ways)
     bus = found.bus
+    scan = setup.task.scan if isinstance(setup.task, Touch) else None
     return Plan(
-        scene=scene,
-        nodes=_nodes(scene, devices, bus.pdos),
+        setup=setup,
+        nodes=_nodes(setup, devices, bus.pdos),
         pdos=bus.pdos,
         sync=bus.sync,
         buses=bus.buses,
-        choices=(*found.choices, *turn),
+        choices=found.choices,
         joint_speeds=joint_speeds,
-        estimator=scene.shape.method if scene.shape is not None else None,
-        offline_estimators=scene.shape.also if scene.shape is not None else (),
-        strategy=scene.task.strategy if scene.task.kind == "scan" else None,
-        fidelity=scene.plant.fidelity if scene.plant is not None and scene.emulated_node_ids else None,
-        outputs=outputs(scene),
-        left_out=left_out(scene),
-        not_available=(*bus.not_available, *unavailable_bridges(scene)),
-        warnings=plan_warnings(scene, bus.pdos),
+        estimator=setup.shape.method if setup.shape is not None else None,
+        offline_estimators=setup.shape.also if setup.shape is not None else (),
+        strategy=scan.name if scan is not None else None,
+        fidelity=setup.truth.fidelity if setup.emulated_node_ids else None,
+        outputs=outputs(setup),
+        left_out=left_out(setup),
+        not_available=(*bus.not_available, *unavailable_bridges(setup)),
+        warnings=plan_warnings(setup, bus.pdos),
     )
 
 
@@ -109,7 +107,7 @@ class _BusPlan:
 class _Found:
     """The first candidate that fits, or else the nearest to it."""
 
-    scene: Scene
+    setup: Setup
     choices: tuple[Choice, ...]
     bus: _BusPlan
     tried: int
@@ -127,12 +125,12 @@ class _Found:
         if not self.bus.overload:
             return []
         known = frozenset(self.bus.problems)
-        return ways_out(self.scene, lambda changed: _fits(changed, known))
+        return ways_out(self.setup, lambda changed: _fits(changed, known))
 
 
-def _choose(scene: Scene, devices: Mapping[int, Abilities]) -> _Found:
+def _choose(setup: Setup, devices: Mapping[int, Abilities]) -> _Found:
     nearest: _Found | None = None
-    for tried, (candidate, choices) in enumerate(candidates(scene), start=1):
+    for tried, (candidate, choices) in enumerate(candidates(setup), start=1):
         found = _Found(candidate, choices, _plan_bus(candidate, devices), tried)
         if not found.bus.overload and not found.bus.problems:
             return found
@@ -146,25 +144,25 @@ def _distance(bus: _BusPlan) -> tuple[int, float]:
     return len(bus.problems), bus.peak
 
 
-def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
-    sync, problems = plan_sync(scene)
-    ratio, found = plan_ratio(scene)
+def _plan_bus(setup: Setup, devices: Mapping[int, Abilities]) -> _BusPlan:
+    sync, problems = plan_sync(setup)
+    ratio, found = plan_ratio(setup)
     planning = PdoPlanning(problems=[*problems, *found])
     if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if SYNC_COUNTER not in device.od]:
         sync = replace(sync, overflow=0)
         planning.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
-    plan_drive_pdos(planning, scene, sync, devices)
-    if scene.sensor is not None:
-        plan_tactile_pdos(planning, scene, sync, ratio, devices[scene.sensor.node_id])
-    planned = order_by_deadline(planning.pdos) if scene.bus.cob_ids == "by_deadline" else planning.pdos
+    plan_drive_pdos(planning, setup, sync, devices)
+    if setup.array is not None:
+        plan_tactile_pdos(planning, setup, sync, ratio, devices[setup.array.node_id])
+    planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
     planning.problems += identifier_problems(planned)
     buses: list[PlannedBus] = []
     pdos: list[PlannedPdo] = []
     overload: list[str] = []
-    for channel, node_ids in _channels(scene).items():
+    for channel, node_ids in _channels(setup).items():
         mine = [replace(pdo, channel=channel) for pdo in planned if pdo.node_id in node_ids]
-        settings = replace(scene.bus, channel=channel)
-        traffic, timed, late = plan_traffic(mine, sync, node_ids, settings, round(scene.cycle.compute_us * 1000))
+        settings = replace(setup.bus, channel=channel)
+        traffic, timed, late = plan_traffic(mine, sync, node_ids, settings, setup.compute_ns)
         buses.append(PlannedBus(channel, node_ids, traffic))
         pdos += timed
         overload += late
@@ -173,78 +171,68 @@ def _plan_bus(scene: Scene, devices: Mapping[int, Abilities]) -> _BusPlan:
     )
 
 
-def _channels(scene: Scene) -> dict[str, tuple[int, ...]]:
+def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
     """Which nodes are on which bus, the arm's first."""
     channels: dict[str, tuple[int, ...]] = {}
-    if scene.arm is not None:
-        channels[scene.bus.channel] = tuple(sorted(scene.arm.node_ids))
-    if scene.sensor is not None:
-        channel = scene.sensor.channel or scene.bus.channel
-        channels[channel] = tuple(sorted((*channels.get(channel, ()), scene.sensor.node_id)))
+    if setup.arm is not None:
+        channels[setup.bus.channel] = tuple(sorted(setup.arm.node_ids))
+    if setup.array is not None:
+        channel = setup.array.channel or setup.bus.channel
+        channels[channel] = tuple(sorted((*channels.get(channel, ()), setup.array.node_id)))
     return channels
 
 
-def _fits(scene: Scene, known: frozenset[str]) -> Traffic | None:
+def _fits(setup: Setup, known: frozenset[str]) -> Traffic | None:
     """The fullest bus of a changed scene if it fits and brings no problem that is not known already."""
-    devices, problems = _devices(scene)
+    devices, problems = _devices(setup)
     if problems:
         return None
-    bus = _plan_bus(scene, devices)
+    bus = _plan_bus(setup, devices)
     if bus.overload or not known.issuperset(bus.problems):
         return None
     return max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
 
 
-def _devices(scene: Scene) -> tuple[dict[int, Abilities], list[str]]:
+def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
     """The EDS of every node, and what is missing in them; each file is read once."""
     devices: dict[int, Abilities] = {}
     problems: list[str] = []
-    wanted: list[tuple[NodeKind, str, tuple[int, ...]]] = []
-    if scene.arm is not None:
-        wanted.append(("drive", scene.arm.eds, scene.arm.node_ids))
-    if scene.sensor is not None:
-        wanted.append(("tactile", scene.sensor.eds, (scene.sensor.node_id,)))
-    for kind, eds, node_ids in wanted:
+    wanted: dict[tuple[NodeKind, str], list[int]] = {}
+    for drive in setup.arm.drives if setup.arm is not None else ():
+        wanted.setdefault(("drive", drive.eds), []).append(drive.node_id)
+    if setup.array is not None:
+        wanted["tactile", setup.array.eds] = [setup.array.node_id]
+    for (kind, eds), node_ids in wanted.items():
         try:
             device = Abilities.of(eds, node_ids[0])
         except EdsError as error:
             problems.append(str(error))
             continue
-        problems += missing_objects(device, kind, scene) + missing_bitrate(device, kind, scene)
+        problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
         devices.update(dict.fromkeys(node_ids, device))
     return devices, problems
 
 
-def _nodes(scene: Scene, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...]) -> tuple[PlannedNode, ...]:
-    roles: list[tuple[int, NodeKind, str, bool]] = []
-    if scene.arm is not None:
-        joints = enumerate(scene.arm.node_ids, start=1)
-        roles += [(node_id, "drive", f"joint {axis}", scene.arm.emulated) for axis, node_id in joints]
-    if scene.sensor is not None:
-        roles.append((scene.sensor.node_id, "tactile", "tactile array", scene.sensor.emulated))
-    channel_of = {node_id: channel for channel, node_ids in _channels(scene).items() for node_id in node_ids}
+def _nodes(setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...]) -> tuple[PlannedNode, ...]:
+    roles: list[tuple[NodeKind, str, Drive | Array]] = []
+    if setup.arm is not None:
+        roles += [("drive", f"joint {axis}", drive) for axis, drive in enumerate(setup.arm.drives, start=1)]
+    if setup.array is not None:
+        roles.append(("tactile", "tactile array", setup.array))
+    channel_of = {node_id: channel for channel, node_ids in _channels(setup).items() for node_id in node_ids}
     return tuple(
         PlannedNode(
-            node_id=node_id,
+            node_id=node.node_id,
             kind=kind,
             role=role,
-            eds=devices[node_id].eds,
-            identity=replace(devices[node_id].identity, serial_number=_serial_number(scene, node_id)),
-            emulated=emulated,
-            channel=channel_of[node_id],
-            switched_off=_switched_off(node_id, devices[node_id], pdos),
+            eds=devices[node.node_id].eds,
+            identity=replace(devices[node.node_id].identity, serial_number=node.serial),
+            emulated=node.emulated,
+            channel=channel_of[node.node_id],
+            switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
         )
-        for node_id, kind, role, emulated in sorted(roles)
+        for kind, role, node in sorted(roles, key=lambda one: one[2].node_id)
     )
-
-
-def _serial_number(scene: Scene, node_id: int) -> int | None:
-    """What the scene wants 1018h:04 of a node to be."""
-    if scene.sensor is not None and node_id == scene.sensor.node_id:
-        return scene.sensor.serial_number
-    if scene.arm is None or scene.arm.serial_numbers is None:
-        return None
-    return scene.arm.serial_numbers[scene.arm.node_ids.index(node_id)]
 
 
 def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.scene import Scene
+from canprobe.scene_setup import Setup
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
@@ -249,12 +249,12 @@ class Plan:
     """Everything that follows from a scene before anything is started.
 
     Attributes:
-        scene: what it was made from.
+        setup: what it was made from, with nothing open any more.
         nodes: ascending node ids.
         pdos: by priority on the bus.
         sync: the cycle.
         buses: that of the arm first, then one of the sensor's own where it has one.
-        choices: what the scene left open; `scene` has the values.
+        choices: what the scene left open; `setup` has the values.
         joint_speeds: None without an arm.
         estimator: in the loop; None where no shape is estimated.
         offline_estimators: on the same data after the run.
@@ -266,7 +266,7 @@ class Plan:
         warnings: what is carried out all the same, but not as the numbers say.
     """
 
-    scene: Scene
+    setup: Setup
     nodes: tuple[PlannedNode, ...]
     pdos: tuple[PlannedPdo, ...]
     sync: SyncPlan
@@ -290,7 +290,7 @@ class Plan:
     @property
     def cycles(self) -> int:
         """About how many the whole task takes, with the ways to the object and back."""
-        return round((self.scene.task.duration_s + AROUND_S) * self.sync.rate_hz)
+        return round((self.setup.task.duration_s + AROUND_S) * self.sync.rate_hz)
 
     @property
     def node_ids(self) -> tuple[int, ...]:

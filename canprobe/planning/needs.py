@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.model import NodeKind
-from canprobe.scene import Scene
+from canprobe.scene_setup import Setup
 
 _EVERY_NODE: Mapping[int, str] = {
     0x1000: "device type",
@@ -30,22 +30,22 @@ MOST_BITRATE = 1_000_000
 """Of classical CAN, bit/s: the most that an EDS file can list."""
 
 
-def missing_objects(device: Abilities, kind: NodeKind, scene: Scene) -> list[str]:
+def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
     """One line for every object that the EDS lacks."""
     needed = {**_EVERY_NODE, **_OF_KIND[kind]}
     section = "arm" if kind == "drive" else "sensor"
     return [
-        f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {scene.name} needs it"
+        f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {setup.name} needs it"
         for index, what in needed.items()
         if index not in device.od
     ]
 
 
-def missing_bitrate(device: Abilities, kind: NodeKind, scene: Scene) -> list[str]:
+def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
     """That the device does not have the bus's bit rate, where its EDS tells which it has."""
-    beyond = scene.bus.bitrate > MOST_BITRATE  # no scene file may say so: a study's bus that no CAN is
-    if not device.bitrates or scene.bus.bitrate in device.bitrates or beyond:
+    beyond = setup.bus.bitrate > MOST_BITRATE  # no scene file may say so: a study's bus that no CAN is
+    if not device.bitrates or setup.bus.bitrate in device.bitrates or beyond:
         return []
     section = "arm" if kind == "drive" else "sensor"
     has = ", ".join(map(str, device.bitrates))
-    return [f"bus.bitrate = {scene.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]
+    return [f"bus.bitrate = {setup.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]

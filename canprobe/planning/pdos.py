@@ -12,7 +12,7 @@ from canprobe.planning.wire_bits import frame_bits
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import WINDOW, window_words
 from canprobe.protocol.timing import worst_case_bits
-from canprobe.scene import Scene, SensorSettings
+from canprobe.scene_setup import Array, Setup
 
 STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
 POSITION, TARGET_POSITION = (0x6064, 0), (0x607A, 0)
@@ -67,16 +67,17 @@ class PdoPlanning:
         return found
 
 
-def plan_drive_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, devices: Mapping[int, Abilities]) -> None:
+def plan_drive_pdos(planning: PdoPlanning, setup: Setup, sync: SyncPlan, devices: Mapping[int, Abilities]) -> None:
     """Feedback and targets of six drives: one PDO each way, or two targets sharing one RPDO."""
-    arm = scene.arm
+    arm = setup.arm
     if arm is None:
         return
     for node_id in arm.node_ids:
         _plan_feedback(planning, node_id, sync, devices[node_id])
-    grouped = arm.grouped_rpdo and all(devices[node_id].dummy(DUMMY_INTEGER32, 32) for node_id in arm.node_ids)
-    if arm.grouped_rpdo and not grouped:
-        why = f"{arm.eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps a target RPDO of its own"
+    grouped = arm.grouped and all(devices[node_id].dummy(DUMMY_INTEGER32, 32) for node_id in arm.node_ids)
+    if arm.grouped and not grouped:
+        eds = arm.drives[0].eds
+        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps a target RPDO of its own"
         planning.not_available.append(("two targets in one RPDO", why))
     for axis, node_id in enumerate(arm.node_ids):
         if grouped:
@@ -131,14 +132,14 @@ def _plan_shared_target(planning: PdoPlanning, node_id: int, first: int, sync: S
         planning.add(device, _synchronous(node_id, "rpdo", 2, layout, sync))
 
 
-def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio: int, device: Abilities) -> None:
+def plan_tactile_pdos(planning: PdoPlanning, setup: Setup, sync: SyncPlan, ratio: int, device: Abilities) -> None:
     """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
-    sensor = scene.sensor
+    sensor = setup.array
     if sensor is None:
         return
     cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
-    long = scene.bus.fd and device.has_long_pdos
-    if scene.bus.fd and not long:
+    long = setup.bus.fd and device.has_long_pdos
+    if setup.bus.fd and not long:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
         planning.not_available.append(("CAN FD frames from the sensor", why))
     _plan_window(planning, sensor, device)
@@ -146,12 +147,12 @@ def plan_tactile_pdos(planning: PdoPlanning, scene: Scene, sync: SyncPlan, ratio
         entries = planning.entries(device, sensor.node_id, "tpdo", found)
         if entries:
             layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
-            bits = frame_bits(layout.length, scene.bus)
+            bits = frame_bits(layout.length, setup.bus)
             pdo = _synchronous(sensor.node_id, "tpdo", number, layout, sync, cycles=cycles, bits=bits)
             planning.add(device, replace(pdo, kind="tactile"))
 
 
-def tactile_objects(sensor: SensorSettings) -> tuple[tuple[int, int], ...]:
+def tactile_objects(sensor: Array) -> tuple[tuple[int, int], ...]:
     """The objects of a tactile frame, its header first."""
     if sensor.mode == "features":
         return (FEATURES, 1), (FEATURES, 2)
@@ -160,7 +161,7 @@ def tactile_objects(sensor: SensorSettings) -> tuple[tuple[int, int], ...]:
     return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(sensor.window)) + 1))
 
 
-def _plan_window(planning: PdoPlanning, sensor: SensorSettings, device: Abilities) -> None:
+def _plan_window(planning: PdoPlanning, sensor: Array, device: Abilities) -> None:
     """A sensor whose window cannot be set has one of 8×8 taxels."""
     if sensor.mode != "window" or has_window_size(device.od):
         return

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 
 from canprobe.planning.contact_window import PITCH_M
 from canprobe.protocol.tactile import SIDE
-from canprobe.scene import Scene
-from canprobe.scene_geometry import approach_normal, scan_axes, true_object
+from canprobe.scene_setup import Approach, Touch
 from canprobe.touch.objects import PlacedShape
-from canprobe.touch.strategy import make_strategy
 
 Array = NDArray[np.float64]
 
@@ -37,57 +35,39 @@ class SurfacePath:
     hollow_radius: float
 
 
-def surface_path(scene: Scene, samples: int = SAMPLES) -> tuple[SurfacePath | None, list[str]]:
+def surface_path(task: Touch, shape: PlacedShape | None) -> tuple[SurfacePath | None, list[str]]:
     """Points of the object under the task's path; without a described object the plane that the approach expects.
 
     Args:
-        scene: a scan or a press.
-        samples: points of a scan's path.
+        task: a scan or a press.
+        shape: the object.
     """
-    problems: list[str] = []
-    shape = _shape(scene, problems)
-    if problems:
-        return None, problems
-    start = np.array(scene.task.start_mm) * 1e-3
-    down = approach_normal(scene.task)
+    approach, down = task.approach, task.approach.normal
     if shape is None:
-        points = _plane_points(scene, samples)
+        points = _plane_points(task)
         return SurfacePath(points, np.tile(down, (len(points), 1)), math.inf), []
-    miss = _along(shape, start, down)
-    if miss is None or not -scene.task.search_mm <= 1e3 * miss <= scene.task.clearance_mm:
-        return None, [_missed(scene, miss)]
+    miss = _along(shape, approach.start, down)
+    if miss is None or not -approach.search <= miss <= approach.clearance:
+        return None, [_missed(approach, miss)]
     contacts = []
-    for point in _plane_points(scene, samples):
+    for point in _plane_points(task):
         height = _along(shape, point, down)
         if height is None:
             return None, [_left_object(point)]
         contacts.append(shape.closest(point + height * down))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
     path = SurfacePath(points, normals, shape.tightest_concave_radius(points))
-    beside = _beside(scene, shape, path, start, down)
+    beside = _beside(task, shape, path)
     return (path, []) if beside is None else (None, [beside])
 
 
-def _shape(scene: Scene, problems: list[str]) -> PlacedShape | None:
-    if scene.object is None:
-        return None
-    try:
-        return true_object(scene.object)
-    except ValueError as error:
-        problems.append(f"object: {error}")
-        return None
-
-
-def _plane_points(scene: Scene, samples: int) -> Array:
+def _plane_points(task: Touch) -> Array:
     """Points of the path in the scan plane, (n, 3) m; one point for a press."""
-    task = scene.task
-    start = np.array(task.start_mm) * 1e-3
-    if task.kind != "scan":
-        return start[None, :]
-    along, across, _ = scan_axes(task)
-    strategy = make_strategy(task.strategy, task.length_mm * 1e-3, task.width_mm * 1e-3, task.wavelength_mm * 1e-3)
-    flat = [strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, samples, endpoint=False)]
-    points: Array = start + np.array([x * along + y * across for x, y in flat])
+    if task.scan is None:
+        return task.approach.start[None, :]
+    along, across, _ = task.approach.axes
+    flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
+    points: Array = task.approach.start + np.array([x * along + y * across for x, y in flat])
     return points
 
 
@@ -105,32 +85,32 @@ def _along(shape: PlacedShape, point: Array, up: Array) -> float | None:
     return None
 
 
-def _missed(scene: Scene, miss: float | None) -> str:
-    x, y, z = scene.task.start_mm
+def _missed(approach: Approach, miss: float | None) -> str:
+    x, y, z = (1e3 * approach.start).tolist()
     where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
     if miss is None:
         return f"{where}: the approach does not meet the object; move start_mm over it or the object under it"
     return (
         f"{where}: the object lies {abs(1e3 * miss):.1f} mm {'above' if miss > 0 else 'below'} along the approach, "
-        f"searched from {scene.task.clearance_mm:g} mm above to {scene.task.search_mm:g} mm below; move one of them"
+        f"searched from {1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below; move one of them"
     )
 
 
-def _beside(scene: Scene, shape: PlacedShape, path: SurfacePath, start: Array, up: Array) -> str | None:
+def _beside(task: Touch, shape: PlacedShape, path: SurfacePath) -> str | None:
     """Why the probe, before or at its first touch, meets the object where there is no array; None where all is well.
 
     A hollow that is tighter than the probe is refused as that.
     """
-    if scene.probe is None or path.hollow_radius <= scene.probe.radius_mm * 1e-3:
+    approach, radius, up = task.approach, task.probe.radius, task.approach.normal
+    if path.hollow_radius <= radius:
         return None
-    radius, clearance = scene.probe.radius_mm * 1e-3, scene.task.clearance_mm * 1e-3
-    nearest = shape.closest(start + (clearance + radius) * up)
+    nearest = shape.closest(approach.start + (approach.clearance + radius) * up)
     tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))
     mend = f"turn task.approach_normal by {math.degrees(tilt):.0f} deg to the object's normal, or move one of them"
     if nearest.distance <= radius:
         deep = 1e3 * (radius - nearest.distance)
         return (
-            f"task.clearance_mm = {scene.task.clearance_mm:g}: the probe would be {deep:.1f} mm in the object before"
+            f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {deep:.1f} mm in the object before"
             f" its approach, {math.degrees(tilt):.0f} deg beside it; {mend}"
         )
     if radius * tilt > 0.5 * SIDE * PITCH_M:

@@ -28,8 +28,8 @@ def plan_text(plan: Plan) -> str:
 
 
 def _lines(plan: Plan) -> Iterator[str]:
-    bus, sync = plan.scene.bus, plan.sync
-    yield f"{plan.scene.name}: {plan.scene.title}" if plan.scene.title else plan.scene.name
+    bus, sync = plan.setup.bus, plan.sync
+    yield f"{plan.setup.name}: {plan.setup.title}" if plan.setup.title else plan.setup.name
     channels = " and ".join(one.channel for one in plan.buses)
     yield f"bus {channels} ({bus.interface}), {bus.bitrate} bit/s"
     if bus.fd:
@@ -170,16 +170,16 @@ def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
 
 
 def _use_rows(plan: Plan) -> Iterator[list[str]]:
-    yield ["task", plan.scene.task.kind]
+    yield ["task", plan.setup.kind]
     if plan.strategy is not None:
         yield ["strategy", plan.strategy]
     if plan.estimator is not None:
         also = f"; on the same data afterwards: {', '.join(plan.offline_estimators)}" if plan.offline_estimators else ""
         yield ["estimator", plan.estimator + also]
     if plan.fidelity is not None:
-        emulated = ", ".join(map(str, plan.scene.emulated_node_ids))
-        yield ["emulator", f"nodes {emulated}; arm {plan.fidelity}" if plan.scene.arm else f"nodes {emulated}"]
-    for name in plan.scene.bridge.use if plan.scene.bridge is not None else ():
+        emulated = ", ".join(map(str, plan.setup.emulated_node_ids))
+        yield ["emulator", f"nodes {emulated}; arm {plan.fidelity}" if plan.setup.arm else f"nodes {emulated}"]
+    for name in plan.setup.bridge.use if plan.setup.bridge is not None else ():
         yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
 

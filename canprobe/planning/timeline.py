@@ -85,7 +85,7 @@ def _controller_start(plan: Plan, slots: Sequence[Slot], cycle: int) -> int:
 def _releases(
     plan: Plan, bus: PlannedBus, cyclic: Sequence[PlannedPdo], starts: Sequence[int | None]
 ) -> Iterator[_Release]:
-    period, bitrate = plan.sync.period_ns, plan.scene.bus.bitrate
+    period, bitrate = plan.sync.period_ns, plan.setup.bus.bitrate
     sync_ns = _ns(worst_case_bits(1 if SYNC_OVERFLOW else 0), bitrate)
     mine = on_the_wire([pdo for pdo in cyclic if pdo.channel == bus.channel])
     for cycle, start in enumerate(starts):

@@ -18,7 +18,7 @@ from canprobe.planning.model import (
 )
 from canprobe.protocol.frames import HEARTBEAT_BASE, SYNC_ID
 from canprobe.protocol.timing import Message, Response, best_case_bits, worst_case_bits
-from canprobe.scene import BusSettings
+from canprobe.scene_setup import Bus
 
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
 _SYNC_BITS = worst_case_bits(_SYNC_BYTES)
@@ -31,7 +31,7 @@ def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
 
 
 def plan_traffic(
-    pdos: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings, compute_ns: int = 0
+    pdos: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus, compute_ns: int = 0
 ) -> tuple[Traffic, list[PlannedPdo], list[str]]:
     """Traffic of a set of PDOs, the PDOs with their response times, and what does not fit.
 
@@ -57,7 +57,7 @@ def plan_traffic(
     return traffic, timed, _problems(traffic, analysis.responses, bus)
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: BusSettings) -> CycleMessages:
+def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> CycleMessages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
     bitrate = bus.bitrate
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
@@ -138,7 +138,7 @@ def _ns(bits: int, bitrate: int) -> int:
     return -(-bits * 1_000_000_000 // bitrate)
 
 
-def _problems(traffic: Traffic, responses: Sequence[Response], bus: BusSettings) -> list[str]:
+def _problems(traffic: Traffic, responses: Sequence[Response], bus: Bus) -> list[str]:
     where = f"bus {bus.channel} at {bus.bitrate} bit/s"
     if bus.transmit_queue == "fifo":
         where += ", every node's oldest frame first"

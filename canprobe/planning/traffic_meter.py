@@ -40,7 +40,7 @@ class Expected:
 def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
     """Every message that the plan lists for one of its buses, by identifier."""
     sync_bytes = 1 if SYNC_OVERFLOW else 0
-    shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.scene.bus.bitrate
+    shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.setup.bus.bitrate
     found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, worst_case_bits(sync_bytes)), Expected(NMT_ID, "NMT")]
     for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
         triggered = pdo.transmission_type <= SYNCHRONOUS
@@ -101,7 +101,7 @@ class TrafficMeter:
         buses = self.plan.buses
         self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
         self._expected = expected_messages(self.plan, self._bus)
-        self._unstuffed = {n: unstuffed_frame_bits(n, self.plan.scene.bus) for n in FD_LENGTHS}
+        self._unstuffed = {n: unstuffed_frame_bits(n, self.plan.setup.bus) for n in FD_LENGTHS}
         tactile = frozenset(e.cob_id for e in self._expected.values() if e.kind == "tactile PDO")
         latest = {e.cob_id: e.latest_ns for e in self._expected.values() if e.latest_ns is not None}
         self._lateness = Lateness(latest, tactile, min(tactile, default=None))
@@ -146,7 +146,7 @@ class TrafficMeter:
             count.frames += frames_of
             count.bits += 0 if self.exact else frames_of * self._unstuffed[n_data]
         if self.exact:
-            bus = self.plan.scene.bus
+            bus = self.plan.setup.bus
             for can_id, data, _ in frames:
                 counts[can_id].bits += exact_frame_bits(can_id, data, bus)
 
@@ -176,7 +176,7 @@ class TrafficMeter:
             seen.update({can_id: one.frames for can_id, one in part.items()})
         return MeasuredTraffic(
             duration_s=ns * 1e-9,
-            bitrate=self.plan.scene.bus.bitrate,
+            bitrate=self.plan.setup.bus.bitrate,
             exact=self.exact,
             classes=tuple(self._classes(counts, ns * 1e-9)),
             unlisted={can_id: n for can_id, n in seen.items() if can_id not in self._expected},

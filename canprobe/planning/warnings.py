@@ -7,22 +7,22 @@ from collections.abc import Sequence
 from canprobe.planning.cut_patch import TOLERATED, cut_patch
 from canprobe.planning.model import PlannedPdo
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS
-from canprobe.scene import BusSettings, Scene
+from canprobe.scene_setup import Bus, Setup
 
 
-def plan_warnings(scene: Scene, pdos: Sequence[PlannedPdo]) -> tuple[str, ...]:
+def plan_warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> tuple[str, ...]:
     """Everything that a user has to know before he trusts the plan, most important first."""
-    return (*_window(scene), *_errors(scene.bus, pdos))
+    return (*_window(setup), *_errors(setup.bus, pdos))
 
 
-def _window(scene: Scene) -> list[str]:
-    cut = cut_patch(scene)
+def _window(setup: Setup) -> list[str]:
+    cut = cut_patch(setup)
     return (
         [] if cut is None else [f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"]
     )
 
 
-def _errors(bus: BusSettings, pdos: Sequence[PlannedPdo]) -> list[str]:
+def _errors(bus: Bus, pdos: Sequence[PlannedPdo]) -> list[str]:
     if bus.bit_error_rate <= 0 or not pdos:
         return []
     longest = max(pdo.bits_worst for pdo in pdos)

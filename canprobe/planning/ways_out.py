@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 from canprobe.planning.cycle import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.model import Traffic
 from canprobe.planning.open_keys import candidates, opened, second_channel, written_value
 from canprobe.protocol.tactile import WINDOW, WINDOWS
-from canprobe.scene import Scene, TactileModeName
+from canprobe.scene_setup import ArrayMode, Setup
 
 FD_ARRAY = "tactile_array_fd.eds"
-Fit = Callable[[Scene], Traffic | None]
+Fit = Callable[[Setup], Traffic | None]
 """Traffic of a changed scene, or None where that does not fit either."""
 
 
-def ways_out(scene: Scene, fit: Fit) -> list[str]:
+def ways_out(setup: Setup, fit: Fit) -> list[str]:
     """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
     found = []
-    for text, changed in (*_changes(scene), *_together(scene, fit), *_quicker(scene, fit), *_slower(scene, fit)):
+    for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
         traffic = fit(changed)
         if traffic is not None:
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
@@ -28,76 +28,65 @@ def ways_out(scene: Scene, fit: Fit) -> list[str]:
     return found or ["fewer nodes or a faster bus"]
 
 
-def _changes(scene: Scene) -> Iterator[tuple[str, Scene]]:
-    if scene.bus.bitrate < 1_000_000:
-        yield "bus.bitrate = 1000000", dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, bitrate=1_000_000))
-    if scene.bus.transmit_queue == "fifo":
+def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
+    bus, array = setup.bus, setup.array
+    if bus.bitrate < 1_000_000:
+        yield "bus.bitrate = 1000000", setup.with_bus(bitrate=1_000_000)
+    if bus.transmit_queue == "fifo":
         text = 'controllers that send their most urgent frame first (bus.transmit_queue = "priority")'
-        yield text, dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, transmit_queue="priority"))
-    if scene.arm is not None and not scene.arm.grouped_rpdo:
-        yield (
-            "arm.grouped_rpdo = true",
-            dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, grouped_rpdo=True)),
-        )
-    if scene.sensor is None:
+        yield text, setup.with_bus(transmit_queue="priority")
+    if setup.arm is not None and not setup.arm.grouped:
+        yield "arm.grouped_rpdo = true", setup.with_arm(grouped=True)
+    if array is None:
         return
-    smaller: dict[TactileModeName, tuple[TactileModeName, ...]] = {
+    smaller: dict[ArrayMode, tuple[ArrayMode, ...]] = {
         "image": ("window", "features"),
         "window": ("features",),
     }
-    if scene.sensor.mode == "window":
-        for side in reversed([side for side in WINDOWS if side < int(scene.sensor.window)]):
-            sensor = dataclasses.replace(scene.sensor, window=side)
-            yield f"sensor.window = {side}", dataclasses.replace(scene, sensor=sensor)
-    for mode in smaller.get(scene.sensor.mode, ()):
-        kept = scene.sensor.window if mode == "window" else WINDOW  # only a window may have another size
-        text = f'sensor.mode = "{mode}"' + " without sensor.window" * (kept != scene.sensor.window)
-        sensor = dataclasses.replace(scene.sensor, mode=mode, window=kept)
-        yield text, dataclasses.replace(scene, sensor=sensor)
-    if scene.arm is not None:
-        own = second_channel(scene.bus.channel)
-        if scene.sensor.channel in (None, scene.bus.channel):
-            text = f'a bus of its own for the sensor (sensor.channel = "{own}")'
-            yield text, dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, channel=own))
-    if not scene.bus.fd and scene.sensor.emulated:
-        fd = dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, fd=True))
+    if array.mode == "window":
+        for side in reversed([side for side in WINDOWS if side < int(array.window)]):
+            yield f"sensor.window = {side}", setup.with_array(window=side)
+    for mode in smaller.get(array.mode, ()):
+        kept = array.window if mode == "window" else WINDOW  # only a window may have another size
+        text = f'sensor.mode = "{mode}"' + " without sensor.window" * (kept != array.window)
+        yield text, setup.with_array(mode=mode, window=kept)
+    if setup.arm is not None and array.channel in (None, bus.channel):
+        own = second_channel(bus.channel)
+        yield f'a bus of its own for the sensor (sensor.channel = "{own}")', setup.with_array(channel=own)
+    if not bus.fd and array.emulated:
+        fd = setup.with_bus(fd=True)
         yield "bus.fd = true", fd
-        sensor = dataclasses.replace(scene.sensor, eds=FD_ARRAY)
-        yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', dataclasses.replace(fd, sensor=sensor)
+        yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', fd.with_array(eds=FD_ARRAY)
 
 
-def _together(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
+def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """The cheapest of what the plan could choose by itself, where it takes more than one change."""
-    for changed, choices in candidates(opened(scene)):
-        differing = [choice for choice in choices if choice.value != written_value(scene, choice.key)]
+    for changed, choices in candidates(opened(setup)):
+        differing = [choice for choice in choices if choice.value != written_value(setup, choice.key)]
         if fit(changed) is not None:
             if len(differing) > 1:
                 yield " and ".join(f"{choice.key} = {choice.value}" for choice in differing), changed
             return
 
 
-def _quicker(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
+def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """A controller that takes no longer than the bus leaves it, in whole microseconds."""
-    idle = fit(_computing(scene, 0.0))
+    idle = fit(replace(setup, compute_ns=0))
     if idle is None or idle.budget.slack_ns is None:
         return
     left_us = idle.budget.slack_ns // 1000
-    if 0 < left_us < scene.cycle.compute_us:
-        yield f"cycle.compute_us = {left_us}", _computing(scene, float(left_us))
+    if 0 < left_us * 1000 < setup.compute_ns:
+        yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
 
 
-def _computing(scene: Scene, compute_us: float) -> Scene:
-    return dataclasses.replace(scene, cycle=dataclasses.replace(scene.cycle, compute_us=compute_us))
-
-
-def _slower(scene: Scene, fit: Fit) -> Iterator[tuple[str, Scene]]:
+def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """The fastest cycle of whole hertz that fits, at the same number of cycles a tactile frame."""
-    for rate in _representable_rates(below=scene.cycle.rate_hz):
-        changed = dataclasses.replace(scene, cycle=dataclasses.replace(scene.cycle, rate_hz=rate))
+    for rate in _representable_rates(below=setup.rate_hz):
+        changed = replace(setup, rate_hz=rate)
         text = f"cycle.rate_hz = {rate:g}"
-        if scene.sensor is not None:
-            tactile = rate * scene.sensor.rate_hz / scene.cycle.rate_hz
-            changed = dataclasses.replace(changed, sensor=dataclasses.replace(scene.sensor, rate_hz=tactile))
+        if setup.array is not None:
+            tactile = rate * setup.array.rate_hz / setup.rate_hz
+            changed = changed.with_array(rate_hz=tactile)
             text += f" with sensor.rate_hz = {tactile:.6g}"
         if fit(changed) is not None:
             yield text, changed

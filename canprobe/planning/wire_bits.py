@@ -10,12 +10,12 @@ from canprobe.protocol.frame_bits import (
     worst_case_bits,
     worst_case_fd_bits,
 )
-from canprobe.scene import BusSettings
+from canprobe.scene_setup import Bus
 
 CLASSIC_BYTES = 8
 
 
-def frame_bits(n_data: int, bus: BusSettings) -> int:
+def frame_bits(n_data: int, bus: Bus) -> int:
     """Worst case of one frame in bit times of the nominal rate; the data phase of an FD frame rounded up.
 
     Args:
@@ -28,7 +28,7 @@ def frame_bits(n_data: int, bus: BusSettings) -> int:
     return worst.nominal - (-worst.data * bus.bitrate // bus.data_bitrate)
 
 
-def exact_frame_bits(can_id: int, data: bytes, bus: BusSettings) -> int:
+def exact_frame_bits(can_id: int, data: bytes, bus: Bus) -> int:
     """Bits of this very frame, in the same bit times."""
     if len(data) <= CLASSIC_BYTES:
         return exact_bits(can_id, data)
@@ -36,7 +36,7 @@ def exact_frame_bits(can_id: int, data: bytes, bus: BusSettings) -> int:
     return exact.nominal - (-exact.data * bus.bitrate // bus.data_bitrate)
 
 
-def unstuffed_frame_bits(n_data: int, bus: BusSettings) -> int:
+def unstuffed_frame_bits(n_data: int, bus: Bus) -> int:
     """Bits of a frame without stuff bits, as `canbusload -i` counts, in the same bit times."""
     if n_data <= CLASSIC_BYTES:
         return best_case_bits(n_data)

@@ -15,7 +15,7 @@ from canprobe.bus.clock import VirtualClock
 from canprobe.cell.build import make_task
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Measurement
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.emulator.node import SlaveNode

@@ -39,7 +39,7 @@ from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
 from canprobe.cell.limits import limits_of
 from canprobe.cell.supervision import Limits
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.node import SlaveNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.api import run as run_scene
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import PlanError, SafetyStop
 from canprobe.planning import make_plan
 from canprobe.scene import PlantSettings, Scene

@@ -11,7 +11,7 @@ import pytest
 from candump_lines import can_id_of, restamped, stamp_us
 
 import canprobe
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.cli import main
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))

@@ -14,7 +14,7 @@ from canprobe.cell.log_cycles import LogCycles
 from canprobe.cell.logged_way_back import TARGET_TOLERANCE
 from canprobe.cell.recording import read_recording
 from canprobe.cell.replay import replay_task
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import NodeError

@@ -7,7 +7,7 @@ import pytest
 
 import canprobe
 from canprobe.cell.build import make_task
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.scene import PlantSettings
 from canprobe.session import Session, resolve_scene
 from canprobe.studies.fault_runs import Witness

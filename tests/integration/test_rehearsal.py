@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from canprobe.cell.build import make_task
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.planning import make_plan
 from canprobe.rehearsal import rehearse, shortened
 from canprobe.scene_loader import load_scene

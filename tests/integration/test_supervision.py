@@ -18,7 +18,7 @@ from canprobe.cell.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Command
 from canprobe.cell.supervision import Reaction
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
@@ -284,7 +284,7 @@ def test_the_overrun_budget_makes_the_probe_retreat():
 
 def test_force_above_the_limit_makes_the_probe_retreat():
     def squeeze(run):
-        run.task._s = replace(run.task._s, target_force=4.0)
+        run.task.set_target("target_force_n", 4.0)
 
     run = Injected("press", HOLD_CYCLE, squeeze, limits={"force_max_n": 3.0})
     assert "above the limit of 3.00 N" in str(run.error)

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.studies import workprec_cell
 from canprobe.studies.study_files import as_document, text_of, write_study
 from canprobe.studies.workprec_cell import MEASURES, Case, Setting, default_of, findings, good, measure, run_cell

@@ -10,7 +10,7 @@ from canprobe.cell.build import make_task
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.limits import limits_of
 from canprobe.cell.measurement import Command
-from canprobe.cell.tasks.touch_settings import Phase
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import Fault
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import CanprobeError

@@ -1,30 +1,23 @@
-"""Plan → touch task: the scene's millimetres and degrees become SI here, once."""
+"""Plan → the tasks that touch."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.limits import limits_of, workspace_of
-from canprobe.cell.supervision import Limits
+from canprobe.cell.limits import limits_of
 from canprobe.cell.tasks.calibration import PAD_LAG, array_calibration
 from canprobe.cell.tasks.probe_motion import MotionBounds, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
 from canprobe.cell.tasks.shape import ROUND_S, ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
-from canprobe.cell.tasks.touch_settings import TouchSettings
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import ProbeSettings, Scene, ServoSettings, TaskSettings
-from canprobe.scene_geometry import T_flange_probe, scan_axes
+from canprobe.scene_setup import Calibrate, Probe, Setup, Touch
 from canprobe.touch.patch_image import MomentImage
-from canprobe.touch.servo import SurfaceGains
-from canprobe.touch.strategy import Strategy, make_strategy
 
 if TYPE_CHECKING:
     from canprobe.cell.tasks.calibrate import CalibrateTask
@@ -44,183 +37,121 @@ seeds 100 and 101 of saddle and sphere; `canprobe study pipeline` verifies with 
 SCANNING = 2.0
 """Variance of second moments on a pad that slides over changing curvature, over that of the presses that the patch was
 calibrated with: of scans of torus, bowl and wave (seed 0) with the patch alone 1.7, 1.5 and 1.0, rounded up."""
-CYCLES_TO_EFFECT = 2
 Vector = NDArray[np.float64]
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
 
 
-def make_touch_task(plan: Plan, period_s: float) -> TouchTask:
+def make_touch_task(plan: Plan, task: Touch) -> TouchTask:
     """The task of a ``scan`` or ``press`` scene."""
-    scene = plan.scene
-    sensing = make_sensing(scene)
+    sensing = make_sensing(task)
     return TouchTask(
-        _settings(scene, period_s, limits_of(plan)),
+        task,
+        limits_of(plan),
         sensing,
-        _motion(scene, sensing, period_s),
-        _strategy(scene.task),
-        make_shape_tracker(scene),
+        _motion(plan, sensing),
+        plan.sync.period_ns * 1e-9,
+        make_shape_tracker(plan.setup),
     )
 
 
-def _motion(scene: Scene, sensing: ContactSensing, period_s: float) -> Callable[[Vector], ProbeMotion]:
+def _motion(plan: Plan, sensing: ContactSensing) -> Callable[[Vector], ProbeMotion]:
     """What makes the probe's motion from the first joint angles."""
-    model, flange_probe = sensing.model, sensing.flange_probe
+    limits, model, flange_probe = plan.setup.limits, sensing.model, sensing.flange_probe
     bounds = MotionBounds(
-        margin=math.radians(scene.limits.joint_margin_deg),
-        speed_share=scene.limits.joint_speed_share,
-        workspace=workspace_of(scene.limits),
-        radius=sensing.radius,
+        margin=limits.joint_margin, speed_share=limits.speed_share, workspace=limits.workspace, radius=sensing.radius
     )
-    return lambda q: ProbeMotion(model, flange_probe, q, period_s, bounds)
+    return lambda q: ProbeMotion(model, flange_probe, q, plan.sync.period_ns * 1e-9, bounds)
 
 
-def make_calibrate_task(plan: Plan, period_s: float) -> CalibrateTask:
+def make_calibrate_task(plan: Plan, task: Calibrate) -> CalibrateTask:
     """The task of a ``calibrate`` scene."""
-    from canprobe.cell.tasks.calibrate import CalibrateTask, CalibrationSettings
-    from canprobe.robot.tool_calibration import BallModel
-    from canprobe.scene_ball import expected_ball, planned_approaches
+    from canprobe.cell.tasks.calibrate import CalibrateTask
 
-    scene = plan.scene
-    sensing = make_sensing(scene)
-    centre, radius = expected_ball(scene.task)
-    sensing.set_kappa(np.full(2, 1.0 / radius))
-    ball = BallModel(
-        sensing.flange_probe[:3, 3], centre, sensing.radius + radius, sigma_c=scene.task.ball_sigma_mm * 1e-3
-    )
-    settings = CalibrationSettings(
-        period_s=period_s,
-        limits=limits_of(plan),
-        force=scene.task.force_n,
-        approaches=planned_approaches(scene.task),
-        ball=ball,
-        clearance=scene.task.clearance_mm * 1e-3,
-        search=scene.task.search_mm * 1e-3,
-        approach_speed=scene.task.approach_mm_s * 1e-3,
-        lead_s=_lead_s(scene, period_s),
-    )
-    return CalibrateTask(settings, sensing, _motion(scene, sensing, period_s))
+    sensing = make_sensing(task)
+    return CalibrateTask(task, limits_of(plan), sensing, _motion(plan, sensing), plan.sync.period_ns * 1e-9)
 
 
-def _lead_s(scene: Scene, period_s: float) -> float:
-    """From a SYNC to the moment its command has taken effect, s."""
-    return CYCLES_TO_EFFECT * period_s + (scene.servo or ServoSettings()).drive_lag_ms * 1e-3
-
-
-def make_sensing(scene: Scene) -> ContactSensing:
-    """Contacts from measurements, as the scene's arm, probe and sensor give them."""
-    assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
-    calibration = array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3)
+def make_sensing(task: Touch | Calibrate) -> ContactSensing:
+    """Contacts from measurements, as the task's arm, probe and array give them."""
+    calibration = array_calibration(task.array.full_scale, task.probe.radius)
     return ContactSensing(
-        MODELS[scene.arm.model],
-        T_flange_probe(scene.probe),
+        task.arm.model,
+        task.probe.T_flange_probe,
         calibration,
-        scene.probe.radius_mm * 1e-3,
-        scene.probe.stiffness_n_m3,
-        moment_image=MomentImage(calibration) if _uses_patch(scene) else None,
+        task.probe.radius,
+        task.probe.stiffness,
+        moment_image=MomentImage(calibration) if isinstance(task, Touch) and _uses_patch(task) else None,
         lag=PAD_LAG,
     )
 
 
-def _settings(scene: Scene, period_s: float, limits: Limits) -> TouchSettings:
-    task, servo = scene.task, scene.servo or ServoSettings()
-    scanning = task.kind == "scan"
-    return TouchSettings(
-        period_s=period_s,
-        limits=limits,
-        target_force=task.force_n,
-        start=np.array(task.start_mm) * 1e-3,
-        axes=scan_axes(task),
-        duration_s=task.duration_s,
-        speed=task.speed_mm_s * 1e-3 if scanning else 0.0,
-        rolling_share=task.rolling_share if scanning else 0.0,
-        approach_speed=task.approach_mm_s * 1e-3,
-        clearance=task.clearance_mm * 1e-3,
-        search=task.search_mm * 1e-3,
-        lead_s=_lead_s(scene, period_s),
-        gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
-    )
-
-
-def _strategy(task: TaskSettings) -> Strategy | None:
-    if task.kind != "scan":
-        return None
-    return make_strategy(task.strategy, task.length_mm * 1e-3, task.width_mm * 1e-3, task.wavelength_mm * 1e-3)
-
-
-def centroid_coupling(probe: ProbeSettings) -> float:
+def centroid_coupling(probe: Probe) -> float:
     """`Noise.coupling` of contacts that the array on this probe feels, 1/m."""
-    return 1e3 / probe.radius_mm
+    return 1.0 / probe.radius
 
 
-def make_shape_estimator(scene: Scene, method: str) -> Estimator:
-    """An estimator as the scene sets it, by name."""
+def make_shape_estimator(task: Touch, method: str) -> Estimator:
+    """An estimator as a scan's setup has it, by name."""
     from canprobe.touch.estimators import make_estimator  # only where a shape is asked for
     from canprobe.touch.noise import Correlation
 
-    assert scene.shape is not None and scene.probe is not None and scene.sensor is not None
-    memory = scene.shape.memory_mm * 1e-3
-    window = max(8, round(memory / (scene.task.speed_mm_s * 1e-3) * scene.sensor.rate_hz))
+    assert task.shape is not None and task.scan is not None
+    memory = task.shape.memory
+    window = max(8, round(memory / task.scan.speed * task.array.rate_hz))
     estimator = make_estimator(
         method,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
-        probe_radius=scene.probe.radius_mm * 1e-3,
+        probe_radius=task.probe.radius,
         memory_m=memory,
         window=window,
         correlation=Correlation(*CORRELATION),
-        coupling=centroid_coupling(scene.probe),
+        coupling=centroid_coupling(task.probe),
     )
     if method not in WITH_PATCH:
         return estimator
     from canprobe.touch.estimators.following import FollowingEstimator
 
-    return FollowingEstimator(_with_patch(scene, estimator, memory) if _uses_patch(scene) else estimator, memory)
+    return FollowingEstimator(_with_patch(task, estimator, memory) if _uses_patch(task) else estimator, memory)
 
 
-def _with_patch(scene: Scene, estimator: Estimator, memory: float) -> Estimator:
+def _with_patch(task: Touch, estimator: Estimator, memory: float) -> Estimator:
     """The estimator with the contact patch as its second sensor."""
     from canprobe.cell.tasks.patch_fits import moment_model
     from canprobe.touch.estimators.patched import PatchedEstimator
     from canprobe.touch.patch_curvature import PatchCurvature
 
-    assert scene.probe is not None and scene.sensor is not None
     model = moment_model(
-        array_calibration(scene.sensor.full_scale_kpa * 1e3, scene.probe.radius_mm * 1e-3),
-        scene.probe.stiffness_n_m3,
-        windowed=scene.sensor.mode == "window" and int(scene.sensor.window) <= WINDOW,
+        array_calibration(task.array.full_scale, task.probe.radius),
+        task.probe.stiffness,
+        windowed=task.array.mode == "window" and int(task.array.window) <= WINDOW,
     )
     return PatchedEstimator(estimator, PatchCurvature(model, SCANNING), memory)
 
 
-def _uses_patch(scene: Scene) -> bool:
+def _uses_patch(task: Touch) -> bool:
     """Whether images are asked for curvature: features carry none."""
-    return (
-        scene.shape is not None and scene.shape.patch and scene.sensor is not None and scene.sensor.mode != "features"
-    )
+    return task.shape is not None and task.shape.patch and task.array.mode != "features"
 
 
-def samples_between_estimates(scene: Scene) -> int:
-    """Tactile samples between two answers of the estimator."""
-    assert scene.shape is not None and scene.sensor is not None
-    return max(1, round(scene.shape.every_ms * 1e-3 * scene.sensor.rate_hz))
-
-
-def make_shape_tracker(scene: Scene) -> ShapeTracker | None:
-    """The estimator of a scene that asks for a shape, None of one that does not."""
-    if scene.shape is None or scene.task.kind != "scan":
+def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
+    """The estimator of a setup that asks for a shape, None of one that does not."""
+    task = setup.task
+    if not isinstance(task, Touch) or task.shape is None:
         return None
-    rounds = max(1, round(1.0 / (scene.cycle.rate_hz * ROUND_S)))
-    return ShapeTracker(make_shape_estimator(scene, scene.shape.method), samples_between_estimates(scene), rounds)
+    samples = max(1, round(task.shape.every_s * task.array.rate_hz))
+    rounds = max(1, round(1.0 / (setup.rate_hz * ROUND_S)))
+    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, rounds)
 
 
-def estimates_of(scene: Scene, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
+def estimates_of(task: Touch, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
     """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
-    assert scene.shape is not None and scene.sensor is not None
-    every = max(1, round(0.1 * scene.sensor.rate_hz))
+    assert task.shape is not None
+    every = max(1, round(0.1 * task.array.rate_hz))
     return {
         method: tracker.records
-        if method == scene.shape.method
-        else replay_samples(make_shape_estimator(scene, method), tracker.samples, every)
+        if method == task.shape.method
+        else replay_samples(make_shape_estimator(task, method), tracker.samples, every)
         for method in dict.fromkeys(methods)
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,10 @@ from canprobe.cell.supervision import TOUCH_FORCE, Contact, Limits
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion
-from canprobe.cell.tasks.probing import ProbingTask
+from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.touch_settings import Phase
-from canprobe.robot.tool_calibration import BallApproach, BallModel, BallTouch, ToolEstimate, calibrate_tool
+from canprobe.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, calibrate_tool
+from canprobe.scene_setup import Calibrate
 from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.servo import ProbePose
@@ -33,40 +33,15 @@ MOVE_SPEED = 40e-3
 RETREAT_SPEED = 20e-3
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class CalibrationSettings:
-    """What a calibration does, in SI units.
-
-    Attributes:
-        period_s: of the cycle.
-        limits: of the cell.
-        force: at which the probe rests, N.
-        approaches: the touches.
-        ball: what is known of ball and tool.
-        clearance: above the ball before each approach, m.
-        search: beyond the ball's expected surface where an approach gives up, m.
-        approach_speed: m/s.
-        lead_s: from a SYNC to the moment its command has taken effect.
-    """
-
-    period_s: float
-    limits: Limits
-    force: float
-    approaches: Sequence[BallApproach]
-    ball: BallModel
-    clearance: float
-    search: float
-    approach_speed: float
-    lead_s: float
-
-
 class CalibrateTask(ProbingTask):
     """Touch after touch; the estimate in the end.
 
     Args:
-        settings: what to do.
-        sensing: contacts from measurements; knows the ball's curvature.
+        task: what to do.
+        limits: of the cell; beyond them the probe retreats and the cell stops.
+        sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
+        period_s: of the cycle.
 
     Attributes:
         touches: what was felt so far.
@@ -74,12 +49,20 @@ class CalibrateTask(ProbingTask):
     """
 
     def __init__(
-        self, settings: CalibrationSettings, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion]
+        self,
+        task: Calibrate,
+        limits: Limits,
+        sensing: ContactSensing,
+        motion_from: Callable[[Vector], ProbeMotion],
+        period_s: float,
     ) -> None:
-        super().__init__(sensing, motion_from, settings.period_s)
+        super().__init__(task.lag_s, limits, sensing, motion_from, period_s)
+        sensing.set_kappa(np.full(2, 1.0 / task.ball_radius))
+        radii = sensing.radius + task.ball_radius
+        self._ball = BallModel(sensing.flange_probe[:3, 3], task.ball_centre, radii, sigma_c=task.ball_sigma)
         self.touches: list[BallTouch] = []
         self.estimate: ToolEstimate | None = None
-        self._s = settings
+        self._task = task
         self._line: LineMotion | ArcMotion | None = None
         self._number = 0
         self._gone = 0.0
@@ -108,7 +91,7 @@ class CalibrateTask(ProbingTask):
 
     def stop(self) -> None:
         """Let go, and estimate from what was felt so far."""
-        self._number = len(self._s.approaches)
+        self._number = len(self._task.approaches)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
 
@@ -137,7 +120,7 @@ class CalibrateTask(ProbingTask):
             return
         hidden, off_pad = self._hidden.hidden_s, self._off_pad.hidden_s
         age = measurement.tactile_age
-        finding = touch_finding(Contact(self._s.limits, self._force, age, hidden_s=hidden, off_pad_s=off_pad))
+        finding = touch_finding(Contact(self._limits, self._force, age, hidden_s=hidden, off_pad_s=off_pad))
         if finding is not None:
             self.retreat(str(finding.error))
 
@@ -145,44 +128,46 @@ class CalibrateTask(ProbingTask):
 
     def _at(self, gap: float) -> ProbePose:
         """Probe at a distance from the expected ball, with this touch's direction and pole."""
-        touch = self._s.approaches[self._number]
-        return ProbePose(self._s.ball.c_base + (self._s.ball.radii + gap) * touch.n_base, touch.pole_base)
+        touch = self._task.approaches[self._number]
+        return ProbePose(self._ball.c_base + (self._ball.radii + gap) * touch.n_base, touch.pole_base)
 
     def _move_on(self) -> None:
         """To the next touch, round the ball; or to the end."""
         assert self._motion is not None
-        if self.reason is not None or self._number >= len(self._s.approaches):
+        if self.reason is not None or self._number >= len(self._task.approaches):
             if self.reason is None and len(self.touches) >= 2:
-                self.estimate = calibrate_tool(self._corrected(), self._s.ball)
+                self.estimate = calibrate_tool(self._corrected(), self._ball)
             return self._enter(Phase.DONE)
         self._push = PushFit()
-        self._line = ArcMotion(self._s.ball.c_base, self._motion.pose, self._at(self._s.clearance), MOVE_SPEED)
+        self._line = ArcMotion(
+            self._ball.c_base, self._motion.pose, self._at(self._task.approach.clearance), MOVE_SPEED
+        )
         self._enter(Phase.MOVE)
 
     def _move(self) -> ProbePose:
         assert self._line is not None
         pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._s.lead_s + 0.1:
+        if self._t >= self._line.duration + self._lead_s + 0.1:
             self._enter(Phase.APPROACH)
         return pose
 
     def _approach(self) -> ProbePose:
-        self._gone = self._s.approach_speed * self._t - self._s.clearance
+        self._gone = self._task.approach.speed * self._t - self._task.approach.clearance
         if self._force > TOUCH_FORCE:
             self._enter(Phase.SETTLE)
-        elif self._gone > self._s.search:
+        elif self._gone > self._task.approach.search:
             self.retreat(
-                f"touch {self._number + 1}: no ball found up to {self._s.search * 1e3:.0f} mm beyond the expected place"
+                f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected place"
             )
         return self._at(-self._gone)
 
     def _settle(self) -> ProbePose:
         """On, slowly, until the force is there."""
-        if self._force >= self._s.force:
+        if self._force >= self._task.force:
             self._felt = []
             self._enter(Phase.SCAN)
-        elif self._gone > self._s.search:
-            self.retreat(f"touch {self._number + 1}: {self._s.force:g} N are not reached where the ball is expected")
+        elif self._gone > self._task.approach.search:
+            self.retreat(f"touch {self._number + 1}: {self._task.force:g} N are not reached where the ball is expected")
         else:
             self._gone += PRESS_SPEED * self._dt
         return self._at(-self._gone)
@@ -211,7 +196,7 @@ class CalibrateTask(ProbingTask):
 
     def _pushed(self, centre: Vector) -> float:
         """Way of the probe's centre (3,), m, towards the ball along this touch's direction, from the ball's centre."""
-        return -float(self._s.approaches[self._number].n_base @ (centre - self._s.ball.c_base))
+        return -float(self._task.approaches[self._number].n_base @ (centre - self._ball.c_base))
 
     def _corrected(self) -> list[BallTouch]:
         """The touches with depths as the arm made them, from where the force began to where the probe rested.
@@ -226,15 +211,15 @@ class CalibrateTask(ProbingTask):
     def _let_go(self) -> None:
         assert self._motion is not None
         pose = self._motion.pose
-        n = pose.centre - self._s.ball.c_base
-        away = ProbePose(pose.centre + n / np.linalg.norm(n) * (self._s.clearance + 2e-3), pose.pole)
+        n = pose.centre - self._ball.c_base
+        away = ProbePose(pose.centre + n / np.linalg.norm(n) * (self._task.approach.clearance + 2e-3), pose.pole)
         self._line = LineMotion(pose, away, RETREAT_SPEED, at_once=True)
         self._enter(Phase.RETREAT)
 
     def _retreat(self) -> ProbePose:
         assert self._line is not None
         pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._s.lead_s:
+        if self._t >= self._line.duration + self._lead_s:
             self._move_on()
         return pose
 

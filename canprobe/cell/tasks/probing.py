@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from enum import IntEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,9 +11,9 @@ from numpy.typing import NDArray
 
 from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.measurement import Command, TactileSample
+from canprobe.cell.supervision import Limits
 from canprobe.cell.tasks.probe_motion import ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch import Patch
 from canprobe.touch.servo import ProbePose
@@ -21,14 +22,30 @@ if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
 
 Vector = NDArray[np.float64]
+CYCLES_TO_EFFECT = 2
+"""From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
+
+
+class Phase(IntEnum):
+    """Phases of a touch task, in their order; a scan that loses its contact goes to and fro between it and REGAIN."""
+
+    MOVE = 0
+    APPROACH = 1
+    SETTLE = 2
+    SCAN = 3
+    RETREAT = 4
+    DONE = 5
+    REGAIN = 6
 
 
 class ProbingTask:
     """Base of the tasks that touch.
 
     Args:
+        lag_s: of the drives behind a ramp.
+        limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
         period_s: of the cycle.
@@ -39,11 +56,20 @@ class ProbingTask:
         taxels: last image of the touch itself.
     """
 
-    def __init__(self, sensing: ContactSensing, motion_from: Callable[[Vector], ProbeMotion], period_s: float) -> None:
+    def __init__(
+        self,
+        lag_s: float,
+        limits: Limits,
+        sensing: ContactSensing,
+        motion_from: Callable[[Vector], ProbeMotion],
+        period_s: float,
+    ) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
+        self._limits = limits
+        self._lead_s = CYCLES_TO_EFFECT * period_s + lag_s
         self._motion_from = motion_from
         self._motion: ProbeMotion | None = None
         self._period_s = self._dt = period_s

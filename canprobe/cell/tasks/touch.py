@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.measurement import Command, Measurement
-from canprobe.cell.supervision import Contact, Reaction
+from canprobe.cell.supervision import TOUCH_FORCE, Contact, Limits, Reaction
 from canprobe.cell.supervisor import touch_finding
 from canprobe.cell.tasks.probe_motion import LineMotion, ProbeMotion, smooth_step
-from canprobe.cell.tasks.probing import ProbingTask
+from canprobe.cell.tasks.probing import Phase, ProbingTask
 from canprobe.cell.tasks.regain import REST_S, SPEED, Loss, Search
 from canprobe.cell.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.cell.tasks.shape import ShapeTracker
-from canprobe.cell.tasks.touch_settings import Phase, TouchSettings
+from canprobe.scene_setup import Touch
 from canprobe.touch.at_rest import AtRest
 from canprobe.touch.compliance import PushFit
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.servo import LocalSurface, ProbePose, TactileServo
-from canprobe.touch.strategy import PathFollower, Strategy
+from canprobe.touch.strategy import PathFollower
 
 if TYPE_CHECKING:
     from canprobe.touch.estimate import SurfaceEstimate
@@ -36,6 +35,12 @@ AT_REST = 0.7
 """Share of the settling time after which nothing is asked to change any more."""
 LOST = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
+RETREAT, RETREAT_SPEED = 6e-3, 20e-3
+"""Way off the object (m) and its speed (m/s)."""
+SETTLE_S = 0.5
+"""At rest in contact before the scan."""
+RAMP_S = 0.05
+"""To reach the scan's speed."""
 _LEAVING = (Phase.RETREAT, Phase.DONE)
 
 
@@ -43,27 +48,30 @@ class TouchTask(ProbingTask):
     """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
 
     Args:
-        settings: what to do.
+        task: what to do.
+        limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
-        strategy: path in the scan plane; None holds.
+        period_s: of the cycle.
         shape: the estimator in the loop; None where no shape is asked for.
     """
 
     def __init__(
         self,
-        settings: TouchSettings,
+        task: Touch,
+        limits: Limits,
         sensing: ContactSensing,
         motion_from: Callable[[Vector], ProbeMotion],
-        strategy: Strategy | None,
+        period_s: float,
         shape: ShapeTracker | None,
     ) -> None:
-        super().__init__(sensing, motion_from, settings.period_s)
+        super().__init__(task.lag_s, limits, sensing, motion_from, period_s)
         self.shape = shape
         self._scan_start: int | None = None
         self._scan_end: int | None = None
-        self._s = settings
-        self._strategy = strategy
+        self._task = task
+        self._target_force = task.force
+        self._speed = task.scan.speed if task.scan is not None else 0.0
         self._line: LineMotion | None = None
         self._servo: TactileServo | None = None
         self._cycle = 0
@@ -94,12 +102,14 @@ class TouchTask(ProbingTask):
     @property
     def targets(self) -> dict[str, float]:
         """What the servo aims at: `target_force_n` and `speed_m_s`."""
-        return {"target_force_n": self._s.target_force, "speed_m_s": self._s.speed}
+        return {"target_force_n": self._target_force, "speed_m_s": self._speed}
 
     def set_target(self, kind: str, value: float) -> None:
         """Change one of `targets`, by a small step: the servo follows at once."""
-        force, speed = (value, self._s.speed) if kind == "target_force_n" else (self._s.target_force, value)
-        self._s = replace(self._s, target_force=force, speed=speed)
+        if kind == "target_force_n":
+            self._target_force = value
+        else:
+            self._speed = value
 
     def stop(self) -> None:
         """Let go and be done, from whatever phase."""
@@ -113,7 +123,7 @@ class TouchTask(ProbingTask):
         if self._motion is None:
             assert measurement.q is not None
             self._motion = self._motion_from(measurement.q)
-            self._line = LineMotion(self._motion.pose, self._above(self._s.clearance), 30e-3)
+            self._line = LineMotion(self._motion.pose, self._above(self._task.approach.clearance), 30e-3)
         self._cycle = measurement.cycle
         self._pass_time(measurement.t_ns)
         self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None
@@ -142,7 +152,7 @@ class TouchTask(ProbingTask):
         self._hidden.add(not felt, measurement.tactile.t_sample_ns)
         if self.phase is Phase.SCAN:
             self.taxels = measurement.tactile.frame.taxels
-        touching = patch.force > self._s.touch_force / 2
+        touching = patch.force > TOUCH_FORCE / 2
         self._off_pad.add(touching and patch.off_pad, measurement.tactile.t_sample_ns)
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
         contact = self.sensing.contact(measurement.tactile, patch) if touching else None
@@ -151,12 +161,12 @@ class TouchTask(ProbingTask):
             contact = None
         self._contact = contact
         if contact is not None and self._servo is not None:
-            elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._s.period_s
+            elapsed = contact.t_s - self._sample_t if self._sample_t is not None else 2 * self._period_s
             self._servo.surface.correct(contact.p_base, contact.n_base, min(elapsed, LONGEST_GAP_S))
             self._sample_t = contact.t_s
             if self.phase is Phase.SETTLE:
                 self._feel_stiffness(contact)
-                if self._t > AT_REST * self._s.settle_s:
+                if self._t > AT_REST * SETTLE_S:
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
@@ -208,13 +218,13 @@ class TouchTask(ProbingTask):
         self._lost = self._lost + self._dt if self._force < self._least_force() else 0.0
         finding = touch_finding(
             Contact(
-                self._s.limits,
+                self._limits,
                 self._force,
                 measurement.tactile_age,
                 self._lost,
                 hidden_s=self._hidden.hidden_s,
                 off_pad_s=self._off_pad.hidden_s,
-                path=self._s.speed > 0 and self._scan_start is not None,
+                path=self._speed > 0 and self._scan_start is not None,
                 searched=self.losses[-1].searched if self._search is not None else 0.0,
             )
         )
@@ -228,9 +238,9 @@ class TouchTask(ProbingTask):
     def _least_force(self) -> float:
         """The force below which the contact is lost, N; an array that has let go shows a tenth of it for a while."""
         if self.phase is Phase.SCAN:
-            return max(self._s.touch_force / 2, LOST * self._s.target_force)
+            return max(TOUCH_FORCE / 2, LOST * self._target_force)
         resting = self.phase is Phase.SETTLE or (self.phase is Phase.REGAIN and self._search is None)
-        return self._s.touch_force / 2 if resting else 0.0
+        return TOUCH_FORCE / 2 if resting else 0.0
 
     def retreat(self, reason: str) -> None:
         """Let go for a reason that the cell has; nothing changes where the task is letting go already."""
@@ -244,41 +254,42 @@ class TouchTask(ProbingTask):
             self._scan_end = self._cycle
         self.reason = reason
         pose = self._motion.pose
-        away = ProbePose(pose.centre - pose.pole * self._s.retreat, pose.pole)
-        self._line = LineMotion(pose, away, self._s.retreat_speed, at_once=True)
+        away = ProbePose(pose.centre - pose.pole * RETREAT, pose.pole)
+        self._line = LineMotion(pose, away, RETREAT_SPEED, at_once=True)
         self._enter(Phase.RETREAT)
 
     # phases: each returns the pose for this cycle
 
     def _above(self, distance: float) -> ProbePose:
-        up = self._s.axes[2]
-        return ProbePose(self._s.start + up * (self.sensing.radius + distance), -up)
+        up = self._task.approach.axes[2]
+        return ProbePose(self._task.approach.start + up * (self.sensing.radius + distance), -up)
 
     def _move(self) -> ProbePose:
         assert self._line is not None
         pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._s.lead_s + 0.1:
+        if self._t >= self._line.duration + self._lead_s + 0.1:
             self._enter(Phase.APPROACH)
         return pose
 
     def _approach(self) -> ProbePose:
-        distance = self._s.clearance - self._s.approach_speed * self._t
+        distance = self._task.approach.clearance - self._task.approach.speed * self._t
         pose = self._above(distance)
-        if self._contact is not None and self._force > self._s.touch_force:
+        if self._contact is not None and self._force > TOUCH_FORCE:
             self._touch_down(self._contact, pose)
-        elif distance < -self._s.search:
-            self._leave(f"no object found up to {self._s.search * 1e3:.0f} mm beyond the expected point")
+        elif distance < -self._task.approach.search:
+            self._leave(f"no object found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected point")
         return pose
 
     def _touch_down(self, contact: ContactSample, pose: ProbePose) -> None:
-        surface = LocalSurface(contact.p_base, contact.n_base, self._s.gains)
+        scan = self._task.scan
+        surface = LocalSurface(contact.p_base, contact.n_base, self._task.gains)
         self._servo = TactileServo(
             surface,
-            PathFollower(self._strategy) if self._strategy is not None else None,
-            axes=self._s.axes,
+            PathFollower(scan.strategy) if scan is not None else None,
+            axes=self._task.approach.axes,
             origin=contact.p_base,
             probe_radius=self.sensing.radius,
-            rolling_share=self._s.rolling_share,
+            rolling_share=scan.rolling_share if scan is not None else 0.0,
         )
         self._sink_from(contact, pose)
         self._enter(Phase.SETTLE)
@@ -297,23 +308,23 @@ class TouchTask(ProbingTask):
         return ProbePose(pose.centre, pole / np.linalg.norm(pole))
 
     def _target_depth(self) -> float:
-        return self.sensing.depth(self._s.target_force)
+        return self.sensing.depth(self._target_force)
 
     def _settle(self) -> ProbePose:
-        pose = self._sink(smooth_step(self._t / (0.6 * self._s.settle_s)))
-        if self._t >= self._s.settle_s:
+        pose = self._sink(smooth_step(self._t / (0.6 * SETTLE_S)))
+        if self._t >= SETTLE_S:
             self._enter(Phase.SCAN)
             self._scan_start = self._cycle
-            doubt = self._at_rest.doubt(self._s.target_force, self._push.certain(CERTAIN))
+            doubt = self._at_rest.doubt(self._target_force, self._push.certain(CERTAIN))
             if doubt is not None:
                 self._leave(doubt)
         return pose
 
     def _scan(self) -> ProbePose:
         assert self._servo is not None
-        left = self._s.duration_s - self._scan_t
-        share = min(1.0, self._t / self._s.ramp_s, max(left, 0.0) / self._s.ramp_s)
-        pose = self._servo.step(self._s.speed * share, self._target_depth(), self._dt)
+        left = self._task.duration_s - self._scan_t
+        share = min(1.0, self._t / RAMP_S, max(left, 0.0) / RAMP_S)
+        pose = self._servo.step(self._speed * share, self._target_depth(), self._dt)
         if self._asked is not None:
             self._velocity = (pose.centre - self._asked.centre) / self._dt
         self._asked = pose
@@ -335,7 +346,7 @@ class TouchTask(ProbingTask):
 
     def _regain(self) -> ProbePose:
         assert self._servo is not None
-        if self._scan_t >= self._s.duration_s:
+        if self._scan_t >= self._task.duration_s:
             self._leave(None)
         if self._search is None:
             if self._t >= REST_S:
@@ -343,8 +354,8 @@ class TouchTask(ProbingTask):
             return self._sink(smooth_step(self._t / (0.6 * REST_S)))
         pose, loss = self._search.pose(self._t), self.losses[-1]
         loss.searched = self._searched_before + SPEED * self._t
-        if self._contact is not None and self._force > self._s.touch_force + self._floor:
-            loss.regained_s = (self._cycle - loss.cycle) * self._s.period_s
+        if self._contact is not None and self._force > TOUCH_FORCE + self._floor:
+            loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)
             self._sink_from(self._contact, pose)
             self._search = None
@@ -354,7 +365,7 @@ class TouchTask(ProbingTask):
     def _retreat(self) -> ProbePose:
         assert self._line is not None
         pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._s.lead_s:
+        if self._t >= self._line.duration + self._lead_s:
             self._enter(Phase.DONE)
         return pose
 
