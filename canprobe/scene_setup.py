@@ -26,9 +26,9 @@ from canprobe.scene import (
     BridgeSettings,
     BringUpSettings,
     BusSettings,
-    Fidelity,
     ShapeMethod,
     TactileModeName,
+    TaskKind,
 )
 from canprobe.touch.objects import PlacedShape
 from canprobe.touch.servo import SurfaceGains
@@ -39,7 +39,7 @@ Bus = BusSettings
 BringUp = BringUpSettings
 Bridges = BridgeSettings
 ArrayMode = TactileModeName
-TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
+Fidelity = Literal["ideal", "dynamic"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,15 +301,17 @@ class Dynamics:
         torque_limit_permille: of the continuous torque.
         integrator: a key of the plant's integrators.
         step_ns: its longest step.
+        hold_ns: how long mass matrix, bias and contact geometry are held.
     """
 
-    payload: float
-    friction: float
-    integral_s: float
-    velocity_feed_forward: float
-    torque_limit_permille: int
-    integrator: str
-    step_ns: int
+    payload: float = 0.3
+    friction: float = 0.3
+    integral_s: float = 0.02
+    velocity_feed_forward: float = 0.0
+    torque_limit_permille: int = 2000
+    integrator: str = "rosenbrock"
+    step_ns: int = 625_000
+    hold_ns: int = 2_500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,7 @@ from canprobe.protocol.cia402 import state_of
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
-from canprobe.robot.puma260 import MODELS, counts_to_joints
+from canprobe.robot.puma260 import counts_to_joints
 
 SECOND_NS = 1_000_000_000
 CLASSIC_BYTES = 8
@@ -98,7 +98,7 @@ class Monitor:
         roles = {node.node_id: node.role for node in plan.nodes} | {MASTER_NODE_ID: "master"}
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
         arm = plan.setup.arm
-        self._model = MODELS[arm.model] if arm is not None else None
+        self._model = arm.model if arm is not None else None
         axes = enumerate(arm.node_ids if arm is not None else ())
         self._feedback = {plan.pdos_of(n, "tpdo")[0].cob_id: (i, n, plan.pdos_of(n, "tpdo")[0].layout) for i, n in axes}
         self._counts: list[int | None] = [None] * 6

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.emulator.plant.config import DynamicSettings
 from canprobe.emulator.plant.dynamic_arm import Stepping
+from canprobe.scene_setup import Dynamics
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -165,8 +165,8 @@ def verdict(row: dict[str, Any]) -> str:
 
 def default_choice() -> dict[str, Any]:
     """What the dynamic plant does by default."""
-    settings = DynamicSettings()
-    return {"held": True, "method": settings.method, "step_us": settings.step_ns / 1000.0}
+    settings = Dynamics()
+    return {"held": True, "method": settings.integrator, "step_us": settings.step_ns / 1000.0}
 
 
 def knee(rows: Sequence[dict[str, Any]], stiffness: float) -> dict[str, Any] | None:

@@ -45,14 +45,7 @@ WITH_PATCH = ("recursive", "ml")
 def make_touch_task(plan: Plan, task: Touch) -> TouchTask:
     """The task of a ``scan`` or ``press`` scene."""
     sensing = make_sensing(task)
-    return TouchTask(
-        task,
-        limits_of(plan),
-        sensing,
-        _motion(plan, sensing),
-        plan.sync.period_ns * 1e-9,
-        make_shape_tracker(plan.setup),
-    )
+    return TouchTask(task, limits_of(plan), sensing, _motion(plan, sensing), make_shape_tracker(plan.setup))
 
 
 def _motion(plan: Plan, sensing: ContactSensing) -> Callable[[Vector], ProbeMotion]:
@@ -69,7 +62,7 @@ def make_calibrate_task(plan: Plan, task: Calibrate) -> CalibrateTask:
     from canprobe.cell.tasks.calibrate import CalibrateTask
 
     sensing = make_sensing(task)
-    return CalibrateTask(task, limits_of(plan), sensing, _motion(plan, sensing), plan.sync.period_ns * 1e-9)
+    return CalibrateTask(task, limits_of(plan), sensing, _motion(plan, sensing))
 
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:

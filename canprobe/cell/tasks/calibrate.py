@@ -41,7 +41,6 @@ class CalibrateTask(ProbingTask):
         limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
-        period_s: of the cycle.
 
     Attributes:
         touches: what was felt so far.
@@ -54,9 +53,8 @@ class CalibrateTask(ProbingTask):
         limits: Limits,
         sensing: ContactSensing,
         motion_from: Callable[[Vector], ProbeMotion],
-        period_s: float,
     ) -> None:
-        super().__init__(task.lag_s, limits, sensing, motion_from, period_s)
+        super().__init__(task.lag_s, limits, sensing, motion_from)
         sensing.set_kappa(np.full(2, 1.0 / task.ball_radius))
         radii = sensing.radius + task.ball_radius
         self._ball = BallModel(sensing.flange_probe[:3, 3], task.ball_centre, radii, sigma_c=task.ball_sigma)
@@ -157,7 +155,8 @@ class CalibrateTask(ProbingTask):
             self._enter(Phase.SETTLE)
         elif self._gone > self._task.approach.search:
             self.retreat(
-                f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected place"
+                f"touch {self._number + 1}: no ball found up to {self._task.approach.search * 1e3:.0f} mm beyond the"
+                " expected place"
             )
         return self._at(-self._gone)
 

@@ -48,7 +48,6 @@ class ProbingTask:
         limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
-        period_s: of the cycle.
 
     Attributes:
         phase: what it is about.
@@ -62,13 +61,13 @@ class ProbingTask:
         limits: Limits,
         sensing: ContactSensing,
         motion_from: Callable[[Vector], ProbeMotion],
-        period_s: float,
     ) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
         self._limits = limits
+        period_s = limits.period_ns * 1e-9
         self._lead_s = CYCLES_TO_EFFECT * period_s + lag_s
         self._motion_from = motion_from
         self._motion: ProbeMotion | None = None

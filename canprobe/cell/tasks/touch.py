@@ -52,7 +52,6 @@ class TouchTask(ProbingTask):
         limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
         motion_from: makes the probe's motion from the first joint angles.
-        period_s: of the cycle.
         shape: the estimator in the loop; None where no shape is asked for.
     """
 
@@ -62,10 +61,9 @@ class TouchTask(ProbingTask):
         limits: Limits,
         sensing: ContactSensing,
         motion_from: Callable[[Vector], ProbeMotion],
-        period_s: float,
         shape: ShapeTracker | None,
     ) -> None:
-        super().__init__(task.lag_s, limits, sensing, motion_from, period_s)
+        super().__init__(task.lag_s, limits, sensing, motion_from)
         self.shape = shape
         self._scan_start: int | None = None
         self._scan_end: int | None = None

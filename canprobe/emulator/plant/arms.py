@@ -26,7 +26,7 @@ def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
     from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping
 
     d = config.dynamics
-    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.method, d.step_ns, d.hold_ns))
+    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
 
 
 def make_equations(config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> ArmEquations:
@@ -47,8 +47,8 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
 
     assert config.model is not None
     d, effects = config.dynamics, effects or Effects()
-    ball = ball_inertia(d.payload_kg, config.radius_m)
-    links = puma260_inertia(config.model).with_payload(d.payload_kg, config.T_flange_probe_centre, ball)
+    ball = ball_inertia(d.payload, config.radius_m)
+    links = puma260_inertia(config.model).with_payload(d.payload, config.T_flange_probe_centre, ball)
     body = RigidBody(config.model, links)
     back = joints_per_motor()
     inertia = np.array(REFLECTED_INERTIA)

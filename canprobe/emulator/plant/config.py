@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.robot.kinematics import tool_z_offset
 from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel
+from canprobe.scene_setup import Dynamics, Fidelity
 from canprobe.touch.objects import ObjectShape
-
-Fidelity = Literal["ideal", "dynamic"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,31 +26,6 @@ class PressMotion:
     force_n: float = 2.0
     swing: float = 0.4
     frequency_hz: float = 0.5
-
-
-@dataclass(frozen=True, slots=True)
-class DynamicSettings:
-    """A dynamic arm beyond its geometry.
-
-    Args:
-        payload_kg: mass of the probe, a ball.
-        friction: Coulomb coefficient between probe and object.
-        integral_s: reset time of the velocity loops; 0 for none.
-        velocity_feed_forward: share of the reference's speed that the drives add; 1 removes their lag.
-        torque_limit_permille: of the continuous torque.
-        method: a key of ``integrators.STEPS``.
-        step_ns: longest step of it.
-        hold_ns: how long mass matrix, bias and contact geometry are held.
-    """
-
-    payload_kg: float = 0.3
-    friction: float = 0.3
-    integral_s: float = 0.02
-    velocity_feed_forward: float = 0.0
-    torque_limit_permille: int = 2000
-    method: str = "rosenbrock"
-    step_ns: int = 625_000
-    hold_ns: int = 2_500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,5 +64,5 @@ class PlantConfig:
     press: PressMotion = PressMotion()
     seed: int = 0
     fidelity: Fidelity = "ideal"
-    dynamics: DynamicSettings = DynamicSettings()
+    dynamics: Dynamics = field(default_factory=Dynamics)
     base_offset_m: Array = field(default_factory=lambda: np.zeros(3))

@@ -7,7 +7,8 @@ import pytest
 
 from canprobe.emulator.plant.arm import IdealArm
 from canprobe.emulator.plant.arms import make_arm, make_equations
-from canprobe.emulator.plant.config import DynamicSettings, PlantConfig
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.scene_setup import Dynamics
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping
 from canprobe.emulator.plant.equations import Effects
 from canprobe.emulator.plant.held_step import held_rosenbrock2
@@ -31,7 +32,7 @@ NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, co
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=DynamicSettings(**dynamics))
+    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=Dynamics(**dynamics))
 
 
 def state(arm):

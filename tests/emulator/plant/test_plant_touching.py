@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from canprobe.emulator.plant.arms import make_equations
-from canprobe.emulator.plant.config import DynamicSettings, PlantConfig
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.scene_setup import Dynamics
 from canprobe.emulator.plant.contact import elastic_contact
 from canprobe.emulator.plant.equations import Effects
 from canprobe.emulator.plant.field import SIDE
@@ -113,7 +114,7 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
     q0 = start_posture(UPENN, point, (0, 0, 1), radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
-    settings = DynamicSettings(friction=friction)
+    settings = Dynamics(friction=friction)
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, **config)
 
 
