@@ -9,6 +9,7 @@ from canprobe.errors import UsageError
 from canprobe.planning import make_plan
 from canprobe.planning.model import Plan
 from canprobe.scene_loader import dump_scene, parse_scene
+from canprobe.scene_resolve import resolve
 
 KINDS = ("start", "stop", "target_force_n", "speed_m_s")
 
@@ -34,7 +35,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
         return f"expected a number, got {value}"
     changed = replace(task, force_n=value) if kind == "target_force_n" else replace(task, speed_mm_s=value * 1e3)
     try:
-        make_plan(parse_scene(dump_scene(replace(plan.scene, task=changed))))
+        make_plan(resolve(parse_scene(dump_scene(replace(plan.scene, task=changed)))))
     except UsageError as error:
         return str(error).splitlines()[0].removeprefix("scene: ")
     return None

@@ -14,13 +14,11 @@ from canprobe.bus.port import EFF_FLAG, RTR_FLAG, TimedFrame
 from canprobe.cell.measurement import Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.tasks.calibration import array_calibration
-from canprobe.cell.tasks.sensing import ContactSensing, patch_of
 from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.tasks.sensing import ContactSensing, patch_of
 from canprobe.planning.model import Plan
 from canprobe.robot.kinematics import forward
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene
-from canprobe.scene_geometry import T_flange_probe
+from canprobe.scene_setup import Setup, Touch
 from canprobe.touch.contact import ContactSample, pad_to_direction
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.patch import Patch
@@ -37,16 +35,13 @@ class SampleSource:
     """
 
     def __init__(self, plan: Plan) -> None:
-        scene = plan.scene
+        arm, array, probe = plan.setup.arm, plan.setup.array, plan.setup.probe
         self._health = Health(plan)
-        self._sensing = _sensing(scene)
-        self._model = MODELS[scene.arm.model] if scene.arm is not None else None
-        self._T_flange_probe = T_flange_probe(scene.probe) if scene.probe is not None else None
-        sensor, probe = scene.sensor, scene.probe
-        self._radius = probe.radius_mm * 1e-3 if probe is not None else 0.0
-        self._calibration = (
-            array_calibration(sensor.full_scale_kpa * 1e3, self._radius) if sensor and probe is not None else None
-        )
+        self._sensing = _sensing(plan.setup)
+        self._model = arm.model if arm is not None else None
+        self._T_flange_probe = probe.T_flange_probe if plan.setup.scene.probe is not None else None
+        self._radius = probe.radius
+        self._calibration = array_calibration(array.full_scale, probe.radius) if array is not None else None
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
@@ -107,13 +102,14 @@ class SampleSource:
             self._sensing.set_kappa(np.array([high, low]))
 
 
-def _sensing(scene: Scene) -> ContactSensing | None:
+def _sensing(setup: Setup) -> ContactSensing | None:
     """Contacts, where there is an arm to place them; second moments are the estimator's business."""
     from canprobe.cell.tasks.build import make_sensing
 
-    if scene.arm is None or scene.sensor is None or scene.probe is None:
+    touch = setup.touch
+    if touch is None:
         return None
-    return make_sensing(replace(scene, shape=None))
+    return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
 
 
 def _frame(frame: TimedFrame) -> CanFrame:

@@ -26,6 +26,7 @@ from canprobe.planning import make_plan
 from canprobe.planning.bridges import BRIDGES
 from canprobe.scene import BridgeSettings
 from canprobe.scene_loader import parse_scene
+from canprobe.scene_resolve import resolve
 
 NICE = 10
 """Whatever a bridge computes, the cell and its nodes come first."""
@@ -67,7 +68,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
 
 
 def _context(config: dict[str, Any], send: Any) -> Context:
-    plan = make_plan(parse_scene(config["scene"]))
+    plan = make_plan(resolve(parse_scene(config["scene"])))
     out = Path(config["out"]) if config["out"] is not None else None
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
 

@@ -28,7 +28,7 @@ _EXPORTS = {
     "load_scene": ("canprobe.scene_loader", "load_scene"),
     "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
     "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
-    "plan": ("canprobe.planning", "make_plan"),
+    "plan": ("canprobe.api", "plan"),
     "run": ("canprobe.api", "run"),
     "load_table": ("canprobe.tables", "load_table"),
     "open_cell": ("canprobe.api", "open_cell"),

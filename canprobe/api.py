@@ -23,6 +23,7 @@ from canprobe.note_report import news_teller, telling_notes
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, log_columns, summarise, write_files
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 from canprobe.session_bus import open_ports
 
@@ -102,7 +103,7 @@ def run(
         bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
-    plan = make_plan(resolved)
+    plan = make_plan(resolve(resolved))
     controller = make_task(plan)
     failure: BaseException | None = None
     with Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges:
@@ -144,6 +145,16 @@ class _Hold:
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
     """Where :func:`run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
     return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
+
+
+def plan(scene: Scene) -> Plan:
+    """Everything that follows from a scene before anything is started; see :func:`canprobe.planning.make_plan`.
+
+    Raises:
+        UsageError: this is no scene.
+        PlanError: with every reason why it does not fit, its numbers and the ways out.
+    """
+    return make_plan(resolve(scene))
 
 
 def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement], None]:
@@ -190,7 +201,7 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
         return {}
     from canprobe.cell.tasks.build import estimates_of
 
-    return estimates_of(scene, tracker, (scene.shape.method, *scene.shape.also))
+    return estimates_of(resolve(scene), tracker, (scene.shape.method, *scene.shape.also))
 
 
 def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
@@ -266,7 +277,7 @@ def open_cell(
         bridge=bridge,
     )
     folder = Path(out) if out is not None else None
-    plan = make_plan(resolved)
+    plan = make_plan(resolve(resolved))
     with (
         Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
         Session(plan, folder, say, (*observers, *bridges.observers), rows_kept) as session,
@@ -294,7 +305,7 @@ def up(
     resolved = resolve_scene(
         scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
     )
-    plan = make_plan(resolved)
+    plan = make_plan(resolve(resolved))
     check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
@@ -352,7 +363,7 @@ def commission(
     hush_canopen()
     wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
     if scene is not None:
-        wanted = wanted_by(make_plan(resolve_scene(scene, interface=interface)))
+        wanted = wanted_by(make_plan(resolve(resolve_scene(scene, interface=interface))))
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
         return commission(port, wanted, must=scene is None, store=store)
@@ -391,7 +402,7 @@ def monitor(
     )
     if resolved.bus.interface == LOCKSTEP:
         raise UsageError("monitor: a lockstep bus lives inside one run; name a real interface with --bus")
-    plan, clock = make_plan(resolved), MonotonicClock()
+    plan, clock = make_plan(resolve(resolved)), MonotonicClock()
     with open_ports(plan, clock) as ports:
         listener = Monitor(plan)
         start_ns = next_ns = clock.now_ns()

@@ -57,11 +57,12 @@ def emulate(
     """
     from canprobe.emulator.build import make_world
     from canprobe.planning import make_plan
+    from canprobe.scene_resolve import resolve
 
     split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
     name = None if split else channel
     resolved = resolve_scene(scene, interface=interface, channel=name, bitrate=bitrate, seed=seed)
-    plan = make_plan(resolved)
+    plan = make_plan(resolve(resolved))
     fast = data_bitrate(plan.scene.bus)
     way_out = "end that node, or name others with --nodes"
     busy = tuple(node_id for node_id in node_ids if node_id not in without_id)

@@ -10,6 +10,7 @@ from canprobe.errors import NodeError, UsageError
 from canprobe.link_report import check_links
 from canprobe.planning import make_plan
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import Say, Session, quiet, resolve_scene
 
 if TYPE_CHECKING:
@@ -52,7 +53,9 @@ def check_joints(
     from canprobe.robot.puma260 import MODELS
 
     plan = make_plan(
-        resolve_scene(scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate)
+        resolve(
+            resolve_scene(scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate)
+        )
     )
     check_links(plan, say)
     check = JointCheck(MODELS[scene.arm.model], limits_of(plan), plan.sync.period_ns * 1e-9, operator)

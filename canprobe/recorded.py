@@ -21,6 +21,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.recorded_summary import estimate_columns, replay_text, summarise_replay
 from canprobe.scene import Scene
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP
 from canprobe.touch.estimators import METHODS, unknown_method
 
@@ -76,7 +77,7 @@ def replay(
             SYNC, or no contact at all.
     """
     path, folder = find_log(Path(log))
-    plan = make_plan(scene_of(path, folder, scene))
+    plan = make_plan(resolve(scene_of(path, folder, scene)))
     methods = _methods(plan.scene, method)
     as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
     recording = read_recording(path, plan, as_taken=as_taken)
@@ -91,7 +92,7 @@ def replay(
         raise UsageError(f"{path}: on {recording.channel}: {error}") from error
     if not tracker.samples:
         raise UsageError(f"{path}: nothing was touched in this log: no contact to estimate from")
-    estimates = estimates_of(plan.scene, tracker, methods)
+    estimates = estimates_of(plan.setup, tracker, methods)
     summary = summarise_replay(
         plan, recording, cycles, task, tracker=tracker, unplaced=unplaced, estimates=estimates, folder=folder
     )

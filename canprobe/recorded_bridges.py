@@ -26,6 +26,7 @@ from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.recorded import ReplayResult, find_log, replay, scene_of
 from canprobe.scene import BridgeSettings, Scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP, Say
 from canprobe.touch.estimate import SurfaceEstimate
 
@@ -69,7 +70,7 @@ def replay_into(
     path, folder = find_log(Path(log))
     check_bridges(bridge)
     resolved = _only(scene_of(path, folder, scene), bridge)
-    plan = make_plan(resolved)
+    plan = make_plan(resolve(resolved))
     estimated = method is not None or (resolved.shape is not None and resolved.task.kind == "scan")
     result = replay(log, scene=resolved, method=method) if estimated else None
     observations = _Observations(plan, path, folder, result)

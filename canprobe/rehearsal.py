@@ -13,6 +13,7 @@ from canprobe.cell.build import make_task
 from canprobe.errors import CanprobeError
 from canprobe.planning import Plan
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP, Session
 
 REHEARSED_S = 0.3
@@ -28,7 +29,10 @@ def rehearse(plan: Plan) -> None:
     Args:
         plan: what is about to run on a real bus.
     """
-    with contextlib.suppress(CanprobeError), Session(replace(plan, scene=shortened(plan.scene))) as session:
+    with (
+        contextlib.suppress(CanprobeError),
+        Session(replace(plan, setup=resolve(shortened(plan.scene)), choices=())) as session,
+    ):
         session.run(make_task(session.plan))
 
 

@@ -19,6 +19,7 @@ from canprobe.errors import UsageError
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 from canprobe.scene_tool import FILE, calibration_lines, summarise_calibration, tool_text
 from canprobe.scene_writer import dump_scene
 from canprobe.session import LOCKSTEP, Session
@@ -290,7 +291,7 @@ def _bound_ratio(
         memory_m=shape.memory_mm * 1e-3,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
-        coupling=0.0 if scene.probe is None else centroid_coupling(scene.probe),
+        coupling=centroid_coupling(resolve(scene).probe),
     )
     return None if bound is None else score.kappa_rms / bound
 

@@ -64,6 +64,7 @@ def resolve(scene: Scene) -> Setup:
     settings = scene.probe or ProbeSettings()
     probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
     return Setup(
+        scene=scene,
         name=scene.name,
         title=scene.title,
         seed=scene.seed,

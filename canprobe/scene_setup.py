@@ -26,6 +26,7 @@ from canprobe.scene import (
     BridgeSettings,
     BringUpSettings,
     BusSettings,
+    Scene,
     ShapeMethod,
     TactileModeName,
     TaskKind,
@@ -350,6 +351,7 @@ class Setup:
     """One experiment, whole.
 
     Attributes:
+        scene: the user's words, for who writes, sends or changes them. Nobody who plans, drives or emulates reads it.
         name, title, seed: of the scene.
         figures: whether its run is drawn.
         bus: interface, channel, bit rates and what a lockstep bus is like.
@@ -360,6 +362,7 @@ class Setup:
         truth: what is really there.
     """
 
+    scene: Scene
     name: str
     title: str
     seed: int

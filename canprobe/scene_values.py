@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import tomllib
 import typing
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, TypeVar
 
@@ -41,6 +43,20 @@ def with_values(section: _Section, **values: object) -> _Section:
     annotations = typing.get_type_hints(type(section), include_extras=True)
     changes = {key: _checked(key, value, annotations[key]) for key, value in given.items()}
     return replace(section, **changes)  # type: ignore[type-var]  # a dataclass, as all sections are
+
+
+def with_choices(scene: Scene, choices: Mapping[str, str]) -> Scene:
+    """A scene with what was chosen in the place of its "auto".
+
+    Args:
+        scene: with open keys.
+        choices: value by key path, as a scene file writes it: `{"sensor.mode": '"window"'}`.
+    """
+    for path, text in choices.items():
+        section, _, key = path.partition(".")
+        value = tomllib.loads(f"value = {text}")["value"]
+        scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
+    return scene
 
 
 def _checked(key: str, value: object, annotation: Any) -> Any:

@@ -34,6 +34,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import BridgeSettings, Scene
+from canprobe.scene_resolve import resolve
 from canprobe.scene_values import need_scene, with_values
 from canprobe.scene_writer import dump_scene
 from canprobe.session_bus import Sink, TrafficCounter, channel_routes, lockstep_bus, open_ports
@@ -120,7 +121,7 @@ class Session:
         rows_kept: int | None = None,
     ) -> None:
         self._rows_kept = rows_kept
-        self.plan = scene if isinstance(scene, Plan) else make_plan(scene)
+        self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
         self.scene = self.plan.scene
         self.out = out
         self.started_ns = 0

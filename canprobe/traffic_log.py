@@ -12,6 +12,7 @@ from canprobe.planning import Plan, make_plan
 from canprobe.planning.measured import MeasuredTraffic
 from canprobe.planning.traffic_meter import TrafficMeter
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 
 LOG = "bus.log"
 
@@ -36,7 +37,7 @@ def measure_traffic(
         PlanError: the scene does not fit its bus.
     """
     path = Path(log) / LOG if Path(log).is_dir() else Path(log)
-    plan = scene if isinstance(scene, Plan) else make_plan(scene)
+    plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
     meters: dict[str, TrafficMeter] = {}
     syncs: Counter[str] = Counter()
     for t_ns, name, can_id, data in read_candump(path):

@@ -12,6 +12,7 @@ from canprobe.cell.build import make_tactile
 from canprobe.planning import make_plan
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.scene import Scene
+from canprobe.scene_resolve import resolve
 
 TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
 
@@ -32,7 +33,7 @@ def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
     assert scene.sensor is not None
     if scene.sensor.mode == "features" or not file.is_file():
         return ()
-    receiver = make_tactile(make_plan(scene))
+    receiver = make_tactile(make_plan(resolve(scene)))
     assert receiver is not None
     start: int | None = None
     frames = []

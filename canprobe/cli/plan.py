@@ -70,15 +70,17 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.planning.export import refused_dict
     from canprobe.planning.open_keys import opened
     from canprobe.scene_loader import load_scene
+    from canprobe.scene_resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
     scene = load_scene(args.scene)
     try:
-        plan = make_plan(opened(scene) if args.auto else scene)
+        setup = resolve(scene)
+        plan = make_plan(opened(setup) if args.auto else setup)
     except PlanError as error:
         if args.json:
-            print_json(refused_dict(scene, error.problems, error.ways_out))
+            print_json(refused_dict(scene.name, error.problems, error.ways_out))
         raise
     if args.measured is not None:
         return _compare(plan, args.measured, args.json)

@@ -7,7 +7,9 @@ from typing import Any, Literal
 
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.scene import Scene
 from canprobe.scene_setup import Setup
+from canprobe.scene_values import with_choices
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
@@ -281,6 +283,11 @@ class Plan:
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
     warnings: tuple[str, ...]
+
+    @property
+    def scene(self) -> Scene:
+        """The scene with nothing open any more, for who writes, sends or changes it."""
+        return with_choices(self.setup.scene, {choice.key: choice.value for choice in self.choices})
 
     @property
     def traffic(self) -> Traffic:

@@ -29,6 +29,7 @@ from canprobe.cell.observe import Observation, Observers
 from canprobe.planning import make_plan
 from canprobe.planning.bridges import BRIDGES
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import Session, resolve_scene
 from canprobe.studies.installed_size import size_of
 from canprobe.studies.study import Column, Row, StudyResult
@@ -99,7 +100,7 @@ def _record(seconds: float) -> list[Observation]:
 
 
 def _measure(case: Case, observations: Sequence[Observation]) -> Row:
-    plan = make_plan(resolve_scene(load_scene(SCENE), bridge=case.bridges))
+    plan = make_plan(resolve(resolve_scene(load_scene(SCENE), bridge=case.bridges)))
     with (
         tempfile.TemporaryDirectory(prefix="canprobe-") as folder,
         Bridges(plan, Path(folder), virtual=False) as bridges,

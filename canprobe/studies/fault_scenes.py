@@ -10,6 +10,7 @@ from types import MappingProxyType
 from canprobe.planning import Plan, make_plan
 from canprobe.scene import Scene
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 
 FORCE_MAX_N = 3.0
 _CLEARANCE_MM = 0.3
@@ -73,10 +74,12 @@ def scenario_scene(name: str, timed: bool) -> Scene:
 @cache
 def scenario_plan(name: str, timed: bool) -> Plan:
     """Its plan: the same for all seeds."""
-    return make_plan(scenario_scene(name, timed))
+    return make_plan(resolve(scenario_scene(name, timed)))
 
 
 def seeded_plan(name: str, timed: bool, seed: int) -> Plan:
     """The plan of one run."""
     plan = scenario_plan(name, timed)
-    return replace(plan, scene=replace(plan.scene, scene=replace(plan.scene.scene, seed=seed)))
+    setup = plan.setup
+    scene = replace(setup.scene, scene=replace(setup.scene.scene, seed=seed))
+    return replace(plan, setup=replace(setup, scene=scene, seed=seed))

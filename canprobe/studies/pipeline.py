@@ -25,6 +25,7 @@ from canprobe.cell.scoring import RUN_IN_M, curvature_tensor
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.planning import make_plan
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import Session, resolve_scene
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
@@ -89,7 +90,7 @@ def measure(cell: tuple[str, int, float]) -> dict[str, Any]:
     scene = resolve_scene(load_scene(name), interface="lockstep", seed=seed, duration_s=duration)
     if scene.shape is not None:
         scene = replace(scene, shape=replace(scene.shape, also=()))
-    task: Any = make_task(make_plan(scene))
+    task: Any = make_task(make_plan(resolve(scene)))
     with Session(scene) as session:
         session.run(task)
     times = session.cell.log.arrays()["t_s"]

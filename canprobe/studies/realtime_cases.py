@@ -21,6 +21,7 @@ from canprobe.errors import CanprobeError
 from canprobe.planning import make_plan
 from canprobe.scene import Scene, TactileModeName
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.session import Session, resolve_scene
 from canprobe.studies.cycle_times import CycleTimes, answer_latencies, processor_seconds, share_of, woken
 
@@ -54,7 +55,7 @@ def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
 
     scene = holding_scene("window", rate_hz)
     with served(CHANNEL, in_realtime=True), realtime(MASTER_PRIORITY, _unheard):
-        times = run_plain(make_plan(scene), CHANNEL, seconds)
+        times = run_plain(make_plan(resolve(scene)), CHANNEL, seconds)
     return Measured("plain canopen", "window", rate_hz, times)
 
 

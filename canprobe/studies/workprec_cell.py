@@ -28,6 +28,7 @@ from canprobe.errors import PlanError, SafetyStop
 from canprobe.planning import make_plan
 from canprobe.scene import PlantSettings, Scene
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -144,7 +145,7 @@ def scene_of(setting: Setting) -> Scene:
 def refusal(setting: Setting) -> str | None:
     """Why the plan refuses a setting; None where it fits."""
     try:
-        make_plan(scene_of(setting))
+        make_plan(resolve(scene_of(setting)))
     except PlanError as error:
         return str(error).splitlines()[0]
     return None

@@ -10,7 +10,6 @@ import pytest
 
 import canprobe
 from canprobe.api import Observation
-from canprobe.planning import make_plan
 from canprobe.results import RunResult
 from canprobe.scene_loader import parse_scene
 from canprobe.scene_writer import dump_scene
@@ -46,7 +45,7 @@ def recorded(tmp_path_factory) -> Recorded:
 
 @pytest.fixture(scope="session")
 def press_plan():
-    return make_plan(canprobe.load_scene("press"))
+    return canprobe.plan(canprobe.load_scene("press"))
 
 
 @pytest.fixture(scope="session")

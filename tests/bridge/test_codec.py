@@ -10,7 +10,6 @@ from canprobe.bridge.codec import pack_observation, unpack_observation
 from canprobe.bridge.source import SampleSource
 from canprobe.cell.measurement import Command, Measurement, TactileSample
 from canprobe.cell.observe import Observation
-from canprobe.planning import make_plan
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
 
 WINDOW = TactileFrame(
@@ -64,7 +63,7 @@ def test_a_controller_of_ones_own_may_call_anything_a_phase(value, phase):
     command = Command(columns={"phase": value})
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), command, [])))
     assert got.phase == phase
-    sample = SampleSource(make_plan(canprobe.load_scene("free"))).sample(got)
+    sample = SampleSource(canprobe.plan(canprobe.load_scene("free"))).sample(got)
     assert sample.phase == ("scan" if phase == 3.0 else None)
 
 

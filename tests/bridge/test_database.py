@@ -7,11 +7,11 @@ import cantools
 import numpy as np
 import pytest
 
+import canprobe
 from canprobe.bridge.database import FORMATS, write_database
 from canprobe.bridge.signals import describe_frames, identifier
 from canprobe.bus.candump import read_candump
 from canprobe.errors import UsageError
-from canprobe.planning import make_plan
 from canprobe.protocol.pdo import PdoEntry
 from canprobe.robot.puma260 import MODELS
 from canprobe.scene_loader import load_scene
@@ -63,7 +63,7 @@ def test_tactile_header_and_taxels_decode_as_the_cell_reads_them(read_back, list
 def test_grouped_targets_are_one_message_with_two_signals(tmp_path):
     scene = load_scene("free")
     scene = dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, grouped_rpdo=True))
-    database = cantools.database.load_file(write_database(make_plan(scene), tmp_path, "dbc"))
+    database = cantools.database.load_file(write_database(canprobe.plan(scene), tmp_path, "dbc"))
     message = database.get_message_by_frame_id(0x303)
     first, second = message.signals
     assert (first.name, first.start, second.name, second.start) == (
@@ -74,7 +74,7 @@ def test_grouped_targets_are_one_message_with_two_signals(tmp_path):
 
 @pytest.mark.parametrize("scene", ["cylinder", "free", "listen", "press"])
 def test_names_are_unique_and_no_bit_is_used_twice(scene):
-    frames = describe_frames(make_plan(load_scene(scene)))
+    frames = describe_frames(canprobe.plan(load_scene(scene)))
     assert len({frame.name for frame in frames}) == len({frame.cob_id for frame in frames}) == len(frames)
     for frame in frames:
         bits = [bit for signal in frame.signals for bit in range(signal.start, signal.start + signal.bits)]
@@ -102,7 +102,7 @@ def test_long_pdos_are_messages_of_can_fd(tmp_path):
         sensor=dataclasses.replace(scene.sensor, mode="image", eds="tactile_array_fd.eds"),
         bus=dataclasses.replace(scene.bus, fd=True),
     )
-    database = cantools.database.load_file(write_database(make_plan(scene), tmp_path, "dbc"))
+    database = cantools.database.load_file(write_database(canprobe.plan(scene), tmp_path, "dbc"))
     message = database.get_message_by_frame_id(0x513)
     assert (message.length, message.is_fd, len(message.signals)) == (64, True, 64)
     assert not database.get_message_by_frame_id(0x511).is_fd

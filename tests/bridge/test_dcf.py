@@ -9,13 +9,13 @@ import canopen
 import pytest
 import yaml
 
+import canprobe
 from canprobe.bridge.bus_yml import read_bus_yml, write_bus_yml
 from canprobe.bridge.dcf import dcf_text, final_values, write_dcfs
 from canprobe.cell.configuration import make_setups
 from canprobe.cli import main
 from canprobe.eds import check_eds
 from canprobe.errors import UsageError
-from canprobe.planning import make_plan
 from canprobe.scene_loader import load_scene
 
 
@@ -24,7 +24,7 @@ def plan(request):
     scene = load_scene(request.param)
     if request.param == "free":
         scene = dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, grouped_rpdo=True))
-    return make_plan(scene)
+    return canprobe.plan(scene)
 
 
 def entry(od, index, subindex):

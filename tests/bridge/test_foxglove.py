@@ -22,7 +22,6 @@ import canprobe
 from canprobe.bridge.process import BridgeProcess
 from canprobe.bridge.topics import TOPICS
 from canprobe.errors import UsageError
-from canprobe.planning import make_plan
 from canprobe.scene_loader import parse_scene
 from canprobe.scene_writer import dump_scene
 
@@ -30,13 +29,13 @@ PROTOCOL = "foxglove.sdk.v1"
 
 
 def plan_with(scene, section):
-    return make_plan(parse_scene(dump_scene(scene) + f"\n[bridge]\n{section}\n"))
+    return canprobe.plan(parse_scene(dump_scene(scene) + f"\n[bridge]\n{section}\n"))
 
 
 @pytest.fixture
 def bridge(recorded):
     text = dump_scene(recorded.result.plan.scene).replace("foxglove_port = 8765", "foxglove_port = 0")
-    one = BridgeProcess("foxglove", make_plan(parse_scene(text)), None, virtual=False)
+    one = BridgeProcess("foxglove", canprobe.plan(parse_scene(text)), None, virtual=False)
     yield one, re.match(r"ws://127\.0\.0\.1:\d+", one.await_ready())[0]
     one.kill()
 

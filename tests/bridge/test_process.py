@@ -17,13 +17,12 @@ from canprobe.bridge import process as process_module
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cell.observe import Observation
 from canprobe.errors import UsageError
-from canprobe.planning import make_plan
 from canprobe.session import Session, resolve_scene
 
 
 @pytest.fixture
 def plan():
-    return make_plan(resolve_scene(canprobe.load_scene("free"), duration_s=0.1))
+    return canprobe.plan(resolve_scene(canprobe.load_scene("free"), duration_s=0.1))
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy
 
+import canprobe
 from canprobe.bridge.cdr import Encoder, encode_can_frame
 from canprobe.bridge.codec import pack_observation, unpack_observation
 from canprobe.bridge.limits import refuse
@@ -20,7 +21,6 @@ from canprobe.bridge.ros2_types import DdsTypes, dds_name
 from canprobe.bridge.sample import CanFrame
 from canprobe.bridge.source import SampleSource
 from canprobe.bridge.topics import JOINT_STATES, TAXELS, TF_STATIC, TOPICS
-from canprobe.planning import make_plan
 from canprobe.scene_loader import parse_scene
 from canprobe.scene_writer import dump_scene
 
@@ -50,7 +50,7 @@ def messages(recorded, encoder):
 def plan(recorded):
     text = dump_scene(recorded.result.plan.scene)
     text = text.replace("ros2_domain = 0", f"ros2_domain = {DOMAIN}").replace("commands = false", "commands = true")
-    return make_plan(parse_scene(text))
+    return canprobe.plan(parse_scene(text))
 
 
 def test_cyclone_itself_makes_the_same_bytes(messages, encoder):
@@ -182,5 +182,5 @@ def test_limits_are_those_of_the_scene(recorded, kind, value, why):
 def test_a_speed_that_the_joints_cannot_follow_is_refused_with_the_joint(recorded):
     """Within the range of the key, but not of the arm: the plan of the changed scene says so."""
     text = dump_scene(recorded.result.plan.scene).replace("joint_speed_share = 1.0", "joint_speed_share = 0.5")
-    refused = refuse(make_plan(parse_scene(text)), "speed_m_s", 0.19)
+    refused = refuse(canprobe.plan(parse_scene(text)), "speed_m_s", 0.19)
     assert refused is not None and "joint" in refused

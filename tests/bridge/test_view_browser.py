@@ -24,7 +24,6 @@ from zstandard import ZstdDecompressor
 import canprobe
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cli import main
-from canprobe.planning import make_plan
 from canprobe.scene import BridgeSettings
 
 ROOT = Path(__file__).parents[2]
@@ -90,7 +89,7 @@ def test_a_run_is_served_until_it_is_told_to_end(served, number):
 def test_a_cell_is_shown_while_it_runs(recorded):
     """The bridge, fed what an observer saw: a browser finds the path, nothing is dropped, nothing is left."""
     scene = replace(recorded.result.plan.scene, bridge=BridgeSettings(use=("view",), view_port=0))
-    bridge = BridgeProcess("view", make_plan(scene), None, virtual=True)
+    bridge = BridgeProcess("view", canprobe.plan(scene), None, virtual=True)
     try:
         address = bridge.await_ready()
         for observation in recorded.observations:
@@ -118,7 +117,7 @@ def test_without_the_extra_there_is_the_line_that_installs_it(monkeypatch, capsy
     monkeypatch.setattr("importlib.util.find_spec", lambda name, *rest: None if name == "viser" else find(name, *rest))
     assert main(["view", str(recorded.folder)]) == 2
     assert capsys.readouterr().err == "canprobe: bridge view: needs viser: pip install 'canprobe[view]'\n"
-    plan = make_plan(canprobe.load_scene("free"))
+    plan = canprobe.plan(canprobe.load_scene("free"))
     assert "report.html" not in plan.outputs
     assert (
         "replay to share (report.html)",

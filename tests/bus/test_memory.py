@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+import canprobe
 from canprobe.bus.memory import LARGEST_RESERVE, LEAST_RESERVE, reserve_memory
-from canprobe.planning import make_plan
 from canprobe.scene_loader import load_scene
 
 
@@ -24,4 +24,4 @@ def test_as_much_as_the_cycles_will_keep(cycles, size):
 
 
 def test_a_plan_knows_about_how_many_cycles_it_takes():
-    assert make_plan(load_scene("cylinder")).cycles == 23 * 400
+    assert canprobe.plan(load_scene("cylinder")).cycles == 23 * 400

@@ -10,7 +10,6 @@ import pytest
 import canprobe
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Measurement
-from canprobe.planning import make_plan
 
 PERIOD_NS = 2_500_000
 
@@ -18,7 +17,7 @@ PERIOD_NS = 2_500_000
 def seconds_to_give_up(periods):
     """Time until no ball is found, where every cycle takes so many periods."""
     scene = canprobe.load_scene("calibrate")
-    plan = make_plan(replace(scene, task=replace(scene.task, touches=2, clearance_mm=1.0, search_mm=1.0)))
+    plan = canprobe.plan(replace(scene, task=replace(scene.task, touches=2, clearance_mm=1.0, search_mm=1.0)))
     task = make_task(plan)
     q = np.radians(plan.scene.arm.start_deg)
     for cycle in range(20_000):

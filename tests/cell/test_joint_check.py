@@ -15,7 +15,6 @@ from canprobe.cell.measurement import Measurement
 from canprobe.cell.tasks.joint_check import JointCheck
 from canprobe.cell.tasks.joint_findings import Answer
 from canprobe.cli.operator import TerminalOperator
-from canprobe.planning import make_plan
 from canprobe.robot.puma260 import UPENN, counts_to_joints, joints_to_counts
 
 PERIOD_S = 0.02
@@ -24,7 +23,7 @@ START = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
 
 @pytest.fixture(scope="module")
 def limits():
-    return limits_of(make_plan(canprobe.load_scene("free")))
+    return limits_of(canprobe.plan(canprobe.load_scene("free")))
 
 
 class Scripted:

@@ -14,7 +14,6 @@ from canprobe.bus.link import LinkState, parse_link, read_link
 from canprobe.cell.link_checks import Expected, check_link, expected_of, setting
 from canprobe.errors import InterfaceError
 from canprobe.link_report import check_links
-from canprobe.planning import make_plan
 
 # iproute2 6.1 on a virtual interface
 VCAN = """[{"ifindex":2,"ifname":"vcan0","flags":["NOARP","UP","LOWER_UP"],"mtu":72,"qdisc":"noqueue",
@@ -125,11 +124,11 @@ def test_all_that_is_wrong_with_a_fd_link_is_told():
 
 def test_a_plan_says_how_many_frames_go_at_once():
     """Twice SYNC, heartbeat and the RPDOs: six, or with grouped targets six controlwords and three targets."""
-    plan = make_plan(canprobe.load_scene("free"))
+    plan = canprobe.plan(canprobe.load_scene("free"))
     assert expected_of(plan, "can0") == Expected(1_000_000, None, 16)
     grouped = replace(plan.scene, arm=replace(plan.scene.arm, grouped_rpdo=True))
-    assert expected_of(make_plan(grouped), "can0").frames_at_once == 22
-    assert expected_of(make_plan(canprobe.load_scene("listen")), "can0").frames_at_once == 4
+    assert expected_of(canprobe.plan(grouped), "can0").frames_at_once == 22
+    assert expected_of(canprobe.plan(canprobe.load_scene("listen")), "can0").frames_at_once == 4
 
 
 @pytest.fixture
@@ -149,7 +148,7 @@ def ip(monkeypatch):
 
 def on_socketcan(name="free", channel="can0", **bus):
     scene = canprobe.load_scene(name)
-    return make_plan(replace(scene, bus=replace(scene.bus, interface="socketcan", channel=channel, **bus)))
+    return canprobe.plan(replace(scene, bus=replace(scene.bus, interface="socketcan", channel=channel, **bus)))
 
 
 def test_a_wrong_bit_rate_ends_it_and_the_rest_is_said(ip):
@@ -181,7 +180,7 @@ def test_without_ip_it_says_so(ip):
 
 def test_other_buses_and_interfaces_that_are_down_or_missing_are_left_to_who_opens_them(ip):
     said = []
-    check_links(make_plan(canprobe.load_scene("free")), said.append)
+    check_links(canprobe.plan(canprobe.load_scene("free")), said.append)
     ip["can0"] = (PASSIVE.replace('"NOARP","UP"', '"NOARP"'), "")
     check_links(on_socketcan(), said.append)
     del ip["can0"]

@@ -11,7 +11,6 @@ from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.cli import main
 from canprobe.emulator.build import make_world
-from canprobe.planning import make_plan
 
 CHANNEL = ("--bus", "socketcan", "--channel", "can0")
 DRIVE = "0xca5e:0x260:0x10000"
@@ -120,7 +119,7 @@ def test_what_is_stored_is_there_when_the_nodes_are_started_again(serve, tmp_pat
     assert scan("--lss", "--assign", "2=9") == 0
     stored = json.loads((tmp_path / "serial00000002.json").read_text())
     assert stored["node_id"] == 9
-    plan = make_plan(canprobe.load_scene("free"))
+    plan = canprobe.plan(canprobe.load_scene("free"))
     again = make_world(plan, (2,), without_id=(2,)).nodes[0]
     from canprobe.emulator.store_file import keep_in_file
 

@@ -6,6 +6,7 @@ import itertools
 
 import pytest
 
+import canprobe
 from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.eds import load_eds
@@ -15,7 +16,6 @@ from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.tactile import make_tactile_node
 from canprobe.emulator.truth import TruthRecorder
 from canprobe.errors import BusError
-from canprobe.planning import make_plan
 from canprobe.scene_loader import load_scene
 
 MS = 1_000_000
@@ -258,7 +258,7 @@ def test_speed_of_seven_nodes(benchmark, plant):
 
 
 def test_nobody_records_what_nobody_wants_to_know():
-    plan = make_plan(load_scene("press"))
+    plan = canprobe.plan(load_scene("press"))
     world = build.make_world(plan, plan.node_ids, truth=False)
     assert world.recorder is None
     assert world.participants == world.nodes

@@ -11,7 +11,6 @@ import pytest
 import canprobe
 from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.errors import PlanError, SafetyStop, SceneError
-from canprobe.planning import make_plan
 from canprobe.scene_tool import with_tool
 from canprobe.touch.servo import ProbePose
 
@@ -114,7 +113,7 @@ def test_a_ball_that_is_not_there_is_told():
 def test_the_plan_refuses_a_side_that_the_arm_cannot_reach():
     scene = canprobe.load_scene("calibrate")
     with pytest.raises(PlanError, match=r"touch \d+ of 13 is out of reach|joint \d would move"):
-        make_plan(replace(scene, task=replace(scene.task, tilt_deg=55.0)))
+        canprobe.plan(replace(scene, task=replace(scene.task, tilt_deg=55.0)))
 
 
 def test_the_way_round_the_ball_keeps_its_distance():

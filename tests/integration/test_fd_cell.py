@@ -12,7 +12,6 @@ from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.cell.build import make_tactile
 from canprobe.errors import BusError, PlanError
-from canprobe.planning import make_plan
 
 PERIOD_NS = 2_500_000
 
@@ -63,7 +62,7 @@ def test_no_frame_is_later_than_planned(pressed):
 
 def test_a_flipped_bit_in_a_long_pdo_is_found(pressed):
     _, frames = pressed
-    receiver = make_tactile(make_plan(fd_scene("press")))
+    receiver = make_tactile(canprobe.plan(fd_scene("press")))
     start = next(i for i, frame in enumerate(frames) if frame[2] == 0x511)
     sent = [frame for frame in frames[start:] if 0x511 <= frame[2] <= 0x515][:10]
     for t_ns, _, can_id, data in sent[:9]:
@@ -74,18 +73,18 @@ def test_a_flipped_bit_in_a_long_pdo_is_found(pressed):
 
 
 def test_an_fd_image_takes_a_fifth_of_a_classical_one():
-    plan = make_plan(fd_scene("press"))
+    plan = canprobe.plan(fd_scene("press"))
     load = dict(plan.traffic.parts)
-    classical = make_plan(fd_scene("listen", fd=False, mode="features"))
+    classical = canprobe.plan(fd_scene("listen", fd=False, mode="features"))
     assert len(plan.pdos_of(16, "tpdo")) == 5 and len(classical.pdos_of(16, "tpdo")) == 2
     assert load["tactile"] < 0.89 / 5
     with pytest.raises(PlanError, match="TPDO6"):  # the array with long PDOs has five of them
-        make_plan(fd_scene("press", fd=False))
+        canprobe.plan(fd_scene("press", fd=False))
 
 
 def test_a_device_without_long_pdos_keeps_short_ones_and_the_plan_says_so():
     scene = fd_scene("press", mode="window")
-    plan = make_plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, eds="tactile_array.eds")))
+    plan = canprobe.plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, eds="tactile_array.eds")))
     assert {pdo.layout.length for pdo in plan.pdos_of(16, "tpdo")} == {8}
     assert any(what == "CAN FD frames from the sensor" for what, _ in plan.not_available)
 

@@ -14,7 +14,6 @@ from canprobe.cell.build import make_cell
 from canprobe.cell.measurement import Command
 from canprobe.emulator.build import make_world
 from canprobe.errors import UsageError
-from canprobe.planning import make_plan
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.session import Session
 
@@ -27,7 +26,7 @@ def mixed_scene():
 def test_an_arm_of_its_own_and_an_emulated_sensor():
     """Two worlds that know nothing of each other, as the real arm and the emulator's process do not."""
     scene = mixed_scene()
-    plan = make_plan(scene)
+    plan = canprobe.plan(scene)
     assert scene.emulated_node_ids == (16,)
     bus = LockstepBus(VirtualClock(), "can0")
     arm, sensor = make_world(plan, range(1, 7)), make_world(plan, scene.emulated_node_ids)

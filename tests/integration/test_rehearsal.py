@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import pytest
 
+import canprobe
 from canprobe.cell.build import make_task
 from canprobe.cell.tasks.probing import Phase
-from canprobe.planning import make_plan
 from canprobe.rehearsal import rehearse, shortened
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session
@@ -47,12 +47,12 @@ def test_a_shorter_scene_stays_as_short():
 
 def test_what_goes_wrong_in_it_is_of_no_interest():
     scene = load_scene("cylinder")
-    rehearse(make_plan(replace(scene, limits=replace(scene.limits, force_max_n=0.5))))
+    rehearse(canprobe.plan(replace(scene, limits=replace(scene.limits, force_max_n=0.5))))
 
 
 def test_real_nodes_are_emulated_in_it():
     scene = load_scene("press")
-    plan = make_plan(
+    plan = canprobe.plan(
         replace(scene, arm=replace(scene.arm, emulated=False), bus=replace(scene.bus, interface="socketcan"))
     )
     with Session(replace(plan, scene=shortened(plan.scene))) as session:

@@ -7,7 +7,6 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.errors import PlanError
-from canprobe.planning import make_plan
 from canprobe.scene import ObjectSettings
 
 # scene: force RMS error and curvature RMS error that it stays below, percent
@@ -66,4 +65,4 @@ def test_a_bowl_as_tight_as_the_probe_is_refused_with_the_reason():
     assert scene.object.kind == "bowl"
     tight = replace(scene, object=ObjectSettings("bowl", radius_mm=40.0))
     with pytest.raises(PlanError, match="hollow of radius 40 mm is tighter than the probe"):
-        make_plan(tight)
+        canprobe.plan(tight)

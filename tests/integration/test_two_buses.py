@@ -14,7 +14,6 @@ from canprobe.bus.lockstep import LockstepBus
 from canprobe.cell.measurement import Command
 from canprobe.cell.recording import read_recording
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.planning import make_plan
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
 from canprobe.session import Session
@@ -45,7 +44,7 @@ def test_the_full_image_that_one_bus_could_not_carry_is_served_on_its_own(presse
 def test_each_bus_has_its_own_nodes_and_every_bus_the_sync(pressed):
     _, frames = pressed
     ids = {name: {frame[2] for frame in frames if frame[1] == name} for name in ("can0", "can1")}
-    plan = make_plan(split_scene())
+    plan = canprobe.plan(split_scene())
     for pdo in plan.pdos:
         assert [name for name in ids if pdo.cob_id in ids[name]] == [pdo.channel]
     assert {0x590, 0x610, 0x710} <= ids["can1"] and not {0x590, 0x610, 0x710} & ids["can0"]

@@ -11,7 +11,6 @@ import canprobe.eds
 from canprobe.cell.configuration import make_setups
 from canprobe.emulator.plant.contact import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning import make_plan
 from canprobe.planning.contact_window import patch_radius_m, taxels_needed, window_choices
 from canprobe.planning.pdos import tactile_objects
 from canprobe.scene import ProbeSettings
@@ -53,7 +52,7 @@ def test_what_is_planned_is_on_the_bus(press, side, tmp_path):
 def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
     """The truth is the plant's: 10×10 taxels hold the patch of a soft pad; what 8×8 cut off is carried on."""
     foam = canprobe.load_scene("foam")
-    assert make_plan(foam).scene.sensor.window == 10
+    assert canprobe.plan(foam).scene.sensor.window == 10
     for scene in (foam, change(foam, sensor={"window": 8})):
         contact = canprobe.run(scene, files=False, duration_s=1.0).summary["contact"]
         assert contact["force_rms_error_n"] < 0.06 * contact["force_target_n"]
@@ -86,21 +85,21 @@ def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_
 
 def test_auto_takes_what_fits_and_says_why():
     cylinder = change(canprobe.load_scene("cylinder"), sensor={"window": "auto"})
-    tight = make_plan(cylinder)
+    tight = canprobe.plan(cylinder)
     assert tight.scene.sensor.window == 8
     assert "the largest that fits, cutting its rim" in tight.choices[0].why
-    grouped = make_plan(change(cylinder, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
+    grouped = canprobe.plan(change(cylinder, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
     assert grouped.scene.sensor.window == 10 and len(tactile(grouped)) == 14
     assert "the smallest that holds it" in grouped.choices[0].why
-    listening = make_plan(change(canprobe.load_scene("listen"), sensor={"mode": "window", "window": "auto"}))
+    listening = canprobe.plan(change(canprobe.load_scene("listen"), sensor={"mode": "window", "window": "auto"}))
     assert listening.scene.sensor.window == 12
-    features = make_plan(change(cylinder, sensor={"mode": "features"}))
+    features = canprobe.plan(change(cylinder, sensor={"mode": "features"}))
     assert features.choices == (), "there is no window to choose"
 
 
 def test_what_does_not_fit_names_the_windows_that_do():
     with pytest.raises(PlanError, match=r"5695 µs of the 5000 µs in 2 cycles") as refused:
-        make_plan(change(canprobe.load_scene("cylinder"), sensor={"window": 12}))
+        canprobe.plan(change(canprobe.load_scene("cylinder"), sensor={"window": 12}))
     assert refused.value.ways_out[0].startswith("sensor.window = 8: load 87 %")
 
 
@@ -108,7 +107,7 @@ def test_on_can_fd_every_word_of_every_window_has_its_place():
     scene = change(canprobe.load_scene("cylinder"), sensor={"eds": "tactile_array_fd.eds"}, bus={"fd": True})
     lengths = {4: [8, 16], 6: [8, 32, 8], 8: [8, 64], 10: [8, 64, 32, 8], 12: [8, 64, 64, 16]}
     for side, expected in lengths.items():
-        plan = make_plan(change(scene, sensor={"window": side}))
+        plan = canprobe.plan(change(scene, sensor={"window": side}))
         pdos = sorted(tactile(plan), key=lambda pdo: pdo.number)
         assert [pdo.layout.length for pdo in pdos] == expected
         objects = [(entry.index, entry.subindex) for pdo in pdos for entry in pdo.entries]
@@ -127,7 +126,7 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     path = tmp_path / "older.eds"
     path.write_text(older)
     scene = change(canprobe.load_scene("press"), sensor={"eds": str(path), "window": "auto"})
-    plan = make_plan(scene)
+    plan = canprobe.plan(scene)
     assert plan.scene.sensor.window == 8
     assert ("another window", f"{path} has no window size (2008h), so the window keeps 8×8 taxels") in (
         plan.not_available
@@ -135,7 +134,7 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
     (setup,) = (setup for setup in make_setups(plan) if setup.node_id == 16)
     assert not any(write.index == 0x2008 for write in setup.writes) and 0x2008 not in setup.lacks
     with pytest.raises(PlanError, match=r"sensor\.window = 8, not 6"):
-        make_plan(change(scene, sensor={"window": 6}))
+        canprobe.plan(change(scene, sensor={"window": 6}))
     result = canprobe.run(plan.scene, files=False, duration_s=0.1)
     assert result.summary["completed"] and result.summary["cycle"]["torn_frames"] == 0
 

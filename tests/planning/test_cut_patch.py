@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from scenes import change, refused
 
+import canprobe
 from canprobe.cli import main
 from canprobe.emulator.plant.contact import elastic_contact
-from canprobe.planning import make_plan, plan_text
+from canprobe.planning import plan_text
 from canprobe.planning.contact_window import PITCH_M, patch_radius_m
 from canprobe.planning.cut_patch import cut_patch, measured_share, true_force_n
 from canprobe.scene import ProbeSettings
@@ -52,7 +53,7 @@ def test_the_true_force_is_the_one_of_which_the_target_is_inside(side):
 
 
 def test_a_window_that_cuts_the_patch_is_a_warning_with_numbers():
-    small = make_plan(change(load_scene("cylinder"), sensor={"window": 6}))
+    small = canprobe.plan(change(load_scene("cylinder"), sensor={"window": 6}))
     (warning,) = small.warnings
     for part in ("6.7 taxels across", "at 2 N", "94 % of that force", "carried on", "errs by up to 10 %", "window = 8"):
         assert part in warning
@@ -62,7 +63,7 @@ def test_a_window_that_cuts_the_patch_is_a_warning_with_numbers():
 
 @pytest.mark.parametrize("name", ["cylinder", "foam", "steel", "calibrate", "listen", "free", "miscalibrated"])
 def test_packaged_scenes_have_nothing_to_warn_of(name):
-    assert make_plan(load_scene(name)).warnings == ()
+    assert canprobe.plan(load_scene(name)).warnings == ()
 
 
 def test_more_than_the_force_limit_unfelt_is_refused(tmp_path, capsys):
@@ -70,7 +71,7 @@ def test_more_than_the_force_limit_unfelt_is_refused(tmp_path, capsys):
     error = refused(foam)
     assert "more than limits.force_max_n = 5 N can press" in error.problems[0]
     assert error.ways_out == ("sensor.window = 10", "a smaller task.force_n")
-    assert "up to 0.29 N" in make_plan(change(foam, task={"force_n": 0.2})).warnings[0]
+    assert "up to 0.29 N" in canprobe.plan(change(foam, task={"force_n": 0.2})).warnings[0]
     (tmp_path / "foam.toml").write_text(dump_scene(foam))
     assert main(["plan", str(tmp_path / "foam.toml"), "--json"]) == 2
     document = json.loads(capsys.readouterr().out)
@@ -85,5 +86,5 @@ def test_features_and_the_whole_image_cut_nothing():
 
 def test_errors_on_the_wire_are_a_warning():
     """135 bits: 31 more for the error, and 1 - (1 - 1e-3)^135 of them are hit."""
-    (warning,) = make_plan(change(load_scene("free"), bus={"bit_error_rate": 1e-3})).warnings
+    (warning,) = canprobe.plan(change(load_scene("free"), bus={"bit_error_rate": 1e-3})).warnings
     assert "up to 166 µs" in warning and f"{100 * (1 - math.exp(135 * math.log1p(-1e-3))):.2g} % of the" in warning

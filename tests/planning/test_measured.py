@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from canprobe.planning import make_plan
+import canprobe
 from canprobe.planning.traffic_meter import TrafficMeter, expected_messages
 from canprobe.protocol.frame_bits import best_case_bits, exact_bits
 from canprobe.scene_loader import load_scene
@@ -17,7 +17,7 @@ US = 1000
 
 @pytest.fixture(scope="module")
 def plan():
-    return make_plan(load_scene("cylinder"))
+    return canprobe.plan(load_scene("cylinder"))
 
 
 def course():
@@ -128,7 +128,7 @@ def test_too_many_frames_are_not_planned(plan):
 
 
 def test_what_is_sent_on_a_change_may_come_more_often_than_planned_but_not_less():
-    plan = make_plan(
+    plan = canprobe.plan(
         dataclasses.replace(scene := load_scene("free"), arm=dataclasses.replace(scene.arm, grouped_rpdo=True))
     )
     for every_ms, planned in ((100, True), (50, True), (200, False)):

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 from scenes import change, reasons, refused, ways_out
 
-from canprobe.planning import make_plan
+import canprobe
 from canprobe.planning.abilities import Abilities
 from canprobe.planning.budget import controller_starts
 from canprobe.planning.identifiers import identifier_problems
@@ -25,7 +25,7 @@ def cylinder():
 
 @pytest.fixture(scope="module")
 def cylinder_plan(cylinder):
-    return make_plan(cylinder)
+    return canprobe.plan(cylinder)
 
 
 # Independent truth: 55 + 10 n bits a frame, counted by hand from the mapping table; shares of 1 Mbit/s.
@@ -50,7 +50,7 @@ SYNC, DRIVE_TPDO, DRIVE_RPDO, FULL, CONTROLWORD = 65, 135, 115, 135, 75
     ],
 )
 def test_budget_table(name, sections, part, bits_per_second, percent):
-    plan = make_plan(change(load_scene(name), **sections))
+    plan = canprobe.plan(change(load_scene(name), **sections))
     load = sum(share for what, share in plan.traffic.parts if what in part)
     assert load == pytest.approx(bits_per_second / 1e6)
     assert 100 * load == pytest.approx(percent, abs=0.5)
@@ -64,7 +64,7 @@ def test_budget_table(name, sections, part, bits_per_second, percent):
     [({}, 1565, 4345), ({"arm": {"grouped_rpdo": True}}, 1280, 3775)],
 )
 def test_peak_demand_behind_one_sync(cylinder, sections, drives_us, tactile_us):
-    plan = make_plan(change(cylinder, **sections))
+    plan = canprobe.plan(change(cylinder, **sections))
     one, two = plan.traffic.demands
     assert (one.cycles, one.used_ns, one.available_ns) == (1, drives_us * 1000, 2_500_000)
     assert (two.cycles, two.used_ns, two.available_ns) == (2, tactile_us * 1000, 5_000_000)
@@ -104,7 +104,7 @@ def test_ways_out_written_into_the_scene_file_make_it_fit(cylinder, sections):
             file = f"{head}{name}{key} = {value}\n" + re.sub(rf"^{key} = .*\n", "", tail, count=1, flags=re.M)
         for key in re.findall(r"without sensor\.(\w+)", text):
             file = re.sub(rf"^{key} = .*\n", "", file, count=1, flags=re.M)
-        plan = make_plan(parse_scene(file))
+        plan = canprobe.plan(parse_scene(file))
         assert f"load {100 * max(bus.traffic.load for bus in plan.buses):.0f} %" in numbers, way
 
 
@@ -122,7 +122,7 @@ def test_slower_bus_is_refused_and_the_faster_one_named(cylinder):
 def test_six_drives_alone_end_at_500_hz():
     """At 625 Hz 1565 of 1600 µs would do for the bus, but the controller needs its time between TPDOs and RPDOs."""
     free = load_scene("free")
-    assert make_plan(change(free, cycle={"rate_hz": 500.0})).traffic.load < 0.8
+    assert canprobe.plan(change(free, cycle={"rate_hz": 500.0})).traffic.load < 0.8
     error = refused(change(free, cycle={"rate_hz": 625.0}))
     (problem,) = error.problems
     assert "takes 200 µs (cycle.compute_us)" in problem and "behind the next SYNC" in problem
@@ -134,7 +134,7 @@ def test_six_drives_alone_end_at_500_hz():
     ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
 )
 def test_sync_period(rate, period_us, units):
-    sync = make_plan(change(load_scene("free"), cycle={"rate_hz": float(rate)})).sync
+    sync = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)})).sync
     assert (sync.period_us, sync.period_ns, sync.interpolation_100us) == (period_us, period_us * 1000, units)
     assert sync.overflow == 240
 
@@ -147,7 +147,7 @@ def test_sync_period_that_60c2h_cannot_hold(rate, near):
 
 def test_sync_period_of_a_sensor_alone_needs_only_whole_microseconds():
     scene = change(load_scene("listen"), cycle={"rate_hz": 320.0}, sensor={"rate_hz": 160.0})
-    assert make_plan(scene).sync.period_us == 3125
+    assert canprobe.plan(scene).sync.period_us == 3125
     (problem,) = reasons(change(scene, cycle={"rate_hz": 300.0}, sensor={"rate_hz": 150.0}))
     assert "1006h counts µs" in problem
 
@@ -164,7 +164,7 @@ def test_tactile_rate_that_no_trigger_gives(cylinder, rate):
 
 @pytest.mark.parametrize("ratio", [1, 2, 3, 4, 8, 240])
 def test_tactile_trigger(ratio):
-    plan = make_plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
+    plan = canprobe.plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
     assert {pdo.transmission_type for pdo in plan.pdos} == {ratio}
     assert 240 % ratio == 0
     assert {pdo.deadline_ns for pdo in plan.pdos} == {min(2, ratio) * 2_500_000}
@@ -186,13 +186,13 @@ def test_identifiers_and_mappings_of_the_default_cell(cylinder_plan):
     ("mode", "last", "first_object"), [("image", 0x531, (0x2120, 0)), ("features", 0x512, (0x2130, 1))]
 )
 def test_identifiers_of_other_modes(mode, last, first_object):
-    pdos = make_plan(change(load_scene("listen"), sensor={"mode": mode})).pdos
+    pdos = canprobe.plan(change(load_scene("listen"), sensor={"mode": mode})).pdos
     assert [pdo.cob_id for pdo in pdos] == list(range(0x511, last + 1))
     assert (pdos[0].entries[0].index, pdos[0].entries[0].subindex) == first_object
 
 
 def test_grouped_targets_share_an_rpdo_through_dummies():
-    plan = make_plan(change(load_scene("free"), arm={"grouped_rpdo": True}))
+    plan = canprobe.plan(change(load_scene("free"), arm={"grouped_rpdo": True}))
     shared = {(pdo.node_id, pdo.cob_id): [e.index for e in pdo.entries] for pdo in plan.pdos if pdo.number == 2}
     assert shared == {
         (1, 0x301): [0x607A, 4], (2, 0x301): [4, 0x607A], (3, 0x303): [0x607A, 4],
@@ -230,7 +230,7 @@ def test_frames_that_may_be_on_the_bus(cylinder_plan):
 
 
 def test_order_of_node_ids_is_the_order_of_joints():
-    plan = make_plan(change(load_scene("free"), arm={"node_ids": (16, 5, 4, 3, 2, 1)}))
+    plan = canprobe.plan(change(load_scene("free"), arm={"node_ids": (16, 5, 4, 3, 2, 1)}))
     assert {node.node_id: node.role for node in plan.nodes}[16] == "joint 1"
     assert plan.node_ids == (1, 2, 3, 4, 5, 16)
 
@@ -276,14 +276,14 @@ class TestOtherDevices:
 
     def test_without_dummies_targets_stay_single_and_it_says_so(self, edit):
         scene = change(edit((r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
-        plan = make_plan(scene)
+        plan = canprobe.plan(scene)
         assert {pdo.number for pdo in plan.pdos} == {1}
         ((what, why),) = plan.not_available
         assert what == "two targets in one RPDO"
         assert "0004h" in why
 
     def test_torque_that_cannot_be_mapped_is_left_away(self, edit):
-        plan = make_plan(edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0")))
+        plan = canprobe.plan(edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0")))
         assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
         assert len(plan.not_available) == 6
 
@@ -292,7 +292,7 @@ class TestOtherDevices:
         assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
 
     def test_fixed_mapping_is_used_where_it_is_the_right_one(self, edit):
-        assert make_plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
+        assert canprobe.plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
 
     def test_fixed_mapping_that_is_another_is_refused(self, edit):
         problems = reasons(
@@ -344,7 +344,7 @@ HEARTBEAT = 65
     ],
 )
 def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
-    plan = make_plan(change(load_scene(name), **sections))
+    plan = canprobe.plan(change(load_scene(name), **sections))
     budget = plan.traffic.budget
     sync = sync_blocked + SYNC
     feedback = sync + sneaks_in + 6 * DRIVE_TPDO
@@ -364,16 +364,16 @@ def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(be
 
 
 def test_a_controller_that_takes_too_long_is_refused(cylinder):
-    budget = make_plan(cylinder).traffic.budget
+    budget = canprobe.plan(cylinder).traffic.budget
     longest = (budget.slack_ns + budget.compute_ns) / 1000
-    assert make_plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
+    assert canprobe.plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
     longer = change(cylinder, cycle={"compute_us": longest + 1})
     assert "1 µs behind the next SYNC" in reasons(longer)[0]
     assert f"cycle.compute_us = {longest:.0f}" in [way.partition(":")[0] for way in ways_out(longer)]
 
 
 def test_a_sensor_alone_has_a_budget_too():
-    budget = make_plan(load_scene("listen")).traffic.budget
+    budget = canprobe.plan(load_scene("listen")).traffic.budget
     assert (budget.feedback_ns, budget.commands_ns) == (None, None)
     assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
     assert budget.looks_ns == (625_000, 1_500_000)

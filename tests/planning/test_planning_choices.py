@@ -5,9 +5,9 @@ import json
 
 import pytest
 
+import canprobe
 from canprobe.cli import main
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning import make_plan
 from canprobe.planning.identifiers import order_by_deadline
 from canprobe.planning.open_keys import opened, second_channel
 from canprobe.protocol.frames import is_restricted
@@ -31,17 +31,17 @@ def chosen(plan):
 
 
 def test_what_fits_is_left_as_the_contract_has_it(cylinder):
-    plan = make_plan(opened(cylinder))
-    assert plan.pdos == make_plan(cylinder).pdos
+    plan = canprobe.plan(opened(cylinder))
+    assert plan.pdos == canprobe.plan(cylinder).pdos
     assert chosen(plan) == {
         "sensor.channel": '"can0"', "bus.fd": "false", "arm.grouped_rpdo": "false", "bus.cob_ids": '"default"',
     }  # fmt: skip
-    assert not make_plan(cylinder).choices
+    assert not canprobe.plan(cylinder).choices
 
 
 def test_the_packaged_scenes_leave_nothing_open(cylinder):
     assert '"auto"' not in dump_scene(cylinder)
-    assert make_plan(cylinder).scene == cylinder
+    assert canprobe.plan(cylinder).scene == cylinder
 
 
 def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
@@ -49,8 +49,8 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
     scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
         with pytest.raises(PlanError):
-            make_plan(change(scene, **half))
-    plan = make_plan(opened(scene))
+            canprobe.plan(change(scene, **half))
+    plan = canprobe.plan(opened(scene))
     assert chosen(plan)["arm.grouped_rpdo"] == "true" and chosen(plan)["bus.cob_ids"] == '"by_deadline"'
     assert plan.traffic.budget.slack_ns > 0
     assert len(plan.buses) == 1
@@ -59,7 +59,7 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
 def test_ways_out_name_changes_that_fit_only_together(cylinder):
     scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     with pytest.raises(PlanError) as refused:
-        make_plan(scene)
+        canprobe.plan(scene)
     ways = refused.value.ways_out
     assert any(way.startswith('arm.grouped_rpdo = true and bus.cob_ids = "by_deadline": load 95 %') for way in ways)
     assert not any(way.startswith("arm.grouped_rpdo = true: ") for way in ways)  # alone it does not
@@ -67,32 +67,32 @@ def test_ways_out_name_changes_that_fit_only_together(cylinder):
 
 def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
     image = change(cylinder, sensor={"mode": "image"})
-    split = make_plan(opened(image))
+    split = canprobe.plan(opened(image))
     assert [(bus.channel, bus.node_ids) for bus in split.buses] == [("can0", (1, 2, 3, 4, 5, 6)), ("can1", (16,))]
     assert {pdo.channel for pdo in split.pdos if pdo.kind == "tactile"} == {"can1"}
     assert all(bus.traffic.load < 1 for bus in split.buses)
-    fd = make_plan(opened(change(image, sensor={"eds": "tactile_array_fd.eds"})))
+    fd = canprobe.plan(opened(change(image, sensor={"eds": "tactile_array_fd.eds"})))
     assert len(fd.buses) == 1 and fd.scene.bus.fd is True and chosen(fd)["bus.fd"] == "true"
 
 
 def test_what_is_written_is_kept(cylinder):
     scene = change(cylinder, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
-    assert make_plan(scene).scene.arm.grouped_rpdo is False
+    assert canprobe.plan(scene).scene.arm.grouped_rpdo is False
     with pytest.raises(PlanError, match="none of 2 ways"):
-        make_plan(change(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
+        canprobe.plan(change(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
 
 
 def test_the_sensor_gives_less_last_of_all(cylinder):
-    assert make_plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
+    assert canprobe.plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
     fast = change(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
-    assert make_plan(fast).scene.sensor.mode == "features"
-    assert make_plan(opened(fast)).scene.sensor.mode == "window"
-    assert make_plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
+    assert canprobe.plan(fast).scene.sensor.mode == "features"
+    assert canprobe.plan(opened(fast)).scene.sensor.mode == "window"
+    assert canprobe.plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
 
 
 def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
     with pytest.raises(PlanError) as refused:
-        make_plan(opened(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"})))
+        canprobe.plan(opened(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"})))
     first, *_, last = refused.value.problems
     assert first.startswith("none of 32 ways to fill what is left open fits; the nearest: sensor.mode = ")
     assert "1280 µs of the 1000 µs" in last and refused.value.ways_out[0].startswith("cycle.rate_hz = ")
@@ -100,7 +100,7 @@ def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
 
 def test_priorities_follow_the_deadlines_and_are_never_restricted(cylinder):
     grouped = change(cylinder, arm={"grouped_rpdo": True})
-    default, ordered = make_plan(grouped), make_plan(change(grouped, bus={"cob_ids": "by_deadline"}))
+    default, ordered = canprobe.plan(grouped), canprobe.plan(change(grouped, bus={"cob_ids": "by_deadline"}))
     by_id = sorted(ordered.pdos, key=lambda pdo: pdo.cob_id)
     assert [pdo.deadline_ns for pdo in by_id] == sorted(pdo.deadline_ns for pdo in ordered.pdos)
     assert not any(is_restricted(pdo.cob_id) for pdo in ordered.pdos)
@@ -128,7 +128,7 @@ def test_deadline_order_fits_where_the_default_order_does_not():
 
 
 def test_order_by_deadline_twice_changes_nothing(cylinder):
-    once = order_by_deadline(make_plan(cylinder).pdos)
+    once = order_by_deadline(canprobe.plan(cylinder).pdos)
     assert order_by_deadline(once) == once
 
 

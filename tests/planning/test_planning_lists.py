@@ -8,7 +8,7 @@ import sys
 import pytest
 
 import canprobe
-from canprobe.planning import make_plan, plan_text
+from canprobe.planning import plan_text
 from canprobe.scene_loader import load_scene, packaged_scenes
 
 
@@ -29,7 +29,7 @@ from canprobe.scene_loader import load_scene, packaged_scenes
     ],
 )
 def test_what_each_scene_uses_and_leaves_out(name, kinds, estimator, strategy, absent):
-    plan = make_plan(load_scene(name))
+    plan = canprobe.plan(load_scene(name))
     assert {node.kind for node in plan.nodes} == kinds
     assert (plan.estimator, plan.strategy) == (estimator, strategy)
     assert absent <= {what for what, _ in plan.left_out}
@@ -38,7 +38,7 @@ def test_what_each_scene_uses_and_leaves_out(name, kinds, estimator, strategy, a
 
 def test_features_map_no_taxels():
     scene = load_scene("listen")
-    plan = make_plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode="features")))
+    plan = canprobe.plan(dataclasses.replace(scene, sensor=dataclasses.replace(scene.sensor, mode="features")))
     assert {entry.index for pdo in plan.pdos for entry in pdo.entries} == {0x2130}
     left = dict(plan.left_out)
     assert {"full image (32 PDOs)", "window (8 PDOs)", "taxels and patch features in the master"} <= set(left)
@@ -46,10 +46,10 @@ def test_features_map_no_taxels():
 
 def test_a_window_smaller_than_the_patch_is_told():
     cylinder = load_scene("cylinder")
-    small = make_plan(dataclasses.replace(cylinder, sensor=dataclasses.replace(cylinder.sensor, window=6)))
+    small = canprobe.plan(dataclasses.replace(cylinder, sensor=dataclasses.replace(cylinder.sensor, window=6)))
     said = {what: why for what, why in small.left_out if what.startswith("full image")}
     assert next(iter(said.values())).endswith("is sent, with up to 6 % of the force outside")
-    whole = {what: why for what, why in make_plan(cylinder).left_out if what.startswith("full image")}
+    whole = {what: why for what, why in canprobe.plan(cylinder).left_out if what.startswith("full image")}
     assert next(iter(whole.values())).endswith("holds the patch")
 
 
@@ -57,15 +57,15 @@ def test_the_patch_is_left_out_where_it_is_switched_off_or_no_taxels_are_sent():
     axial = load_scene("axial")
     off = dataclasses.replace(axial, shape=dataclasses.replace(axial.shape, patch=False))
     features = dataclasses.replace(axial, sensor=dataclasses.replace(axial.sensor, mode="features"))
-    assert "curvature from the patch" not in dict(make_plan(axial).left_out)
-    assert dict(make_plan(off).left_out)["curvature from the patch"] == "shape.patch = false"
-    assert "features" in dict(make_plan(features).left_out)["curvature from the patch"]
+    assert "curvature from the patch" not in dict(canprobe.plan(axial).left_out)
+    assert dict(canprobe.plan(off).left_out)["curvature from the patch"] == "shape.patch = false"
+    assert "features" in dict(canprobe.plan(features).left_out)["curvature from the patch"]
 
 
 def test_switches_of_the_plant_are_listed():
     cylinder = load_scene("cylinder")
     quiet = dataclasses.replace(cylinder, plant=dataclasses.replace(cylinder.plant, noise=False, creep=False))
-    left = dict(make_plan(quiet).left_out)
+    left = dict(canprobe.plan(quiet).left_out)
     assert left["taxel noise"] == "plant.noise = false"
     assert "taxel creep" in left
     assert "cover blur" not in left
@@ -73,8 +73,8 @@ def test_switches_of_the_plant_are_listed():
 
 def test_figures_are_left_out_where_they_are_switched_off():
     cylinder = load_scene("cylinder")
-    plan = make_plan(dataclasses.replace(cylinder, scene=dataclasses.replace(cylinder.scene, figures=False)))
-    assert {name for name in make_plan(cylinder).outputs if name.startswith(("report", "surface."))} == {
+    plan = canprobe.plan(dataclasses.replace(cylinder, scene=dataclasses.replace(cylinder.scene, figures=False)))
+    assert {name for name in canprobe.plan(cylinder).outputs if name.startswith(("report", "surface."))} == {
         *("report.png", "surface.png", "report.html", "surface.npz")
     }
     assert {name for name in plan.outputs if name.startswith(("report", "surface."))} == {"surface.npz"}
@@ -85,13 +85,13 @@ def test_figures_are_left_out_where_they_are_switched_off():
 def test_outputs_without_truth():
     scene = load_scene("free")
     real = dataclasses.replace(scene, arm=dataclasses.replace(scene.arm, emulated=False))
-    assert "truth.npz" in make_plan(scene).outputs
-    assert "truth.npz" not in make_plan(real).outputs
+    assert "truth.npz" in canprobe.plan(scene).outputs
+    assert "truth.npz" not in canprobe.plan(real).outputs
 
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
 def test_json_says_what_the_plan_says(name):
-    plan = make_plan(load_scene(name))
+    plan = canprobe.plan(load_scene(name))
     document = json.loads(json.dumps(plan.as_dict(), allow_nan=False))
     assert document["scene"] == name
     assert [node["node_id"] for node in document["nodes"]] == list(plan.node_ids)
@@ -102,7 +102,7 @@ def test_json_says_what_the_plan_says(name):
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
 def test_text_shows_every_node_pdo_and_omission(name):
-    plan = make_plan(load_scene(name))
+    plan = canprobe.plan(load_scene(name))
     text = plan_text(plan)
     assert all(f"{pdo.cob_id:03X}h" in text for pdo in plan.pdos)
     assert all(node.role in text for node in plan.nodes)
@@ -111,7 +111,6 @@ def test_text_shows_every_node_pdo_and_omission(name):
 
 
 def test_public_name_is_the_function():
-    assert canprobe.plan is make_plan
     assert canprobe.plan(canprobe.load_scene("free")).scene.name == "free"
 
 

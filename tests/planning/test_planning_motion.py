@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scenes import change, reasons
 
-from canprobe.planning import make_plan
+import canprobe
 from canprobe.planning.surface_path import surface_path
 from canprobe.scene import ObjectSettings
 from canprobe.scene_geometry import true_object
@@ -21,7 +21,7 @@ def cylinder():
 
 @pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
 def test_packaged_scenes_fit(name):
-    plan = make_plan(load_scene(name))
+    plan = canprobe.plan(load_scene(name))
     if plan.joint_speeds is not None:
         pairs = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
         assert all(needed <= 0.6 * limit for needed, limit in pairs), "a packaged scene keeps clear of the limits"
@@ -42,9 +42,9 @@ def test_hollow_tighter_than_the_probe_is_refused(cylinder, obj):
 
 def test_wider_hollow_and_tight_ridge_are_no_problem(cylinder):
     small = change(cylinder, task={"length_mm": 10.0, "width_mm": 4.0})
-    assert make_plan(dataclasses.replace(small, object=ObjectSettings("bowl", radius_mm=60)))
+    assert canprobe.plan(dataclasses.replace(small, object=ObjectSettings("bowl", radius_mm=60)))
     ridge = ObjectSettings("cylinder", radius_mm=12, rotation_deg=(0, 0, 20))
-    assert make_plan(dataclasses.replace(small, object=ridge))
+    assert canprobe.plan(dataclasses.replace(small, object=ridge))
 
 
 def test_object_out_of_reach_names_point_and_why(cylinder):
@@ -71,22 +71,22 @@ def test_speed_beyond_the_joints_is_refused_with_a_speed_that_fits(cylinder):
     problems = reasons(fast)
     assert any("joint 1 would need" in problem for problem in problems)
     fitting = float(problems[0].split("task.speed_mm_s to ")[1].split(",")[0])
-    assert make_plan(change(cylinder, task={"speed_mm_s": fitting}))
+    assert canprobe.plan(change(cylinder, task={"speed_mm_s": fitting}))
 
 
 def test_joint_speeds_scale_with_the_contact_speed(cylinder):
-    slow, fast = (make_plan(change(cylinder, task={"speed_mm_s": v})).joint_speeds for v in (10.0, 30.0))
+    slow, fast = (canprobe.plan(change(cylinder, task={"speed_mm_s": v})).joint_speeds for v in (10.0, 30.0))
     np.testing.assert_allclose(np.array(fast.needed_deg_s), 3 * np.array(slow.needed_deg_s), atol=0.01)
 
 
 def test_rolling_share_lowers_joint_speeds(cylinder):
-    pure, half = (make_plan(change(cylinder, task={"rolling_share": v})).joint_speeds for v in (0.0, 0.5))
+    pure, half = (canprobe.plan(change(cylinder, task={"rolling_share": v})).joint_speeds for v in (0.0, 0.5))
     assert max(half.needed_deg_s) < max(pure.needed_deg_s)
 
 
 def test_swing_of_a_free_scene():
     scene = load_scene("free")
-    speeds = make_plan(scene).joint_speeds
+    speeds = canprobe.plan(scene).joint_speeds
     assert speeds.needed_deg_s[0] == pytest.approx(5 * 2 * math.pi / 4, abs=1e-3)
     assert any("joint 1 would move" in p for p in reasons(change(scene, task={"swing_deg": (25.0, 5, 5, 5, 5, 5)})))
     assert any("swing slower" in p for p in reasons(change(scene, task={"swing_period_s": 0.1})))
@@ -131,7 +131,7 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
     real = dataclasses.replace(
         change(cylinder, arm={"emulated": False}, sensor={"emulated": False}), object=None, plant=None
     )
-    plan = make_plan(real)
+    plan = canprobe.plan(real)
     assert plan.fidelity is None
     assert plan.joint_speeds.needed_deg_s[0] > 0
     path, _ = surface_path(real)
@@ -153,7 +153,7 @@ def tilted(scene, degrees, clearance_mm=3.0):
 
 def test_a_first_touch_beside_the_array_is_refused(cylinder):
     """A probe of 40 mm meets a tilted plane 40 mm · tilt beside its pole; the array ends at 12.7 mm, 18.2 degrees."""
-    assert make_plan(tilted(cylinder, 17.9))
+    assert canprobe.plan(tilted(cylinder, 17.9))
     (problem,) = reasons(tilted(cylinder, 18.5))
     assert "would be 12.9 mm beside the middle of the array, which reaches 12.7 mm" in problem
     assert "turn task.approach_normal by 18 deg" in problem or "turn task.approach_normal by 19 deg" in problem

@@ -6,8 +6,8 @@ import json
 
 import pytest
 
+import canprobe
 from canprobe.cli import main
-from canprobe.planning import make_plan
 from canprobe.planning.timeline import timeline, timeline_rows
 from canprobe.planning.traffic import on_the_wire
 from canprobe.scene_loader import load_scene
@@ -27,7 +27,7 @@ def scenes():
 
 @pytest.fixture(scope="module", params=range(6), ids=["cylinder", "grouped", "split", "fd", "listen", "free"])
 def plan(request):
-    return make_plan(list(scenes())[request.param])
+    return canprobe.plan(list(scenes())[request.param])
 
 
 def test_one_frame_at_a_time_on_each_bus(plan):

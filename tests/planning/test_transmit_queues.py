@@ -7,7 +7,7 @@ from scenes import change, refused
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.planning import make_plan, plan_text
+from canprobe.planning import plan_text
 from canprobe.scene_loader import load_scene
 
 HEARTBEAT, SYNC, FULL = 65, 65, 135
@@ -20,8 +20,8 @@ def fifo(name, **sections):
 def test_sync_behind_the_masters_heartbeat_by_hand():
     """77Fh is the last to win the bus: before it go the frame on the wire, nine tactile PDOs, a heartbeat;
     only then comes SYNC, which waits for one frame at most in a priority queue."""
-    assert make_plan(load_scene("listen")).traffic.sync_response_ns == (HEARTBEAT + SYNC) * 1000
-    plan = make_plan(fifo("listen"))
+    assert canprobe.plan(load_scene("listen")).traffic.sync_response_ns == (HEARTBEAT + SYNC) * 1000
+    plan = canprobe.plan(fifo("listen"))
     on_the_wire = HEARTBEAT  # nothing is below 77Fh: the longest frame that was queued before it, of its own node
     assert plan.traffic.sync_response_ns == (on_the_wire + 9 * FULL + HEARTBEAT + HEARTBEAT + SYNC) * 1000
     assert 'bus.transmit_queue = "fifo"' in plan_text(plan)
@@ -29,10 +29,10 @@ def test_sync_behind_the_masters_heartbeat_by_hand():
 
 
 def test_what_shares_a_queue_shares_its_worst_case():
-    plan = make_plan(fifo("free", cycle={"rate_hz": 125.0}))
+    plan = canprobe.plan(fifo("free", cycle={"rate_hz": 125.0}))
     commands = {pdo.response_ns for pdo in plan.pdos if pdo.direction == "rpdo"}
     assert len(commands) == 1, "all in the master's queue, behind the same heartbeat"
-    priority = make_plan(change(load_scene("free"), cycle={"rate_hz": 125.0}))
+    priority = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": 125.0}))
     for queued, first in zip(plan.pdos, priority.pdos, strict=True):
         assert queued.response_ns > first.response_ns
     assert plan.traffic.load == priority.traffic.load

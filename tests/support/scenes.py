@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+import canprobe
 from canprobe.errors import PlanError
-from canprobe.planning import make_plan
 from canprobe.scene import Scene
 
 
@@ -21,7 +21,7 @@ def change(scene: Scene, **sections: dict[str, Any]) -> Scene:
 def refused(scene: Scene) -> PlanError:
     """Why a scene that must have no plan has none."""
     with pytest.raises(PlanError) as caught:
-        make_plan(scene)
+        canprobe.plan(scene)
     return caught.value
 
 

@@ -8,8 +8,8 @@ import math
 import numpy as np
 import pytest
 
+import canprobe
 from canprobe.errors import PlanError, UsageError
-from canprobe.planning import make_plan
 from canprobe.scene import ObjectSettings
 from canprobe.scene_loader import load_scene
 from canprobe.touch.contact import ContactSample, Doubt, indentation_from_force
@@ -82,7 +82,7 @@ class TestShapes:
         short = dataclasses.replace(scene.task, length_mm=10.0, width_mm=4.0)
         scene = dataclasses.replace(scene, task=short, object=ObjectSettings("bowl", radius_mm=30))
         with pytest.raises(PlanError, match="tighter than the probe"):
-            make_plan(scene)
+            canprobe.plan(scene)
         with pytest.raises(UsageError, match="the probe's own curvature"):
             indentation_from_force(1.0, 1.27e8, 0.04, (-1 / 0.03, -1 / 0.03))
 

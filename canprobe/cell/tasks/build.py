@@ -138,9 +138,10 @@ def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
     return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, rounds)
 
 
-def estimates_of(task: Touch, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
+def estimates_of(setup: Setup, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:
     """What the tracker's estimator said, where it is one of ``methods``, and the others on the same contacts."""
-    assert task.shape is not None
+    task = setup.task
+    assert isinstance(task, Touch) and task.shape is not None
     every = max(1, round(0.1 * task.array.rate_hz))
     return {
         method: tracker.records

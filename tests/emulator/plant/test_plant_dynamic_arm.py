@@ -8,7 +8,6 @@ import pytest
 from canprobe.emulator.plant.arm import IdealArm
 from canprobe.emulator.plant.arms import make_arm, make_equations
 from canprobe.emulator.plant.config import PlantConfig
-from canprobe.scene_setup import Dynamics
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping
 from canprobe.emulator.plant.equations import Effects
 from canprobe.emulator.plant.held_step import held_rosenbrock2
@@ -19,6 +18,7 @@ from canprobe.robot.actuation import counts_per_radian, motors_per_joint
 from canprobe.robot.kinematics import forward_jacobian, tool_z_offset
 from canprobe.robot.puma260 import ELBOW_FORM, MODELS, UPENN, joints_to_counts
 from canprobe.robot.touching import start_posture
+from canprobe.scene_setup import Dynamics
 from canprobe.touch.objects import make_object
 
 CYCLE = 2_500_000

@@ -7,7 +7,6 @@ import pytest
 
 from canprobe.emulator.plant.arms import make_equations
 from canprobe.emulator.plant.config import PlantConfig
-from canprobe.scene_setup import Dynamics
 from canprobe.emulator.plant.contact import elastic_contact
 from canprobe.emulator.plant.equations import Effects
 from canprobe.emulator.plant.field import SIDE
@@ -20,6 +19,7 @@ from canprobe.robot.actuation import joints_per_motor
 from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.puma260 import UPENN, joints_to_counts
 from canprobe.robot.touching import start_posture
+from canprobe.scene_setup import Dynamics
 from canprobe.touch.bowl import LIP_M
 from canprobe.touch.objects import make_object
 
