@@ -174,9 +174,6 @@ class TaskSettings:
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
     heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane
     regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0  # towards the object where contact is lost; 0: give up
-    turn_max_deg: Annotated[float, Range(0, 180), SCANNING] = (
-        90.0  # that the plan may turn it where joints are too slow
-    )
     length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0  # full size; a circle's diameter
     width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
     wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave

@@ -27,7 +27,7 @@ ALLOWED = {
     "eds": set(),
     "robot": {"protocol"},
     "touch": {"protocol", "robot"},
-    "plant": {"protocol", "robot", "touch"},
+    "plant": {"protocol", "robot", "touch", "scene"},
     "scene": PURE,
     "planning": PURE | {"scene"},
     "bus": SCENE,

@@ -50,8 +50,8 @@ def test_the_first_answer_gives_the_force_no_knock(axial):
 
 def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
     session, controller = axial
-    scene = session.scene
-    off = replace(scene, shape=replace(scene.shape, patch=False))
+    task = session.plan.setup.task
+    off = replace(task, shape=replace(task.shape, patch=False))
     records = replay_samples(make_shape_estimator(off, "recursive"), controller.shape.samples, 8)
     found = score(session, records)
     assert found.observed_fraction == 0.0
@@ -63,10 +63,10 @@ def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
 def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):
     session, controller = axial
     samples = controller.shape.samples
-    ml = replay_samples(make_shape_estimator(session.scene, "ml"), samples, 40)[-1].estimate
+    ml = replay_samples(make_shape_estimator(session.plan.setup.task, "ml"), samples, 40)[-1].estimate
     assert ml.method == "ml+patch"
     assert ml.kappa == pytest.approx([1 / 0.036, 0.0], abs=2.8)
-    paper = replay_samples(make_shape_estimator(session.scene, "chen1996"), samples, 40)[-1].estimate
+    paper = replay_samples(make_shape_estimator(session.plan.setup.task, "chen1996"), samples, 40)[-1].estimate
     assert paper.method == "chen1996"
     assert not paper.observed.all()
 

@@ -16,11 +16,11 @@ from canprobe.emulator.plant.contact import elastic_contact
 from canprobe.planning import plan_text
 from canprobe.planning.contact_window import PITCH_M, patch_radius_m
 from canprobe.planning.cut_patch import cut_patch, measured_share, true_force_n
-from canprobe.scene import ProbeSettings
 from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import resolve
 from canprobe.scene_writer import dump_scene
 
-PROBE = ProbeSettings(radius_mm=40.0, stiffness_n_m3=1.27e8)
+PROBE = resolve(load_scene("cylinder")).probe
 
 
 @pytest.mark.parametrize("side, off", [(4, 0.0), (4, 0.75), (6, 0.0), (6, 0.75), (8, 0.75)])
@@ -28,7 +28,7 @@ PROBE = ProbeSettings(radius_mm=40.0, stiffness_n_m3=1.27e8)
 def test_share_against_points_on_a_grid(side, off, force):
     """The plant's own patch and pressure, summed over a million points."""
     radius = patch_radius_m(force, PROBE)
-    contact = elastic_contact(radius**2 / 0.08, (0.0, 0.0), 0.04, PROBE.stiffness_n_m3)
+    contact = elastic_contact(radius**2 / 0.08, (0.0, 0.0), 0.04, PROBE.stiffness)
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 1001)] * 2)
     pressure = np.clip(1.0 - x**2 - y**2, 0.0, None)
     half, middle = side / 2 * PITCH_M / contact.a, off * PITCH_M / contact.a
@@ -48,7 +48,7 @@ def test_the_true_force_is_the_one_of_which_the_target_is_inside(side):
     true = true_force_n(2.0, PROBE, side, 100.0)
     assert true * measured_share(true, PROBE, side) == pytest.approx(2.0, rel=1e-6)
     assert true_force_n(2.0, PROBE, side, 0.999 * true) is None
-    stiffer = dataclasses.replace(PROBE, stiffness_n_m3=10 * PROBE.stiffness_n_m3)
+    stiffer = dataclasses.replace(PROBE, stiffness=10 * PROBE.stiffness)
     assert true_force_n(2.0, stiffer, side, 100.0) < true
 
 
@@ -81,7 +81,7 @@ def test_more_than_the_force_limit_unfelt_is_refused(tmp_path, capsys):
 
 def test_features_and_the_whole_image_cut_nothing():
     for mode in ("features", "image"):
-        assert cut_patch(change(load_scene("foam"), sensor={"mode": mode, "window": 4})) is None
+        assert cut_patch(resolve(change(load_scene("foam"), sensor={"mode": mode, "window": 4}))) is None
 
 
 def test_errors_on_the_wire_are_a_warning():

@@ -8,11 +8,13 @@ import pytest
 import canprobe
 from canprobe.cli import main
 from canprobe.errors import PlanError, SceneError
+from canprobe.planning import make_plan
 from canprobe.planning.identifiers import order_by_deadline
 from canprobe.planning.open_keys import opened, second_channel
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.timing import Message, worst_case_response
 from canprobe.scene_loader import dump_scene, load_scene, parse_scene
+from canprobe.scene_resolve import resolve
 
 
 def change(scene, **sections):
@@ -26,12 +28,16 @@ def cylinder():
     return load_scene("cylinder")
 
 
+def opened_plan(scene):
+    return make_plan(opened(resolve(scene)))
+
+
 def chosen(plan):
     return {choice.key: choice.value for choice in plan.choices}
 
 
 def test_what_fits_is_left_as_the_contract_has_it(cylinder):
-    plan = canprobe.plan(opened(cylinder))
+    plan = opened_plan(cylinder)
     assert plan.pdos == canprobe.plan(cylinder).pdos
     assert chosen(plan) == {
         "sensor.channel": '"can0"', "bus.fd": "false", "arm.grouped_rpdo": "false", "bus.cob_ids": '"default"',
@@ -50,7 +56,7 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
     for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
         with pytest.raises(PlanError):
             canprobe.plan(change(scene, **half))
-    plan = canprobe.plan(opened(scene))
+    plan = opened_plan(scene)
     assert chosen(plan)["arm.grouped_rpdo"] == "true" and chosen(plan)["bus.cob_ids"] == '"by_deadline"'
     assert plan.traffic.budget.slack_ns > 0
     assert len(plan.buses) == 1
@@ -67,11 +73,11 @@ def test_ways_out_name_changes_that_fit_only_together(cylinder):
 
 def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
     image = change(cylinder, sensor={"mode": "image"})
-    split = canprobe.plan(opened(image))
+    split = opened_plan(image)
     assert [(bus.channel, bus.node_ids) for bus in split.buses] == [("can0", (1, 2, 3, 4, 5, 6)), ("can1", (16,))]
     assert {pdo.channel for pdo in split.pdos if pdo.kind == "tactile"} == {"can1"}
     assert all(bus.traffic.load < 1 for bus in split.buses)
-    fd = canprobe.plan(opened(change(image, sensor={"eds": "tactile_array_fd.eds"})))
+    fd = opened_plan(change(image, sensor={"eds": "tactile_array_fd.eds"}))
     assert len(fd.buses) == 1 and fd.scene.bus.fd is True and chosen(fd)["bus.fd"] == "true"
 
 
@@ -86,13 +92,13 @@ def test_the_sensor_gives_less_last_of_all(cylinder):
     assert canprobe.plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
     fast = change(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
     assert canprobe.plan(fast).scene.sensor.mode == "features"
-    assert canprobe.plan(opened(fast)).scene.sensor.mode == "window"
+    assert opened_plan(fast).scene.sensor.mode == "window"
     assert canprobe.plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
 
 
 def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
     with pytest.raises(PlanError) as refused:
-        canprobe.plan(opened(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"})))
+        opened_plan(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"}))
     first, *_, last = refused.value.problems
     assert first.startswith("none of 32 ways to fill what is left open fits; the nearest: sensor.mode = ")
     assert "1280 µs of the 1000 µs" in last and refused.value.ways_out[0].startswith("cycle.rate_hz = ")

@@ -11,7 +11,8 @@ import canprobe
 from canprobe.planning.surface_path import surface_path
 from canprobe.scene import ObjectSettings
 from canprobe.scene_geometry import true_object
-from canprobe.scene_loader import load_scene, packaged_scenes
+from canprobe.scene_loader import load_scene
+from canprobe.scene_resolve import packaged_scenes, resolve
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,8 @@ def test_matrix_that_is_no_surface_at_the_origin(cylinder):
 @pytest.mark.parametrize("name", ["cylinder", "sphere", "saddle", "plane"])
 def test_path_lies_on_the_object_and_spans_the_region(name):
     scene = load_scene(name)
-    path, problems = surface_path(scene)
+    setup = resolve(scene)
+    path, problems = surface_path(setup.task, setup.truth.object)
     assert not problems
     shape = true_object(scene.object)
     assert max(abs(shape.closest(point).distance) for point in path.points) < 1e-9
@@ -134,7 +136,7 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
     plan = canprobe.plan(real)
     assert plan.fidelity is None
     assert plan.joint_speeds.needed_deg_s[0] > 0
-    path, _ = surface_path(real)
+    path, _ = surface_path(resolve(real).task, None)
     np.testing.assert_allclose(path.normals, np.tile([0, 0, 1], (len(path.normals), 1)))
 
 
