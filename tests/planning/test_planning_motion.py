@@ -11,8 +11,8 @@ import canprobe
 from canprobe.planning.surface_path import surface_path
 from canprobe.scene import ObjectSettings
 from canprobe.scene_geometry import true_object
-from canprobe.scene_loader import load_scene
-from canprobe.scene_resolve import packaged_scenes, resolve
+from canprobe.scene_loader import load_scene, packaged_scenes
+from canprobe.scene_resolve import resolve
 
 
 @pytest.fixture(scope="module")
