@@ -10,10 +10,12 @@ from collections.abc import Iterator
 
 from canopen.objectdictionary import ObjectDictionary, ODRecord, ODVariable, datatypes
 
+from canprobe.eds.information import commissioned_node
 from canprobe.eds.lines import Section
 from canprobe.eds.source import Source
 
 _INVALID = 1 << 31
+_CAN_ID = 0x1FFFFFFF
 _MOST = 0xFFFFFFFF
 _SERVO_DRIVE = 0x00020192
 """Device type of a servo drive of CiA 402."""
@@ -97,29 +99,41 @@ def _stated_identity(od: ObjectDictionary) -> dict[int, int]:
 
 
 def _repair_identifiers(source: Source, heads: dict[int, Section], od: ObjectDictionary) -> None:
-    """COB-IDs of the pre-defined connection set that forget the node-ID."""
-    node_id = source.node_id
+    """COB-IDs of the pre-defined connection set that forget the node-ID, or are of the node that a DCF is made for.
+
+    Any other COB-ID was chosen by somebody and stays.
+    """
+    node_id, made_for = source.node_id, commissioned_node(source.sections) or source.node_id
     for index, subindex, base in ((0x1200, 1, 0x600), (0x1200, 2, 0x580)):
         variable = variable_at(od, index, subindex)
-        if variable is not None and variable.default != base + node_id:
-            told = _text(variable)
-            _tell(source, heads, (index, subindex), f"{told}, but the first SDO server has {base:X}h + $NODEID; taken")
+        if variable is not None and _present(variable) != base + node_id:
+            told, key = _text(variable)
+            text = f"{told}, but the first SDO server has {base:X}h + $NODEID; taken"
+            _tell(source, heads, (index, subindex), text, key)
             variable.default, variable.value, variable.relative = base + node_id, None, True
     for index, subindex, base in ((0x1014, 0, 0x80), *((index, 1, base) for index, base in _PDO_BASES.items())):
         variable = variable_at(od, index, subindex)
-        if variable is not None and variable.value is None and _forgets_node(variable, base):
-            told = _text(variable)
+        if variable is None:
+            continue
+        told, key = _text(variable)
+        if variable.value is None and _forgets_node(variable, base):
             _tell(source, heads, (index, subindex), f"{told} without $NODEID, which is added")
             assert isinstance(variable.default, int)
             variable.default, variable.relative = variable.default + node_id, True
+        elif made_for != node_id and (cob_id := _present(variable)) & _CAN_ID == base + made_for:
+            cob_id += node_id - made_for
+            _tell(source, heads, (index, subindex), f"{told} is of node {made_for}; {cob_id:#x} taken", key)
+            setattr(variable, "value" if key == "ParameterValue" else "default", cob_id)
 
 
 def _forgets_node(variable: ODVariable, base: int) -> bool:
     return isinstance(variable.default, int) and not variable.relative and variable.default & ~_INVALID == base
 
 
-def _text(variable: ODVariable) -> str:
-    return str(getattr(variable, "default_raw", "")) or "empty"
+def _text(variable: ODVariable) -> tuple[str, str]:
+    """The value that counts, as the file writes it, and its key."""
+    field, key = ("default_raw", "DefaultValue") if variable.value is None else ("value_raw", "ParameterValue")
+    return str(getattr(variable, field, "")) or "empty", key
 
 
 def _tell(

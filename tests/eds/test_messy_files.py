@@ -89,6 +89,7 @@ VALUES = {
     "no_statusword.eds": {(0x6040, 0): 0},
     "untold_drive.eds": {(0x1000, 0): 0x20192, (0x1018, 1): 0xFB, (0x1018, 2): 0x62100000, (0x1018, 3): None},
     "encoder406.eds": {(0x6040, 1): -5, (0x6041, 0): 0x12345678, (0x6060, 0): 70000, (0x6064, 0): "north"},
+    "other_node.dcf": {(0x1014, 0): 0x85, (0x1200, 1): 0x605},
     "drive402.eds": {(0x1000, 0): 0x20192, (0x6081, 0): 4096, (0x6064, 0): None, (0x60C2, 2): -3},
 }
 
@@ -318,6 +319,18 @@ def test_identity_that_is_not_described_is_served_as_device_info_has_it(tmp_path
     node = make_eds_node(check_eds(path, NODE_ID).usable(), NODE_ID)
     node.start(0)
     assert [upload(node, 0x1018, sub)[0] for sub in range(4)] == [3, 7, 8, 9]
+
+
+@pytest.mark.parametrize("node_id", [5, 7, 9])
+def test_a_configuration_of_another_node_leaves_no_node_deaf(node_id):
+    """What the pre-defined connection set gives to node 7 is given to the node that is asked for; the rest stays."""
+    for od in (load_eds(FOLDER / "other_node.dcf", node_id), check_eds(FOLDER / "other_node.dcf", node_id).usable()):
+        node = make_eds_node(od, node_id)
+        node.start(0)
+        cob_ids = {(0x1014, 0): 0x80, (0x1400, 1): 0x200, (0x1800, 1): 0xC0000180, (0x1801, 1): 0x280}
+        for (index, subindex), base in cob_ids.items():
+            assert upload(node, index, subindex) == (base + node_id).to_bytes(4, "little")
+        assert upload(node, 0x1401, 1) == (0x183).to_bytes(4, "little"), "what it hears of node 3"
 
 
 @pytest.mark.parametrize("name", ["compact.eds", "no_statusword.eds"])
