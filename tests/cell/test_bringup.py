@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
@@ -275,6 +276,15 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q"][:, 5]) > 0.01
     assert undrawn_run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
+    scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
+    assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
 
 
 def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
