@@ -26,14 +26,14 @@ class Joints:
         position: (6,) rad.
         T_base_probe: (4, 4) probe's centre frame (z is the pole) to base, m; None in a scene without a probe.
         age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
-        torque_permille: of each motor's rated torque (6,), as the drive tells it.
+        torque_permille: of each motor's rated torque (6,), as the drive tells it; see `Measurement`.
         statuswords: CiA 402 statuswords (6,).
     """
 
     position: Array
     T_base_probe: Array | None = None
     age: tuple[int, ...] = ()
-    torque_permille: tuple[int, ...] = ()
+    torque_permille: tuple[float, ...] = ()
     statuswords: tuple[int, ...] = ()
 
 

@@ -127,7 +127,8 @@ def emulate_eds(
         speaks_lss = node_id == UNCONFIGURED or od.device_information.LSS_supported
         nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
         if warnings := len(reading.warnings):
-            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `canprobe eds check {name}` tells them")
+            check = f"canprobe eds check {name} --node-id {od.node_id}"
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` tells them")
     _check_addresses(nodes)
     _make_places(None, store_folder)
     with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:

@@ -141,7 +141,7 @@ def summarise(
             for bus in session.plan.buses
         },
         "traffic": _traffic(session),
-        "left_out": [f"{what}: {why}" for what, why in session.plan.left_out],
+        "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
         "warnings": list(session.plan.warnings),
         "bridges": bridges,
         "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],

@@ -31,7 +31,7 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
         subs: the sections of its sub-objects.
         kind: `ARRAY` or `RECORD`.
     """
-    if is_variable(index):
+    if is_variable(index, source.drive):
         source.fault(head, "", "the standard has a variable at this index, not an array or record")
         return None
     name = head.value("ParameterName")

@@ -19,7 +19,7 @@ _OBJECT_DOMAIN = 2
 def data_type_of(source: Source, section: Section, index: int, subindex: int) -> int | None:
     """The data type that a section means, one of `values.KNOWN`; None where it cannot be known (a fault)."""
     text = section.value("DataType")
-    demanded = standard_type(index, subindex)
+    demanded = standard_type(index, subindex, source.drive)
     if not text:
         return _untyped(source, section, demanded)
     if (named := NAMES.get(text.upper())) is not None:

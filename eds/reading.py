@@ -7,15 +7,16 @@ Source: CiA 306-1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.eds.faults import Fault, Faults
 from canprobe.eds.information import commissioned_node, read_information
-from canprobe.eds.lines import decode, split_sections
+from canprobe.eds.lines import Section, decode, split_sections
 from canprobe.eds.lists import check_lists
+from canprobe.eds.numbers import parse_sum
 from canprobe.eds.objects import build_objects, find_objects
 from canprobe.eds.repairs import repair, variable_at
 from canprobe.eds.source import Source
@@ -24,6 +25,7 @@ from canprobe.errors import EdsError
 _PROFILE = 0xFFFF
 _DRIVE_PROFILE = 402
 _DRIVE_OBJECTS = (0x6040, 0x6041)
+_MODES_OF_OPERATION = 0x6060
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +80,18 @@ def is_drive(od: ObjectDictionary) -> bool:
     return device_profile(od) == _DRIVE_PROFILE and all(index in od.indices for index in _DRIVE_OBJECTS)
 
 
+def _describes_drive(heads: dict[int, Section], composites: set[int], node_id: int) -> bool:
+    """Whether CiA 402 speaks of this device: by 1000h, or, where the file gives it no value, by what a drive has."""
+    head = heads.get(0x1000)
+    text = (head.value("ParameterValue") or head.value("DefaultValue")) if head is not None else ""
+    if not text:
+        return heads.keys() - composites >= {*_DRIVE_OBJECTS, _MODES_OF_OPERATION}
+    try:
+        return parse_sum(text, node_id, lambda _: None)[0] & _PROFILE == _DRIVE_PROFILE
+    except ValueError:  # a fault, found where the value is read
+        return False
+
+
 def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Reading:
     """Read a file, whatever is in it.
 
@@ -100,6 +114,7 @@ def read_eds(path: Path, node_id: int | None, *, serving: bool = True) -> Readin
     read_information(source, od)
     heads, subs = find_objects(source)
     if heads or subs:
+        source = replace(source, drive=_describes_drive(heads, set(subs), source.node_id))
         build_objects(source, heads, subs, od)
         check_lists(source, {**{index: next(iter(members.values())) for index, members in subs.items()}, **heads})
         repair(source, heads, od, serving)

@@ -18,11 +18,13 @@ class Source:
         sections: of the file.
         node_id: for $NODEID.
         faults: collects what is wrong.
+        drive: the device is a drive of CiA 402.
     """
 
     sections: Sections
     node_id: int
     faults: Faults
+    drive: bool = False
 
     def warn(self, section: Section, key: str, text: str) -> None:
         """A warning at a key, or at its section where the key is missing."""

@@ -25,15 +25,19 @@ _READ_ONLY = frozenset(
 _COMMUNICATION = {1: _U32, 2: _U8, 3: _U16, 5: _U16, 6: _U8}
 COUNTING = frozenset({0x1003, *range(0x1600, 0x1800), *range(0x1A00, 0x1C00)})
 """Where subindex 0 tells how many entries are in use, and can be written."""
+_PROFILE_AREA = 0x6000
+"""From here on CiA 402 speaks of drives alone; what other profiles have there is not known here."""
 
 
-def is_variable(index: int) -> bool:
-    """Whether a standard has a plain variable at this index."""
-    return index in _VARIABLES
+def is_variable(index: int, drive: bool) -> bool:
+    """Whether a standard has a plain variable at this index of a device, which may be a drive."""
+    return index in _VARIABLES and (drive or index < _PROFILE_AREA)
 
 
-def standard_type(index: int, subindex: int) -> int | None:
-    """The data type that a standard fixes, None where a maker may choose."""
+def standard_type(index: int, subindex: int, drive: bool) -> int | None:
+    """The data type that a standard fixes for a device, which may be a drive; None where a maker may choose."""
+    if index >= _PROFILE_AREA and not drive:
+        return None
     if subindex == 0:
         fixed = index in _ARRAYS or 0x1400 <= index < 0x1C00 or 0x1200 <= index < 0x1300
         return _U8 if fixed else _VARIABLES.get(index)
@@ -44,8 +48,9 @@ def standard_type(index: int, subindex: int) -> int | None:
     return _U32 if 0x1200 <= index < 0x1300 and subindex < 3 else _ARRAYS.get(index)
 
 
-def standard_access(index: int, subindex: int, composite: bool) -> str:
+def standard_access(index: int, subindex: int, composite: bool, drive: bool) -> str:
     """What AccessType is where the file does not say: the standard's, else free access."""
-    if index in _READ_ONLY or (composite and subindex == 0 and index not in COUNTING):
+    read_only = index in _READ_ONLY and (drive or index < _PROFILE_AREA)
+    if read_only or (composite and subindex == 0 and index not in COUNTING):
         return "ro"
     return "rw"

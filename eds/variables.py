@@ -80,7 +80,9 @@ def _access(source: Source, section: Section, index: int, subindex: int, composi
     text = section.value("AccessType").lower()
     if text in _ACCESS:
         return text
-    taken = _ACCESS_WORDS.get("".join(filter(str.isalpha, text))) or standard_access(index, subindex, composite)
+    taken = _ACCESS_WORDS.get("".join(filter(str.isalpha, text))) or standard_access(
+        index, subindex, composite, source.drive
+    )
     what = f"{section.value('AccessType')!r} is none of CiA 306" if text else "missing"
     source.warn(section, "AccessType", f"{what}; taken for {taken}")
     return taken

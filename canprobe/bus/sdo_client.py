@@ -12,6 +12,8 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping
 from typing import Any
 
+from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import SIGNED_TYPES
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import PumpedNetwork
@@ -41,8 +43,31 @@ def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, 
     yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
 
 
-def upload(index: int, subindex: int) -> Generator[bytes | None, bytes, bytes]:
+def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
+    """Read an entry by its data type, in the entry's own length whatever the length of the answer.
+
+    Many nodes answer with four bytes where the entry has one or two. What is beyond its own must then be padding.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or one that does not fit the entry.
+    """
+    size = len(variable) // 8
+    data = yield from upload(variable.index, variable.subindex, size)
+    own, beyond = data[:size], data[size:]
+    negative = variable.data_type in SIGNED_TYPES and own[-1:] >= b"\x80"
+    if len(own) < size or (any(beyond) and not (negative and min(beyond) == 0xFF)):
+        got = f"{len(data)}: {data.hex(' ')}" if data else "none"
+        raise SdoCommunicationError(f"expected {size} byte{'s' * (size > 1)}, got {got}")
+    return variable.decode_raw(own)
+
+
+def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
     """Read an entry of any length.
+
+    Args:
+        index, subindex: of the entry.
+        size: bytes that are taken of an expedited answer that does not tell how many of its four are the value.
 
     Raises:
         SdoAbortedError: the node refused.
@@ -50,7 +75,7 @@ def upload(index: int, subindex: int) -> Generator[bytes | None, bytes, bytes]:
     """
     answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
     if answer[0] & _EXPEDITED:
-        return answer[4 : 8 - (answer[0] >> 2 & 3 if answer[0] & _SIZED else 0)]
+        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
     return (yield from _segments())
 
 

@@ -13,11 +13,10 @@ from dataclasses import dataclass
 from typing import Any
 
 from canopen import ObjectDictionary
-from canopen.objectdictionary import ObjectDictionaryError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.sdo_client import download, hold_dialogues, upload
+from canprobe.bus.sdo_client import download, hold_dialogues, read_value, upload
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import NmtCommand, NmtState, pack_nmt
@@ -314,8 +313,8 @@ class BringUp:
     def _read(self, setup: NodeSetup, index: int, subindex: int) -> Generator[bytes | None, bytes, int]:
         variable = _variable(setup, index, subindex)
         try:
-            return int(variable.decode_raw((yield from upload(index, subindex))))
-        except (SdoAbortedError, SdoCommunicationError, ObjectDictionaryError) as error:  # the last: of another size
+            return int((yield from read_value(variable)))
+        except (SdoAbortedError, SdoCommunicationError) as error:
             raise NodeError(
                 setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
             ) from error

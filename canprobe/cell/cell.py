@@ -392,7 +392,8 @@ class Cell:
         if self.drives is not None:
             row["q_rad"] = measurement.q
             row["statusword"] = measurement.statuswords
-            row["torque_permille"] = measurement.torque_permille
+            if measurement.torque_permille:
+                row["torque_permille"] = measurement.torque_permille
         if command is not None:
             if command.q_target is not None:
                 row["q_target_rad"] = command.q_target

@@ -8,7 +8,7 @@ from typing import Any
 
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port
-from canprobe.cell.lss import assign, find_unconfigured
+from canprobe.cell.lss import FoundTwiceError, assign, find_unconfigured
 from canprobe.cell.lss_choice import Assignment, Wanted, choose_assignments
 from canprobe.cell.scan import NUMBERS, scan_nodes
 from canprobe.errors import BusError
@@ -55,14 +55,19 @@ def commission(
         timeout_s: for an SDO answer.
 
     Raises:
-        BusError: nobody without an id is there though ids are wanted, or it is not clear who is meant; nothing was
-            changed.
+        BusError: nobody without an id is there though ids are wanted, it is not clear who is meant, or a device hides
+            others from the search; nothing was changed.
         NodeError: one device did not take its id; those before it have theirs.
         InterfaceError: the interface failed.
     """
     nodes = scan_nodes(port, timeout_s)
     network = PumpedNetwork(port)
-    unconfigured = find_unconfigured(network)
+    try:
+        unconfigured = find_unconfigured(network)
+    except FoundTwiceError as error:
+        if not wanted or any(want.numbers[3] is None for want in wanted):
+            raise  # who else could be meant is not known
+        unconfigured = error.found
     present = {int(node["node_id"]): _address(node) for node in nodes}
     chosen = choose_assignments(wanted, unconfigured, present, channel=port.channel, must=must)
     if wanted and not must:

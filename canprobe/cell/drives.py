@@ -5,6 +5,7 @@ The drives hold *motor* positions; the wrist's coupling is undone here and nowhe
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
@@ -33,7 +34,7 @@ class DriveAxis:
 
     Attributes:
         node_id: the node.
-        feedback: layout of its TPDO: statusword, position (counts), torque (permille).
+        feedback: layout of its TPDO: statusword, position (counts) and, where the drive can map it, torque (permille).
         commands: layouts of its RPDOs, which between them map controlword and target position (counts) once. Drives
             whose RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
     """
@@ -80,6 +81,7 @@ class DriveGroup:
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
 
     Attributes:
+        torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
         late, missed, malformed: TPDOs that were not used, or not there.
         answer_ns: from the SYNC to the last TPDO that was used.
         stopped: node ids of drives that are told to stop while the others go on.
@@ -89,7 +91,8 @@ class DriveGroup:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
-        self.torque_permille = [0] * len(axes)
+        with_torque = [len(axis.feedback.entries) > 2 for axis in axes]
+        self.torque_permille = [0 if told else math.nan for told in with_torque] if any(with_torque) else []
         self.late = 0
         self.missed = 0
         self.malformed = 0
@@ -153,7 +156,9 @@ class DriveGroup:
         except ProtocolError:
             self.malformed += 1  # and missed, unless another one comes
             return
-        word, counts, self.torque_permille[i] = values
+        word, counts, *torque = values
+        if torque:
+            self.torque_permille[i] = torque[0]
         enabled = word & _STATE_BITS == _ENABLED and self.statuswords[i] & _STATE_BITS == _ENABLED
         self.statuswords[i] = word
         self._heard[i] = self._cycle

@@ -19,10 +19,27 @@ BOOT_UP_S = 2.0
 MOST_NODES = 127
 
 
+class FoundTwiceError(BusError):
+    """A device that was found answers the search again: nobody of a higher address can be found beside it.
+
+    Attributes:
+        found: every device that was found, that one last.
+    """
+
+    def __init__(self, channel: str, found: list[LssAddress]) -> None:
+        self.found = found
+        super().__init__(
+            f"{channel}: the device {found[-1]} (vendor:product:revision:serial) answers the search for nodes without"
+            " an id again after it was found, against CiA 305, and hides those of higher addresses: give it an id"
+            f" first, as in --assign {found[-1]}=ID, or disconnect it"
+        )
+
+
 def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
     """Every node without an id, ascending by address; all LSS slaves are waiting afterwards.
 
     Raises:
+        FoundTwiceError: a device does not leave the search when it is found.
         BusError: two devices have one address, or answers do not agree.
         InterfaceError: the interface failed.
     """
@@ -34,7 +51,10 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
             is_there, numbers = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
             if not is_there or numbers is None:
                 return found
-            found.append(LssAddress(*numbers))
+            address = LssAddress(*numbers)
+            if address in found:
+                raise FoundTwiceError(network.port.channel, [*(one for one in found if one != address), address])
+            found.append(address)
             if len(lss.inquire_node_ids()) > len(found):
                 raise BusError(
                     f"{network.port.channel}: more than one node without an id has the address {found[-1]}"

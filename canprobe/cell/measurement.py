@@ -40,7 +40,7 @@ class Measurement:
         t_ns: time of its SYNC, ns since the first one.
         q: joint angles at this SYNC (6,), rad; None in a scene without an arm.
         q_age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
-        torque_permille: motor torque as reported (6,).
+        torque_permille: motor torque as reported (6,), NaN for a drive that does not report it; empty where none does.
         statuswords: CiA 402 statuswords (6,).
         enabled: every drive is in operation enabled.
         tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
@@ -53,7 +53,7 @@ class Measurement:
     t_ns: int
     q: Vector | None = None
     q_age: tuple[int, ...] = ()
-    torque_permille: tuple[int, ...] = ()
+    torque_permille: tuple[float, ...] = ()
     statuswords: tuple[int, ...] = ()
     enabled: bool = False
     tactile: TactileSample | None = None

@@ -94,11 +94,13 @@ def plan_drive_pdos(planning: PdoPlanning, setup: Setup, sync: SyncPlan, devices
 def _plan_feedback(planning: PdoPlanning, node_id: int, sync: SyncPlan, device: Abilities) -> None:
     entries = planning.entries(device, node_id, "tpdo", (STATUSWORD, POSITION))
     torque = device.entry(*TORQUE, "tpdo")
-    words = tuple(entry.word for entry in (*entries, torque) if entry is not None)
-    if torque is not None and device.mapping_problem("tpdo", 1, words) is None:
+    problem: str | None = f"6077h is {'not mappable to a TPDO' if device.has(*TORQUE) else 'missing'}"
+    if torque is not None:
+        problem = device.mapping_problem("tpdo", 1, tuple(entry.word for entry in (*entries, torque)))
+    if problem is not None:
+        planning.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
+    elif torque is not None:
         entries.append(torque)
-    else:
-        planning.not_available.append((f"torque of node {node_id}", f"{device.eds} cannot map 6077h beside 6064h"))
     layout = PdoLayout(DRIVE_TPDO1 + node_id, tuple(entries), EVERY_SYNC)
     planning.add(device, _synchronous(node_id, "tpdo", 1, layout, sync))
 

@@ -96,7 +96,7 @@ class _PlainCycle:
                     tpdo.receive_condition.wait(left_ns * 1e-9)
             self.missed += not tpdo.is_received
         for drive, tpdo in zip(self._drives, maps, strict=True):
-            _, position, _ = [variable.raw for variable in tpdo]
+            _, position, *_ = [variable.raw for variable in tpdo]
             self._held.setdefault(drive.id, position)
             controlword, target = list(drive.rpdo[1])
             controlword.raw = word

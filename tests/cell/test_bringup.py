@@ -8,6 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
@@ -181,6 +182,64 @@ def test_a_node_that_does_not_start_is_named(tmp_path):
         open_session(tmp_path, change=deaf_to_starts(9)).__enter__()
 
 
+def answering_in_other_lengths(node):
+    """For `change`: each node answers SDO uploads in its own way, all of them legal or common."""
+    hear, rest = node.receive, []
+    ways = {1: "unsized", 2: "zeros", 3: "sign", 4: "segments"}
+
+    def receive(can_id, data, t_ns):
+        frames = [(i, changed(d) if i == 0x580 + node.node_id else d) for i, d in hear(can_id, data, t_ns)]
+        if can_id == 0x600 + node.node_id and data[0] == 0x60 and rest:
+            frames[:] = [(0x580 + node.node_id, bytes([7]) + rest.pop() + bytes(3))]  # the last one, 4 of 7 bytes
+        return frames
+
+    def changed(answer):
+        if answer[0] & 0xE3 != 0x43:  # expedited, with its size
+            return answer
+        value, way = answer[4 : 8 - (answer[0] >> 2 & 3)], ways.get(node.node_id)
+        if way == "unsized":
+            return b"\x42" + answer[1:4] + value.ljust(4, b"\x55")
+        longer = value.ljust(4, b"\xff" if way == "sign" and answer[1:4] == b"\xc2\x60\x02" else b"\0")
+        if way == "segments":
+            rest[:] = [longer]
+            return b"\x41" + answer[1:4] + bytes((4, 0, 0, 0))
+        return b"\x43" + answer[1:4] + longer if way else answer
+
+    node.receive = receive
+
+
+def test_an_answer_of_another_length_is_read_in_the_objects_own(tmp_path):
+    """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
+    with open_session(tmp_path, change=answering_in_other_lengths) as session:
+        assert [report.failure for report in session.cell.bring_up_reports] == [None] * 6
+    answers = {d[0] for _, i, d in frames(tmp_path) if 0x581 <= i <= 0x584 and d[1:4] == b"\xc2\x60\x02"}
+    assert answers == {0x60, 0x42, 0x43, 0x41}
+
+
+@pytest.mark.parametrize(
+    ("answer", "got"),
+    [
+        ("43 c2 60 01 19 01 00 00", "expected 1 byte, got 4: 19 01 00 00"),
+        ("4b c2 60 01 19 ff 00 00", "expected 1 byte, got 2: 19 ff"),
+        ("43 66 60 00 32 00 01 00", "expected 2 bytes, got 4: 32 00 01 00"),
+        ("4f 66 60 00 32 00 00 00", "expected 2 bytes, got 1: 32"),
+    ],
+)
+def test_a_value_that_does_not_fit_its_object_is_named(tmp_path, answer, got):
+    answer = bytes.fromhex(answer)
+
+    def change(node):
+        hear = node.receive
+        node.receive = lambda can_id, data, t_ns: [
+            (i, answer if i == 0x583 and d[1:4] == answer[1:4] and d[0] & 0xE0 == 0x40 else d)
+            for i, d in hear(can_id, data, t_ns)
+        ]
+
+    entry = f"{answer[2]:02X}{answer[1]:02X}h:{answer[3]:02X}"
+    with pytest.raises(NodeError, match=rf"^node 3: \(joint 3\) read of {entry} failed: {got}$"):
+        open_session(tmp_path, change=change).__enter__()
+
+
 def other_make(tmp_path):
     """The EDS of a drive of another make: other names and numbers, one RPDO and TPDO with mappings that are fixed, and
     nothing that only our drive has."""
@@ -217,6 +276,15 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q"][:, 5]) > 0.01
     assert undrawn_run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+
+
+@pytest.mark.parametrize("fixed", [True, False])
+def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
+    scene = without_torque(canprobe.load_scene("free"), tmp_path, fixed=fixed)
+    result = undrawn_run(scene, out=tmp_path / "out", duration_s=0.5)
+    assert result.summary["completed"] and result.summary["faults"] == []
+    assert {"q_rad", "statusword"} <= set(result.log) and "torque_permille" not in result.log
+    assert any(line.startswith("motor torque (torque_permille of log.npz): ") for line in result.summary["left_out"])
 
 
 def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):

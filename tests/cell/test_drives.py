@@ -12,12 +12,13 @@ STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
 MODEL = MODELS["upenn"]
 ENABLED = DriveState.OPERATION_ENABLED.value
+NAN = float("nan")
 
 
-def make_group(grouped=False, repeat=40):
+def make_group(grouped=False, repeat=40, torque=range(1, 7)):
     axes = []
     for i in range(1, 7):
-        feedback = PdoLayout(0x180 + i, (STATUS, POSITION, TORQUE))
+        feedback = PdoLayout(0x180 + i, (STATUS, POSITION, TORQUE) if i in torque else (STATUS, POSITION))
         if grouped:
             entries = (TARGET, DUMMY) if i % 2 else (DUMMY, TARGET)
             commands = (PdoLayout(0x200 + i, (WORD,), 255), PdoLayout(0x301 + (i - 1) // 2 * 2, entries))
@@ -30,7 +31,8 @@ def make_group(grouped=False, repeat=40):
 def hear(group, counts, status=ENABLED, skip=()):
     for i, axis in enumerate(group.axes):
         if i not in skip:
-            group.push(axis.feedback.cob_id, axis.feedback.pack(status, round(counts[i]), -7))
+            torque = [-7] * (len(axis.feedback.entries) - 2)
+            group.push(axis.feedback.cob_id, axis.feedback.pack(status, round(counts[i]), *torque))
 
 
 def test_joint_angles_come_back_through_the_coupled_wrist():
@@ -41,6 +43,15 @@ def test_joint_angles_come_back_through_the_coupled_wrist():
     assert group.complete
     assert group.joints() == pytest.approx(q, abs=2e-4)
     assert group.torque_permille == [-7] * 6
+
+
+@pytest.mark.parametrize(("torque", "told"), [((1, 4), [-7, NAN, NAN, -7, NAN, NAN]), ((), [])])
+def test_a_drive_without_torque_in_its_tpdo_is_heard_like_the_others(torque, told):
+    group = make_group(torque=torque)
+    group.begin(0)
+    hear(group, [10.0] * 6)
+    assert group.complete and group.ages() == (0,) * 6
+    assert group.torque_permille == pytest.approx(told, nan_ok=True)
 
 
 def test_wrist_motors_turn_with_joint_4():

@@ -20,7 +20,7 @@ from canprobe.eds import load_eds
 from canprobe.emulator.lss import set_serial_number
 from canprobe.emulator.node import SlaveNode
 from canprobe.errors import BusError, NodeError
-from canprobe.protocol.lss import LssAddress
+from canprobe.protocol.lss import LssAddress, LssState
 
 EDS = "puma260_joint"
 ANY = (None, None, None)
@@ -71,6 +71,38 @@ def test_two_devices_with_one_address_are_refused(bus):
     put(bus, make_node(5), make_node(5), make_node(4))
     with pytest.raises(BusError, match=r"more than one node without an id has the address 0xca5e:0x260:0x10000:0x5 "):
         find_unconfigured(PumpedNetwork(bus.port()))
+
+
+def answering_when_selected(node):
+    """As CANopenNode does: a device without an id answers fastscan in LSS configuration state too."""
+    hear = node.receive
+
+    def receive(can_id, data, t_ns):
+        if can_id == 0x7E5 and data[0] == 0x51:
+            node.lss.state = LssState.WAITING
+        return hear(can_id, data, t_ns)
+
+    node.receive = receive
+    return node
+
+
+def test_a_device_that_is_found_again_ends_the_search_and_is_named(bus):
+    put(bus, make_node(5), answering_when_selected(make_node(7)), make_node(9))
+    port = bus.port()
+    told = r"^can0: the device 0xca5e:0x260:0x10000:0x7 .* again .* CiA 305, .* --assign 0xca5e:0x260:0x10000:0x7=ID,"
+    with pytest.raises(BusError, match=told):
+        find_unconfigured(PumpedNetwork(port))
+    assert port.clock.now_ns() < 20_000_000_000
+
+
+def test_a_device_that_is_found_again_gets_an_id_by_its_name_alone(bus):
+    stubborn, other = put(bus, answering_when_selected(make_node(7)), make_node(9))
+    with pytest.raises(BusError, match="again after it was found"):
+        commission(bus.port(), [Wanted(3, "--assign", (*ANY, None))], must=True)
+    assert (stubborn.node_id, other.node_id) == (255, 255), "which of them was meant?"
+    commission(bus.port(), [Wanted(3, "--assign", (*ANY, 7))], must=True)
+    assert (stubborn.node_id, other.node_id) == (3, 255)
+    assert commission(bus.port(), [], must=True).unconfigured == [address(9)]
 
 
 def test_lost_answers_do_not_give_a_wrong_address(bus):

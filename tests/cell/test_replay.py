@@ -9,6 +9,8 @@ import re
 import numpy as np
 import pytest
 from candump_lines import can_id_of, restamped, stamp_us
+from scenes import without_torque
+from undrawn import undrawn_run
 
 import canprobe
 from canprobe.cell.tasks.probing import Phase
@@ -73,6 +75,17 @@ def test_the_log_alone_gives_the_online_result_to_the_last_bit(lockstep_run):
     assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
     online = json.loads((lockstep_run.out / "summary.json").read_text())
     assert json.loads(json.dumps(result.summary["shape"])) == online["shape"]
+
+
+def test_a_run_of_drives_that_send_no_torque_is_replayed_and_shown(lockstep_run, tmp_path):
+    scene = without_torque(lockstep_run.plan.scene, tmp_path, fixed=True)
+    run = undrawn_run(scene, out=tmp_path / "run", duration_s=0.8)
+    assert "torque_permille" in lockstep_run.log and "torque_permille" not in run.log
+    result = canprobe.replay(run.out)
+    assert result.summary["targets"]["worst_counts"] == 0
+    assert_same(result.estimates["recursive"], run.estimates["recursive"])
+    assert main(["view", str(run.out), "--html", str(tmp_path / "run.html")]) == 0
+    assert (tmp_path / "run.html").stat().st_size > 100_000
     assert "the scene's task drove: its scan is replayed\n" in result.text()
     assert result.summary["online"]["K_max_difference_per_m"] == 0.0
     assert result.summary["online"]["replayed"] == result.summary["online"]["estimates"] >= 20

@@ -11,6 +11,7 @@ from canopen.objectdictionary.eds import import_eds
 from canprobe.eds import check_eds, eds_path, load_eds
 from canprobe.emulator.any_eds import make_eds_node
 from canprobe.errors import EdsError
+from canprobe.planning.abilities import Abilities
 
 FOLDER = Path(__file__).parent / "messy"
 FILES = sorted(FOLDER.iterdir())
@@ -86,6 +87,9 @@ VALUES = {
     "mappings.eds": {(0x1A02, 2): 0x20000008},
     "dummies.eds": {(0x1600, 1): 0x00040020},
     "no_statusword.eds": {(0x6040, 0): 0},
+    "untold_drive.eds": {(0x1000, 0): 0x20192, (0x1018, 1): 0xFB, (0x1018, 2): 0x62100000, (0x1018, 3): None},
+    "encoder406.eds": {(0x6040, 1): -5, (0x6041, 0): 0x12345678, (0x6060, 0): 70000, (0x6064, 0): "north"},
+    "other_node.dcf": {(0x1014, 0): 0x85, (0x1200, 1): 0x605},
     "drive402.eds": {(0x1000, 0): 0x20192, (0x6081, 0): 4096, (0x6064, 0): None, (0x60C2, 2): -3},
 }
 
@@ -284,6 +288,49 @@ def test_the_vendors_drive_moves_an_axis_of_its_own():
     assert seen == [0, 0, -1000, -2000, -3000, -4000, -5000], "latched at the next SYNC, there one period later"
     assert upload(node, 0x6061, 0, t_ns) == b"\x08"
     assert upload(node, 0x6502, 0, t_ns) == (1 << 7).to_bytes(4, "little"), "what the emulated drive can do"
+
+
+def test_a_drive_that_is_known_by_its_objects_alone_is_served_as_one(tmp_path):
+    """EDS files of EPOS2, PRBT, LWA4P and others give 1000h no default; some leave it out."""
+    path = FOLDER / "untold_drive.eds"
+    assert check_eds(path, NODE_ID).profile == 402
+    without = tmp_path / "without.eds"
+    without.write_text(re.sub(r"(?s)\[1000\].*?(?=\[1001\])", "", path.read_text()).replace("1=0x1000\n", ""))
+    for file in (path, without):
+        node = make_eds_node(check_eds(file, NODE_ID).usable(), NODE_ID)
+        node.start(0)
+        assert upload(node, 0x1000, 0) == (0x20192).to_bytes(4, "little")
+        assert int.from_bytes(upload(node, 0x6041, 0), "little") & 0x4F == 0x40, "switch on disabled"
+        node.receive(0x605, bytes.fromhex("2b40600006000000"), 0)
+        assert int.from_bytes(upload(node, 0x6041, 0), "little") & 0x6F == 0x21, "ready to switch on"
+
+
+def test_device_info_gives_the_identity_that_1018h_leaves_open():
+    """To the plan, which compares it in bring-up, as to the served node; a revision of 0 there is an empty field."""
+    path = FOLDER / "untold_drive.eds"
+    assert Abilities.of(str(path), NODE_ID).identity.numbers == (0xFB, 0x62100000, None, None)
+    node = make_eds_node(check_eds(path, NODE_ID).usable(), NODE_ID, eds=path)
+    assert node.lss.address.numbers == (0xFB, 0x62100000, 0, 0)
+
+
+def test_identity_that_is_not_described_is_served_as_device_info_has_it(tmp_path):
+    path = tmp_path / "bare.eds"
+    path.write_text("[DeviceInfo]\nVendorNumber=7\nProductNumber=8\nRevisionNumber=9\n[1001]\nDataType=5\n")
+    node = make_eds_node(check_eds(path, NODE_ID).usable(), NODE_ID)
+    node.start(0)
+    assert [upload(node, 0x1018, sub)[0] for sub in range(4)] == [3, 7, 8, 9]
+
+
+@pytest.mark.parametrize("node_id", [5, 7, 9])
+def test_a_configuration_of_another_node_leaves_no_node_deaf(node_id):
+    """What the pre-defined connection set gives to node 7 is given to the node that is asked for; the rest stays."""
+    for od in (load_eds(FOLDER / "other_node.dcf", node_id), check_eds(FOLDER / "other_node.dcf", node_id).usable()):
+        node = make_eds_node(od, node_id)
+        node.start(0)
+        cob_ids = {(0x1014, 0): 0x80, (0x1400, 1): 0x200, (0x1800, 1): 0xC0000180, (0x1801, 1): 0x280}
+        for (index, subindex), base in cob_ids.items():
+            assert upload(node, index, subindex) == (base + node_id).to_bytes(4, "little")
+        assert upload(node, 0x1401, 1) == (0x183).to_bytes(4, "little"), "what it hears of node 3"
 
 
 @pytest.mark.parametrize("name", ["compact.eds", "no_statusword.eds"])

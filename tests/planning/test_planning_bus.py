@@ -6,7 +6,7 @@ import re
 from types import SimpleNamespace
 
 import pytest
-from scenes import change, reasons, refused, ways_out
+from scenes import change, reasons, refused, ways_out, without_torque
 
 import canprobe
 from canprobe.planning.abilities import Abilities
@@ -282,10 +282,17 @@ class TestOtherDevices:
         assert what == "two targets in one RPDO"
         assert "0004h" in why
 
-    def test_torque_that_cannot_be_mapped_is_left_away(self, edit):
-        plan = canprobe.plan(edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0")))
+    @pytest.mark.parametrize(
+        ("fixed", "why"),
+        [
+            (False, ": 6077h is not mappable to a TPDO"),
+            (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h"),
+        ],
+    )
+    def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(self, tmp_path, fixed, why):
+        plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
         assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
-        assert len(plan.not_available) == 6
+        assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
 
     def test_target_that_cannot_be_mapped_is_refused(self, edit):
         problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import canprobe
+from canprobe.eds import eds_path
 from canprobe.errors import PlanError
 from canprobe.scene import Scene
 
@@ -16,6 +19,21 @@ def change(scene: Scene, **sections: dict[str, Any]) -> Scene:
     """A scene with some fields of some sections replaced."""
     changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
     return dataclasses.replace(scene, **changed)
+
+
+def without_torque(scene: Scene, folder: Path, *, fixed: bool) -> Scene:
+    """A scene with drives whose TPDO cannot carry 6077h: its mapping is fixed, or the object cannot be mapped."""
+    edits = [(r"(\[6077\][^\[]*PDOMapping=)1", "0")]
+    if fixed:
+        count = r"(\[1A00sub0\][^\[]*"
+        edits = [(count + "AccessType=)rw", "ro"), (count + "DefaultValue=)3", "2")]
+    text = eds_path("puma260_joint").read_text(encoding="ascii")
+    for pattern, value in edits:
+        text, found = re.subn(pattern, rf"\g<1>{value}", text)
+        assert found == 1, pattern
+    path = folder / "without_torque.eds"
+    path.write_text(text, encoding="ascii")
+    return change(scene, arm={"eds": str(path)})
 
 
 def refused(scene: Scene) -> PlanError:
