@@ -1,6 +1,8 @@
 """From a silent bus to operational nodes: listen, reset, boot-up, identity, configuration with read-back, NMT start.
 
 All nodes go through a step side by side; every step has its own time-out and its own words for what failed where.
+The reset takes the nodes over: before it nothing is sent, on no way out either, and after it every way out leaves them
+pre-operational.
 
 Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
 """
@@ -153,6 +155,8 @@ class BringUp:
 
     Attributes:
         reports: how far each node came, in the order of the setups.
+        took_over: the nodes were reset, and are ours from then on. What did not take them over must not touch them:
+            another master may be at work with them.
     """
 
     def __init__(
@@ -169,6 +173,8 @@ class BringUp:
         self._times = times or BringUpTimes()
         self._say = say
         self._there: set[int] = set()
+        self._listened = False
+        self.took_over = False
         self.reports = tuple(NodeReport(s.node_id, s.name) for s in setups)
 
     def run(self) -> None:
@@ -178,7 +184,7 @@ class BringUp:
             NodeError: nodes are missing, are others than the EDS says, or refused a value; it names all of them.
             BusError: somebody else is master on this bus.
         """
-        self._listen()
+        self.listen()
         self._boot()
         self._say("identify and configure the nodes")
         self._talk([self._configure(setup, report) for setup, report in self._pairs()], self._times.sdo)
@@ -188,6 +194,7 @@ class BringUp:
             if setup.lacks:
                 objects = ", ".join(f"{index:04X}h" for index in setup.lacks)
                 self._say(f"node {setup.node_id}: ({setup.name}) has no {objects}: left as the device has it")
+        self.listen()
         self._start()
 
     def _pairs(self) -> Sequence[tuple[NodeSetup, NodeReport]]:
@@ -209,9 +216,19 @@ class BringUp:
             raise NodeError(first.node_id, f"{first.reason}; " + "; ".join(map(str, others))) from first
         raise first
 
-    def _listen(self) -> None:
-        self._say("listen for another master")
-        self._network.pump_until(lambda: self._watch.foreign is not None, self._times.listen)
+    def listen(self) -> None:
+        """Hear whether somebody else is master here: for a while the first time, afterwards only what has come since.
+
+        Nothing is sent.
+
+        Raises:
+            BusError: somebody is.
+        """
+        if not self._listened:
+            self._say("listen for another master")
+        listen_s = 0.0 if self._listened else self._times.listen
+        self._network.pump_until(lambda: self._watch.foreign is not None, listen_s)
+        self._listened = True
         if self._watch.foreign is not None:
             raise BusError(
                 f"{self._network.port.channel}: {self._watch.foreign}: another master is at work here; stop it first"
@@ -222,6 +239,7 @@ class BringUp:
         self._watch.forget()
         before = dict(self._watch.boot_ups)
         resets = dict.fromkeys(before, 0)
+        self.took_over = True
         for _ in range(1 + self._times.retries):
             self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
             self._network.port.send_batch([pack_nmt(NmtCommand.RESET_NODE, s.node_id) for s in missing])
@@ -365,7 +383,9 @@ class BringUp:
         )
 
     def release(self) -> None:
-        """Take the nodes out of operation: pre-operational, heartbeat consumers off. Every node is tried."""
+        """Take the nodes that are ours out of operation: pre-operational, heartbeat consumers off; each is tried."""
+        if not self.took_over:
+            return
         self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         failures: list[NodeError] = []
 

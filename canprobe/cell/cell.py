@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import Port, PortCounters
+from canprobe.bus.port import Port, PortCounters, TimedFrame
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
@@ -143,6 +143,19 @@ class Cell:
             self.tactile.push(can_id, data, t_ns)
         else:
             self.watch.push(can_id, data, t_ns)
+
+    def listen(self) -> None:
+        """Hear whether somebody else is master here, before anything is started for this cell; nothing is sent.
+
+        Raises:
+            BusError: somebody is.
+        """
+        self._bring_up.listen()
+
+    def hear(self, frames: Iterable[TimedFrame]) -> None:
+        """Take what arrived before bring-up while somebody else waited on the port."""
+        for frame in frames:
+            self.watch.push(*frame)
 
     def __enter__(self) -> Cell:
         try:

@@ -16,18 +16,22 @@ from canprobe.cell.configuration import make_setups
 from canprobe.eds import eds_path
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
-from canprobe.errors import NodeError
+from canprobe.errors import BusError, InterfaceError, NodeError
 from canprobe.session import Session
 
 MS = 1_000_000
 
 
-def open_session(tmp_path, *, faults=(), change=None, nodes=None, scene="free", rate_hz=400.0, **bring_up):
+def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), scene="free", rate_hz=400.0, **bring_up):
+    """A session in lockstep; `beside` are participants besides its nodes."""
+    beside = list(beside)
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
     session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
 
     def join(participant):
+        while beside:
+            session.lockstep.attach(beside.pop())
         if hasattr(participant, "node_id"):
             if nodes is not None:
                 if participant.node_id in nodes:
@@ -50,6 +54,95 @@ def frames(tmp_path):
 
 def writes_to(log, node_id):
     return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
+
+
+class Somebody:
+    """Does something 100 ms after the cell's port was opened, while it listens; or at a frame of the cell's."""
+
+    def __init__(self, act, at=None):
+        self.next_deadline_ns = 100 * MS if at is None else None
+        self._act, self._at = act, at
+
+    def start(self, t_ns):
+        return []
+
+    def receive(self, can_id, data, t_ns):
+        if self._at is not None and self._at(can_id, data):
+            self._at = None
+            return self._act()
+        return []
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return self._act()
+
+
+def sending(can_id, data):
+    return lambda: [(can_id, bytes.fromhex(data))]
+
+
+def raising(error):
+    def act():
+        raise error
+
+    return act
+
+
+def is_reset(can_id, data):
+    return can_id == 0 and data[0] == 0x81
+
+
+def is_write(can_id, data):
+    return can_id == 0x603 and data[0] >> 5 == 1
+
+
+REFUSED = {
+    "a heartbeat of our own id": (sending(0x77F, "05"), BusError),
+    "SYNC": (sending(0x080, ""), BusError),
+    "an NMT command": (sending(0x000, "0103"), BusError),
+    "Ctrl-C": (raising(KeyboardInterrupt()), KeyboardInterrupt),
+    "the interface is lost": (raising(InterfaceError("can0: lost")), InterfaceError),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_did_not_take_over_the_nodes_sends_nothing(tmp_path, what):
+    act, kind = REFUSED[what]
+    with pytest.raises(kind) as refused:
+        open_session(tmp_path, beside=[Somebody(act)]).__enter__()
+    assert kind is not BusError or str(refused.value).endswith("another master is at work here; stop it first")
+    sent = [frame for frame in frames(tmp_path) if frame[0] < 100 * MS or frame[1] not in (0x77F, 0x080, 0x000)]
+    assert sorted(i for _, i, _ in sent) == [0x700 + n for n in range(1, 7)], "the nodes' boot-ups and nothing else"
+    assert len(frames(tmp_path)) - len(sent) == (kind is BusError)
+
+
+def refuse_a_write(node):
+    if node.node_id == 3:
+        node.dictionary.entries.pop(0x606500)
+
+
+FAILED = {
+    "Ctrl-C at the reset": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_reset)]}, KeyboardInterrupt),
+    "Ctrl-C while they are configured": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_write)]}, BaseException),
+    "SYNC after the reset": ({"beside": [Somebody(sending(0x080, ""), is_write)]}, BusError),
+    "a value is refused": ({"change": refuse_a_write}, NodeError),
+}
+
+
+@pytest.mark.parametrize("what", FAILED)
+def test_what_took_over_the_nodes_leaves_them_pre_operational(tmp_path, what):
+    """Another device, a drive that does not start and a pressed probe: see below, and `test_preload`."""
+    options, kind = FAILED[what]
+    with pytest.raises(kind):
+        open_session(tmp_path, **options).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def assert_left_pre_operational(tmp_path, before=(0x81,)):
+    """The last that each node was told; and what they were told before."""
+    commands = [d for _, i, d in frames(tmp_path) if i == 0]
+    assert commands[-6:] == [bytes((0x80, n)) for n in range(1, 7)]
+    assert {d[0] for d in commands[:-6]} == set(before)
 
 
 def test_the_nodes_are_configured_side_by_side(tmp_path):
