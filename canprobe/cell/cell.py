@@ -299,7 +299,9 @@ class Cell:
             self._cycle_until((), 1.5e-9 * self._settings.period_ns)
         axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
         raise NodeError(
-            axis.node_id, f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            axis.node_id,
+            f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            + self.watch.last_words(axis.node_id),
         )
 
     def _cycle_until(

@@ -17,7 +17,9 @@ from canprobe.protocol.frames import NmtState
 def heartbeat_lost(seen: Seen) -> NodeError | None:
     """A node has been silent for longer than its heartbeat's time-out."""
     node_id = seen.watch.silent(seen.sync_ns)
-    return NodeError(node_id, "lost: no heartbeat within its time-out") if node_id is not None else None
+    if node_id is None:
+        return None
+    return NodeError(node_id, "lost: no heartbeat within its time-out" + seen.watch.last_words(node_id))
 
 
 def not_operational(seen: Seen) -> NodeError | None:
@@ -25,7 +27,8 @@ def not_operational(seen: Seen) -> NodeError | None:
     node_id = seen.watch.not_in(NmtState.OPERATIONAL)
     if node_id is None:
         return None
-    return NodeError(node_id, f"left operation: NMT state {seen.watch.states[node_id].name}")
+    state = seen.watch.states[node_id].name
+    return NodeError(node_id, f"left operation: NMT state {state}{seen.watch.last_words(node_id)}")
 
 
 def drive_not_enabled(seen: Seen) -> NodeError | None:

@@ -11,9 +11,11 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.bus.sdo_client import upload
 from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
 from canprobe.eds import eds_path
+from canprobe.emulator.build import make_world
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import BusError, InterfaceError, NodeError
@@ -272,6 +274,104 @@ def test_a_node_that_does_not_start_is_named(tmp_path):
     told = r"node 3: \(joint 3\) is not operational 1 s after NMT start, 3 times: PRE_OPERATIONAL$"
     with pytest.raises(NodeError, match=told):
         open_session(tmp_path, change=deaf_to_starts(9)).__enter__()
+
+
+def silent(node):
+    if node.node_id == 3:
+        node.receive = lambda can_id, data, t_ns: []
+
+
+def other_device(node):
+    if node.node_id == 3:
+        node.dictionary.set_default(0x1018, 2, 7)
+
+
+@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device, refuse_a_write])
+def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
+    """Whatever it fails in; the EMCY came before anybody had spoken to it."""
+    reports = Somebody(sending(0x083, "0050810000000000"))
+    with pytest.raises(NodeError, match=r"^node 3: .*; node 3: EMCY 5000h, device hardware$"):
+        open_session(tmp_path, beside=[reports], change=change, boot_up_s=0.2).__enter__()
+
+
+def test_what_a_node_sent_before_we_listened_is_in_its_error_history(tmp_path):
+    def remember(node):
+        deaf_to_starts(9)(node)
+        if node.node_id == 3:
+            node.dictionary.on_read(0x1003, lambda _: node.dictionary.put(0x1003, 1, 0x12345000))
+
+    told = r"PRE_OPERATIONAL; its error history \(1003h\) begins with 5000h, device hardware$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=remember).__enter__()
+
+
+def late(by_s, **bring_up):
+    """Each answer of node 3 comes late."""
+    fault = Fault(FaultKind.DELAY, 3, 0, 9000 * MS, amount_ns=round(by_s * 1e9))
+    return {"faults": [fault], "sdo_s": 0.05, "retries": 2, **bring_up}
+
+
+def test_late_answers_are_taken_for_what_they_answer(tmp_path):
+    """A write is read back from the same entry: a late answer to the one is none to the other."""
+    with open_session(tmp_path, **late(0.06)) as session:
+        reports = session.cell.bring_up_reports
+    assert str(reports[2]).startswith("node 3: (joint 3) configured, software 1.0, ")
+    assert reports[2].repeated > 20 and reports[1].repeated == 0
+
+
+def test_a_late_answer_is_no_segment():
+    talk = upload(0x100A, 0)
+    begin, text = bytes.fromhex("410a100006000000"), b"9.8.76"
+    assert next(talk) == bytes.fromhex("400a100000000000")
+    assert talk.send(begin) == bytes.fromhex("6000000000000000")
+    assert talk.send(begin) is None, "asked twice, answered twice"
+    with pytest.raises(StopIteration) as ended:
+        talk.send(b"\x03" + text + b"\0")
+    assert ended.value.value == text
+
+
+def test_answers_that_come_far_too_late_are_told_with_the_way_out(tmp_path):
+    told = r"failed: No SDO response received within 0.05 s, 3 times; .* a larger bring_up.sdo_s$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, **late(1.0)).__enter__()
+
+
+def boots_twice(node):
+    if node.node_id != 3:
+        return
+    hear = node.receive
+
+    def receive(can_id, data, t_ns):
+        answers = list(hear(can_id, data, t_ns))
+        return answers * 2 if answers == [(0x703, b"\0")] else answers
+
+    node.receive = receive
+
+
+def test_a_node_that_boots_twice_is_brought_up(tmp_path):
+    said = []
+    session = open_session(tmp_path, change=boots_twice)
+    session._say = said.append
+    with session:
+        pass
+    assert "node 3: (joint 3) sent 2 boot-ups after its reset" in said
+
+
+def test_two_nodes_with_one_id_are_told_from_one_that_boots_twice(tmp_path):
+    plan = canprobe.plan(canprobe.load_scene("free"))
+    (twin,) = make_world(plan, (3,)).nodes
+    told = r"node 3: \(joint 3\) answered .* 2 boot-ups and a request with 2 answers: the node id is in use twice"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, beside=[twin]).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def test_a_node_that_boots_again_ends_bring_up(tmp_path):
+    """It would run with its defaults. On this bus, full of SDOs, its boot-up comes through after them."""
+    booting = Somebody(sending(0x703, "00"), is_write)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) booted again after it was configured: check its power"):
+        open_session(tmp_path, beside=[booting]).__enter__()
+    assert_left_pre_operational(tmp_path, before=(0x81, 0x01))
 
 
 def other_make(tmp_path):
