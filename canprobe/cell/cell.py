@@ -282,11 +282,11 @@ class Cell:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
-            i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
+            i, instead = self.drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = self.drives.axes[i].node_id
             raise NodeError(
                 node_id,
-                f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
+                f"(joint {i + 1}) is {instead} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
                 + self.watch.last_words(node_id),
             )
 

@@ -36,10 +36,10 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.measurement.enabled:
         return None
-    i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
+    i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
     words = seen.watch.last_words(node_id)
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{words}{_held_up(seen)}")
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}{_held_up(seen)}")
 
 
 def _held_up(seen: Seen) -> str:

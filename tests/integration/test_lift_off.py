@@ -36,6 +36,7 @@ LOST = {
     "joint 3 boots again": ("nmt_state", lambda r: r.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)),
     "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
     "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
+    "joint 2 tells no state": ("drive_fault", lambda r: altered(r.nodes[2], 0x182, lambda d: b"\x01\x06" + d[2:])),
     "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
 }
 
