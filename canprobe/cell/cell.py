@@ -18,7 +18,7 @@ from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
-from canprobe.cell.supervision import TOUCH_FORCE, Limits, Reaction, Seen
+from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch, obeys
@@ -375,7 +375,7 @@ class Cell:
     def _lift_off(self, error: BaseException) -> None:
         """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
-        if self._lift_from is None or supervisor.felt() < TOUCH_FORCE or supervisor.must_stop():
+        if self._lift_from is None or not supervisor.pressing() or supervisor.must_stop():
             return
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
         t_s = supervisor.seen.measurement.t_ns * 1e-9
@@ -421,7 +421,7 @@ class Cell:
     def close(self) -> None:
         """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
         self._try(self._stop_drives)
-        if (force := self.supervisor.felt()) >= TOUCH_FORCE:
+        if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
         self._try(self._bring_up.release)
         self._try(self._port.close)

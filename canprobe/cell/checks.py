@@ -197,8 +197,8 @@ def preloaded(seen: Seen) -> SafetyStop | None:
         return None
     return SafetyStop(
         f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
-        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, the array's"
-        " offsets are larger than that"
+        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was pressed"
+        " until just now, which its array forgets in a minute, or the array's offsets are larger than that"
     )
 
 

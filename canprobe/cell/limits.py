@@ -54,14 +54,14 @@ def _of_arm(limits: Limits, scene: Scene, model: PumaModel) -> Limits:
         joint_speed=model.qd_max * scene.limits.joint_speed_share,
         count=np.abs(model.joints_per_count).sum(axis=1),
         workspace=workspace_of(scene.limits),
-        tip_of=_tip_of(model, scene.probe or ProbeSettings()),
+        T_base_tip_of=_T_base_tip_of(model, scene.probe or ProbeSettings()),
     )
 
 
-def _tip_of(model: PumaModel, probe: ProbeSettings) -> Callable[[Vector], Vector]:
+def _T_base_tip_of(model: PumaModel, probe: ProbeSettings) -> Callable[[Vector], Vector]:
     T_flange_tip = T_flange_probe(probe).copy()
     T_flange_tip[:3, 3] += probe.radius_mm * 1e-3 * T_flange_tip[:3, 2]
-    return lambda q: (forward(model, q) @ T_flange_tip)[:3, 3]
+    return lambda q: forward(model, q) @ T_flange_tip
 
 
 def workspace_of(limits: LimitSettings) -> Vector | None:

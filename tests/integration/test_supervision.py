@@ -394,12 +394,12 @@ def test_the_workspace_ends_a_press():
 
 def test_the_workspace_ends_an_own_controllers_motion():
     scene = canprobe.load_scene("free")
-    tip_of = limits_of(Session(scene).plan).tip_of
-    start = 1e3 * tip_of(np.radians(scene.arm.start_deg))
+    T_base_tip_of = limits_of(Session(scene).plan).T_base_tip_of
+    start = 1e3 * T_base_tip_of(np.radians(scene.arm.start_deg))[:3, 3]
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
     assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
-    tips = np.array([tip_of(q) for q in run.session.truth["q"][::5]])
+    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q"][::5]])
     assert (1e3 * tips < start + 15.0 + 3.0).all()
     run.assert_drives_off()
 

@@ -258,13 +258,14 @@ class TouchTask(ProbingTask):
         assert self._line is not None
         pose = self._line.at(self._t)
         if self._t >= self._line.duration + self._s.lead_s + 0.1:
+            self._floor = self._force  # an array that was pressed for long shows some of it for a while
             self._enter(Phase.APPROACH)
         return pose
 
     def _approach(self) -> ProbePose:
         distance = self._s.clearance - self._s.approach_speed * self._t
         pose = self._above(distance)
-        if self._contact is not None and self._force > self._s.touch_force:
+        if self._contact is not None and self._force > self._s.touch_force + self._floor:
             self._touch_down(self._contact, pose)
         elif distance < -self._s.search:
             self._leave(f"no object found up to {self._s.search * 1e3:.0f} mm beyond the expected point")
