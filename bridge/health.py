@@ -8,7 +8,7 @@ from canprobe.bus.port import TimedFrame
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.watch import NodeWatch
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
-from canprobe.protocol.cia402 import DriveState, state_of
+from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.emcy import NO_ERROR, describe
 from canprobe.protocol.frames import NmtState
 
@@ -75,7 +75,7 @@ class Health:
         arm = self._plan.scene.arm
         if arm is None or node.kind != "drive" or not measurement.statuswords:
             return None
-        return state_of(measurement.statuswords[arm.node_ids.index(node.node_id)])
+        return known_state(measurement.statuswords[arm.node_ids.index(node.node_id)])
 
 
 def _cell(received: Received) -> Diagnostic:

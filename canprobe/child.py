@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.clock import MonotonicClock
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, TimedFrame
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import HEARTBEAT_BASE
 from canprobe.scene import Scene
@@ -94,12 +94,18 @@ class EmulatorChild:
         assert self._process is not None
         return self._process.pid
 
-    def await_boot_ups(self, port: Port, say: Callable[[str], None] = lambda _: None) -> None:
+    def await_boot_ups(
+        self,
+        port: Port,
+        say: Callable[[str], None] = lambda _: None,
+        hear: Callable[[list[TimedFrame]], None] = lambda _: None,
+    ) -> None:
         """Wait for the boot-up of each of its nodes, as long as the scene allows; on a busy machine that takes a while.
 
         Args:
             port: of the nodes' bus.
             say: is told now and then how long it has taken.
+            hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
 
         Raises:
             BusError: the process ended; with its own last words.
@@ -121,7 +127,9 @@ class EmulatorChild:
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
                 tell += round(TOLD_EVERY_S * 1e9)
             port.wait(min(deadline, now + 50_000_000))
-            for can_id, data, _ in port.drain():
+            frames = port.drain()
+            hear(frames)
+            for can_id, data, _ in frames:
                 if data == b"\0":
                     waiting.discard(can_id - HEARTBEAT_BASE)
 

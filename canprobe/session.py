@@ -334,6 +334,7 @@ class Session:
 
         child = None
         if self.scene.emulated_node_ids:
+            self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
             emulated = next(node.channel for node in self.plan.nodes if node.emulated)
             child = EmulatorChild(self.scene, self.out, emulated, truth=self._rows_kept is None)
@@ -343,7 +344,7 @@ class Session:
         rehearse(self.plan)
         reserve_memory(self.plan.cycles if self._rows_kept is None else self._rows_kept)
         if child is not None:
-            child.await_boot_ups(port, self._say)
+            child.await_boot_ups(port, self._say, self.cell.hear)
         if self.scene.cycle.realtime:
             self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
 

@@ -23,11 +23,15 @@ Dialogue = Generator[bytes | None, bytes, Any]
 """What is said to one node."""
 
 _LENGTH = 8
-_ABORT, _DOWNLOADED, _UPLOADED, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x02, 0x01
+_ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
 _MOST_EXPEDITED = 4
 _TIMED_OUT = 0x05040000
 ROUND_S = 0.02
 """So long the others wait for the slowest answer: asked at once again they would take the bus from higher node ids."""
+
+
+class SdoTimeoutError(SdoCommunicationError):
+    """A request got no answer in time, however often it was sent."""
 
 
 def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, bytes, None]:
@@ -71,7 +75,7 @@ def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[
 
     Raises:
         SdoAbortedError: the node refused.
-        SdoCommunicationError: no answer, or one that is none.
+        SdoCommunicationError: no answer, or one segment twice.
     """
     answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
     if answer[0] & _EXPEDITED:
@@ -84,11 +88,9 @@ def _answered(
 ) -> Generator[bytes | None, bytes, bytes]:
     multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
     answer = yield command + multiplexer + data
-    while answer[1:4] != multiplexer:  # a late answer to something else
-        answer = yield None
+    while answer[1:4] != multiplexer or not (answer[0] == _ABORT or answer[0] & 0xE0 == expected):
+        answer = yield None  # a late one, to an earlier request: of this entry too, which is read after it was written
     _check_abort(answer)
-    if answer[0] & 0xE0 != expected:
-        raise SdoCommunicationError(f"Unexpected response {answer[0]:#04x}")
     return answer
 
 
@@ -96,6 +98,8 @@ def _segments() -> Generator[bytes | None, bytes, bytes]:
     data, toggle, last = b"", 0, False
     while not last:
         answer = yield bytes((0x60 | toggle,)) + bytes(7)
+        while not (answer[0] == _ABORT or answer[0] & 0xE0 == _SEGMENT):  # a late one, to the request that began this
+            answer = yield None
         _check_abort(answer)
         if answer[0] & 0xF0 != toggle:
             raise SdoCommunicationError("Toggle bit mismatch")
@@ -182,7 +186,9 @@ def _serve(network: PumpedNetwork, talk: _Talk, timeout_ns: int, retries: int, r
         repeated[talk.node_id] += 1
         _send(network, talk, timeout_ns)
     else:
-        _throw(network, talk, SdoCommunicationError("No SDO response received"), timeout_ns)
+        tries = f", {talk.tries} times" if talk.tries > 1 else ""
+        late = SdoTimeoutError(f"No SDO response received within {timeout_ns * 1e-9:g} s{tries}")
+        _throw(network, talk, late, timeout_ns)
 
 
 def _go_on(network: PumpedNetwork, talk: _Talk, answer: bytes | None, timeout_ns: int) -> None:

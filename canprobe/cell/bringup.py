@@ -1,6 +1,8 @@
 """From a silent bus to operational nodes: listen, reset, boot-up, identity, configuration with read-back, NMT start.
 
 All nodes go through a step side by side; every step has its own time-out and its own words for what failed where.
+The reset takes the nodes over: before it nothing is sent, on no way out either, and after it every way out leaves them
+pre-operational.
 
 Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
 """
@@ -8,7 +10,7 @@ Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,11 +18,14 @@ from canopen import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.sdo_client import download, hold_dialogues, read_value, upload
+from canprobe.bus.probe import UPLOAD_DEVICE_TYPE
+from canprobe.bus.sdo_client import SdoTimeoutError, download, hold_dialogues, read_value, upload
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
-from canprobe.protocol.frames import NmtCommand, NmtState, pack_nmt
+from canprobe.protocol.emcy import NO_ERROR, describe
+from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
 
+ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
@@ -94,7 +99,7 @@ class BringUpTimes:
     Attributes:
         listen: for another master.
         boot_up: from the reset to the boot-up message.
-        second_boot_up: in which a second one shows that a node id is in use twice.
+        second_boot_up: in which a second boot-up, or a second answer to one request, is waited for.
         sdo: for one answer.
         start: from NMT start to the first heartbeat that tells it.
         release: for one answer when the nodes are let go.
@@ -152,6 +157,8 @@ class BringUp:
 
     Attributes:
         reports: how far each node came, in the order of the setups.
+        took_over: the nodes were reset, and are ours from then on. What did not take them over must not touch them:
+            another master may be at work with them.
     """
 
     def __init__(
@@ -167,7 +174,10 @@ class BringUp:
         self._setups = setups
         self._times = times or BringUpTimes()
         self._say = say
-        self._there: set[int] = set()
+        self._booted: dict[int, int] = {}
+        self._history: dict[int, str] = {}
+        self._listened = False
+        self.took_over = False
         self.reports = tuple(NodeReport(s.node_id, s.name) for s in setups)
 
     def run(self) -> None:
@@ -177,29 +187,33 @@ class BringUp:
             NodeError: nodes are missing, are others than the EDS says, or refused a value; it names all of them.
             BusError: somebody else is master on this bus.
         """
-        self._listen()
+        self.listen()
         self._boot()
         self._say("identify and configure the nodes")
-        self._talk([self._configure(setup, report) for setup, report in self._pairs()], self._times.sdo)
+        self._talk({s.node_id: self._configure(s, report) for s, report in self._pairs()}, self._times.sdo)
         self._raise_failures()
         for setup, report in self._pairs():
             self._say(str(report))
             if setup.lacks:
                 objects = ", ".join(f"{index:04X}h" for index in setup.lacks)
                 self._say(f"node {setup.node_id}: ({setup.name}) has no {objects}: left as the device has it")
+        self.listen()
+        self._refuse_unconfigured()
         self._start()
+        self._refuse_unconfigured()
 
     def _pairs(self) -> Sequence[tuple[NodeSetup, NodeReport]]:
         return list(zip(self._setups, self.reports, strict=True))
 
-    def _talk(self, dialogues: Sequence[Generator[bytes | None, bytes, None]], timeout_s: float) -> None:
-        retries = self._times.retries
-        by_node = {setup.node_id: one for setup, one in zip(self._setups, dialogues, strict=True)}
-        repeated = hold_dialogues(self._network, by_node, timeout_s=timeout_s, retries=retries)
+    def _talk(self, dialogues: Mapping[int, Generator[bytes | None, bytes, None]], timeout_s: float) -> None:
+        repeated = hold_dialogues(self._network, dialogues, timeout_s=timeout_s, retries=self._times.retries)
         for report in self.reports:
-            report.repeated += repeated[report.node_id]
+            report.repeated += repeated.get(report.node_id, 0)
 
     def _raise_failures(self) -> None:
+        for setup, report in self._pairs():
+            if report.failure is not None:
+                report.failure = self._error(report.failure.reason, setup)
         failures = [report.failure for report in self.reports if report.failure is not None]
         if not failures:
             return
@@ -208,9 +222,34 @@ class BringUp:
             raise NodeError(first.node_id, f"{first.reason}; " + "; ".join(map(str, others))) from first
         raise first
 
-    def _listen(self) -> None:
-        self._say("listen for another master")
-        self._network.pump_until(lambda: self._watch.foreign is not None, self._times.listen)
+    def _refuse_unconfigured(self) -> None:
+        """A node that has booted since its reset has lost what it was told, and would run with its defaults."""
+        for setup in self._setups:
+            if self._watch.boot_ups[setup.node_id] > self._booted[setup.node_id]:
+                raise self._error(
+                    f"({setup.name}) booted again after it was configured: check its power, and that no other node has"
+                    " its id",
+                    setup,
+                )
+
+    def _error(self, reason: str, *setups: NodeSetup) -> NodeError:
+        """What the first of these nodes, and then the others, failed in; with the last EMCY of each of them."""
+        ids = [setup.node_id for setup in setups]
+        return NodeError(ids[0], reason + "".join([self._watch.last_words(i) or self._history.get(i, "") for i in ids]))
+
+    def listen(self) -> None:
+        """Hear whether somebody else is master here: for a while the first time, afterwards only what has come since.
+
+        Nothing is sent.
+
+        Raises:
+            BusError: somebody is.
+        """
+        if not self._listened:
+            self._say("listen for another master")
+        listen_s = 0.0 if self._listened else self._times.listen
+        self._network.pump_until(lambda: self._watch.foreign is not None, listen_s)
+        self._listened = True
         if self._watch.foreign is not None:
             raise BusError(
                 f"{self._network.port.channel}: {self._watch.foreign}: another master is at work here; stop it first"
@@ -221,6 +260,7 @@ class BringUp:
         self._watch.forget()
         before = dict(self._watch.boot_ups)
         resets = dict.fromkeys(before, 0)
+        self.took_over = True
         for _ in range(1 + self._times.retries):
             self._say(f"reset nodes {', '.join(str(s.node_id) for s in missing)}")
             self._network.port.send_batch([pack_nmt(NmtCommand.RESET_NODE, s.node_id) for s in missing])
@@ -236,20 +276,43 @@ class BringUp:
         if missing:
             self._raise_missing(missing)
         self._network.pump_until(lambda: False, self._times.second_boot_up)
+        self._booted = dict(self._watch.boot_ups)
         for setup in self._setups:
-            count = self._watch.boot_ups[setup.node_id] - before[setup.node_id]
+            count = self._booted[setup.node_id] - before[setup.node_id]
             if count > resets[setup.node_id]:
-                raise NodeError(setup.node_id, f"answered its reset with {count} boot-ups: the node id is in use twice")
-            self._there.add(setup.node_id)
+                self._tell_apart(setup, count)
+
+    def _tell_apart(self, setup: NodeSetup, boot_ups: int) -> None:
+        """Two nodes of one id answer a request twice; one that boots twice, as by way of its loader, answers once."""
+        answers: list[bytes] = []
+        cob_id = SDO_TX_BASE + setup.node_id
+
+        def take(_id: int, data: bytearray, _t_s: float) -> None:
+            answers.append(bytes(data))
+
+        self._network.subscribe(cob_id, take)
+        try:
+            self._network.send_message(SDO_RX_BASE + setup.node_id, UPLOAD_DEVICE_TYPE)
+            self._network.pump_until(lambda: bool(answers), self._times.sdo)
+            self._network.pump_until(lambda: len(answers) > 1, self._times.second_boot_up)
+        finally:
+            self._network.unsubscribe(cob_id, take)
+        if len(answers) > 1:
+            raise self._error(
+                f"({setup.name}) answered its reset with {boot_ups} boot-ups and a request with {len(answers)} answers:"
+                " the node id is in use twice",
+                setup,
+            )
+        self._say(f"node {setup.node_id}: ({setup.name}) sent {boot_ups} boot-ups after its reset")
 
     def _raise_missing(self, missing: Sequence[NodeSetup]) -> None:
         others = ", ".join(f"{s.node_id} ({s.name})" for s in missing[1:])
-        raise NodeError(
-            missing[0].node_id,
+        raise self._error(
             f"({missing[0].name}) sent no boot-up within {self._times.boot_up:g} s of its reset on"
             f" {self._network.port.channel}"
             + (f"; nor did {others}" if others else "")
             + "; check power, node id, bit rate and termination, or mark it emulated in the scene",
+            *missing,
         )
 
     # what is said to one node
@@ -266,7 +329,23 @@ class BringUp:
             if self._times.store and not kept:
                 yield from self._keep(setup)
         except NodeError as error:
-            report.failure = error
+            slow = isinstance(error.__cause__, SdoTimeoutError)
+            hint = "; if it is only slow, it needs a larger bring_up.sdo_s" if slow else ""
+            report.failure = NodeError(setup.node_id, error.reason + hint)
+            if not slow:
+                yield from self._recall(setup)
+
+    def _recall(self, setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
+        """What a node that has failed sent before anybody listened, of which its error history tells the last."""
+        if setup.node_id in self._watch.last_alarm or ERROR_HISTORY not in setup.dictionary:
+            return
+        try:
+            newest = yield from upload(ERROR_HISTORY, 1)
+        except (SdoAbortedError, SdoCommunicationError):
+            return  # it is empty
+        if (code := int.from_bytes(newest[:2], "little")) != NO_ERROR:
+            told = f"; its error history (1003h) begins with {code:04X}h, {describe(code)}"
+            self._history[setup.node_id] = told
 
     def _identify(self, setup: NodeSetup, report: NodeReport) -> Generator[bytes | None, bytes, None]:
         for subindex, expected in setup.identity.items():
@@ -353,30 +432,33 @@ class BringUp:
         return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
 
     def _raise_not_operational(self, waiting: Sequence[NodeSetup]) -> None:
+        self._talk({setup.node_id: self._recall(setup) for setup in waiting}, self._times.release)
         slow, *others = waiting
         state = self._watch.states.get(slow.node_id)
         tries = f", {1 + self._times.retries} times" if self._times.retries else ""
-        raise NodeError(
-            slow.node_id,
+        raise self._error(
             f"({slow.name}) is not operational {self._times.start:g} s after NMT start{tries}:"
             f" {'no heartbeat' if state is None else state.name}"
             + (f"; nor are {', '.join(f'{s.node_id} ({s.name})' for s in others)}" if others else ""),
+            *waiting,
         )
 
     def release(self) -> None:
-        """Take the nodes out of operation: pre-operational, heartbeat consumers off. Every node is tried."""
+        """Take the nodes that are ours out of operation: pre-operational, heartbeat consumers off; each is tried."""
+        if not self.took_over:
+            return
         self._network.port.send_batch([pack_nmt(NmtCommand.PRE_OPERATIONAL, s.node_id) for s in self._setups])
         failures: list[NodeError] = []
 
         def let_go(setup: NodeSetup) -> Generator[bytes | None, bytes, None]:
-            if setup.node_id not in self._there or HEARTBEAT_CONSUMER not in setup.dictionary:
+            if setup.node_id not in self._booted or HEARTBEAT_CONSUMER not in setup.dictionary:
                 return
             try:
                 yield from self._write(setup, Write(HEARTBEAT_CONSUMER, 1, 0))
             except NodeError as error:
                 failures.append(error)
 
-        self._talk([let_go(setup) for setup in self._setups], self._times.release)
+        self._talk({setup.node_id: let_go(setup) for setup in self._setups}, self._times.release)
         if failures:
             raise failures[0]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from types import TracebackType
 from typing import TYPE_CHECKING, TypeVar
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import Port, PortCounters
+from canprobe.bus.port import Port, PortCounters, TimedFrame
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
 from canprobe.cell.cycle import Cycle, CycleSettings
 from canprobe.cell.drives import DriveGroup, Vector
@@ -18,7 +18,7 @@ from canprobe.cell.log import RunLog
 from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
 from canprobe.cell.notes import Notes
 from canprobe.cell.observe import Observers
-from canprobe.cell.supervision import TOUCH_FORCE, Limits, Reaction, Seen
+from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
 from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch, obeys
@@ -143,6 +143,19 @@ class Cell:
             self.tactile.push(can_id, data, t_ns)
         else:
             self.watch.push(can_id, data, t_ns)
+
+    def listen(self) -> None:
+        """Hear whether somebody else is master here, before anything is started for this cell; nothing is sent.
+
+        Raises:
+            BusError: somebody is.
+        """
+        self._bring_up.listen()
+
+    def hear(self, frames: Iterable[TimedFrame]) -> None:
+        """Take what arrived before bring-up while somebody else waited on the port."""
+        for frame in frames:
+            self.watch.push(*frame)
 
     def __enter__(self) -> Cell:
         try:
@@ -269,11 +282,11 @@ class Cell:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
-            i, state = next((i, s) for i, s in enumerate(self.drives.states) if s is not DriveState.OPERATION_ENABLED)
+            i, instead = self.drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = self.drives.axes[i].node_id
             raise NodeError(
                 node_id,
-                f"(joint {i + 1}) is {state.name} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
+                f"(joint {i + 1}) is {instead} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
                 + self.watch.last_words(node_id),
             )
 
@@ -286,7 +299,9 @@ class Cell:
             self._cycle_until((), 1.5e-9 * self._settings.period_ns)
         axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
         raise NodeError(
-            axis.node_id, f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            axis.node_id,
+            f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            + self.watch.last_words(axis.node_id),
         )
 
     def _cycle_until(
@@ -360,7 +375,7 @@ class Cell:
     def _lift_off(self, error: BaseException) -> None:
         """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
-        if self._lift_from is None or supervisor.felt() < TOUCH_FORCE or supervisor.must_stop():
+        if self._lift_from is None or not supervisor.pressing() or supervisor.must_stop():
             return
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
         t_s = supervisor.seen.measurement.t_ns * 1e-9
@@ -407,7 +422,7 @@ class Cell:
     def close(self) -> None:
         """Stop safely and close the bus: quick stop, disable, pre-operational. Never raises; failures are faults."""
         self._try(self._stop_drives)
-        if (force := self.supervisor.felt()) >= TOUCH_FORCE:
+        if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
         self._try(self._bring_up.release)
         self._try(self._port.close)

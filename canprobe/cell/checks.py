@@ -17,7 +17,9 @@ from canprobe.protocol.frames import NmtState
 def heartbeat_lost(seen: Seen) -> NodeError | None:
     """A node has been silent for longer than its heartbeat's time-out."""
     node_id = seen.watch.silent(seen.sync_ns)
-    return NodeError(node_id, "lost: no heartbeat within its time-out") if node_id is not None else None
+    if node_id is None:
+        return None
+    return NodeError(node_id, "lost: no heartbeat within its time-out" + seen.watch.last_words(node_id))
 
 
 def not_operational(seen: Seen) -> NodeError | None:
@@ -25,7 +27,8 @@ def not_operational(seen: Seen) -> NodeError | None:
     node_id = seen.watch.not_in(NmtState.OPERATIONAL)
     if node_id is None:
         return None
-    return NodeError(node_id, f"left operation: NMT state {seen.watch.states[node_id].name}")
+    state = seen.watch.states[node_id].name
+    return NodeError(node_id, f"left operation: NMT state {state}{seen.watch.last_words(node_id)}")
 
 
 def drive_not_enabled(seen: Seen) -> NodeError | None:
@@ -33,10 +36,10 @@ def drive_not_enabled(seen: Seen) -> NodeError | None:
     drives = seen.drives
     if drives is None or seen.measurement.enabled:
         return None
-    i, state = next((i, s) for i, s in enumerate(drives.states) if s is not DriveState.OPERATION_ENABLED)
+    i, instead = drives.first_not_in(DriveState.OPERATION_ENABLED)
     node_id = drives.axes[i].node_id
     words = seen.watch.last_words(node_id)
-    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {state.name}{words}{_held_up(seen)}")
+    return NodeError(node_id, f"(joint {i + 1}) left operation enabled: {instead}{words}{_held_up(seen)}")
 
 
 def _held_up(seen: Seen) -> str:
@@ -194,8 +197,8 @@ def preloaded(seen: Seen) -> SafetyStop | None:
         return None
     return SafetyStop(
         f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
-        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, the array's"
-        " offsets are larger than that"
+        f" {seen.limits.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was pressed"
+        " until just now, which its array forgets in a minute, or the array's offsets are larger than that"
     )
 
 

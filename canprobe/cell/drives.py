@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.position_track import STEADY, PositionTrack
 from canprobe.errors import ProtocolError
-from canprobe.protocol.cia402 import DriveState, controlword_toward, state_of
+from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
 from canprobe.robot.puma260 import PumaModel, counts_to_joints, joints_to_counts
@@ -24,8 +24,9 @@ Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
 _COMMAND_OBJECTS = (0x6040, 0x607A)
+_QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
-"""Of a statusword that tells operation enabled; see `state_of` for the other states."""
+"""Of a statusword that tells operation enabled; see `known_state` for the other states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,17 +201,18 @@ class DriveGroup:
         return q
 
     @property
-    def states(self) -> tuple[DriveState, ...]:
-        """CiA 402 state of each drive, from its last statusword."""
-        return tuple([state_of(word) for word in self.statuswords])
+    def states(self) -> tuple[DriveState | None, ...]:
+        """CiA 402 state of each drive, from its last statusword; None where that is a word of no state."""
+        return tuple([known_state(word) for word in self.statuswords])
+
+    def first_not_in(self, state: DriveState) -> tuple[int, str]:
+        """The first drive that is not in a state: which one, from 0, and what it is instead."""
+        i = next(i for i, other in enumerate(self.states) if other is not state)
+        return i, describe_state(self.statuswords[i])
 
     @property
     def enabled(self) -> bool:
-        """Every drive tells operation enabled.
-
-        Raises:
-            ProtocolError: a statusword that is none.
-        """
+        """Every drive tells operation enabled."""
         if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
             return True  # as in every cycle of operation
         return self.all_in(DriveState.OPERATION_ENABLED)
@@ -252,7 +254,7 @@ class DriveGroup:
         key = (self.goal, self.stopped, *self.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
             goals = [self._goal_of(axis.node_id) for axis in self.axes]
-            words = list(map(controlword_toward, self.states, goals, self._words))
+            words = list(map(_controlword, self.states, goals, self._words))
             self._steady = key if words == self._words else None
             self._words = words
         values = [*self._words, *targets]
@@ -277,6 +279,13 @@ class DriveGroup:
             return False
         self._sent[cob_id] = (data, self._cycle)
         return True
+
+
+def _controlword(state: DriveState | None, goal: DriveState, previous: int) -> int:
+    """What a drive is told; one whose state nobody knows is stopped, which is right in every state."""
+    if state is None:
+        return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
+    return controlword_toward(state, goal, previous)
 
 
 def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[int]], Sequence[int]]:

@@ -97,8 +97,8 @@ class JointGuard:
         if not all(inside):
             joint = inside.index(False)
             return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
-        if limits.workspace is not None and limits.tip_of is not None:
-            left = outside_workspace(limits.tip_of(target), limits.workspace)
+        if limits.workspace is not None and limits.T_base_tip_of is not None:
+            left = outside_workspace(limits.T_base_tip_of(target)[:3, 3], limits.workspace)
             if left is not None:
                 return GuardedTarget(None, left)
         return self._within_speed(q_target, wanted, measurement)

@@ -53,14 +53,14 @@ def _of_arm(limits: Limits, setup: Setup, arm: Arm) -> Limits:
         joint_speed=model.qd_max * setup.limits.speed_share,
         count=np.abs(model.joints_per_count).sum(axis=1),
         workspace=setup.limits.workspace,
-        tip_of=_tip_of(model, setup.probe),
+        T_base_tip_of=_T_base_tip_of(model, setup.probe),
     )
 
 
-def _tip_of(model: PumaModel, probe: Probe) -> Callable[[Vector], Vector]:
+def _T_base_tip_of(model: PumaModel, probe: Probe) -> Callable[[Vector], Vector]:
     T_flange_tip = probe.T_flange_probe.copy()
     T_flange_tip[:3, 3] += probe.radius * T_flange_tip[:3, 2]
-    return lambda q: (forward(model, q) @ T_flange_tip)[:3, 3]
+    return lambda q: forward(model, q) @ T_flange_tip
 
 
 def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:

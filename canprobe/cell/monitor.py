@@ -16,7 +16,7 @@ from canprobe.cell.limits import patch_from
 from canprobe.cell.measurement import TactileSample
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
-from canprobe.protocol.cia402 import state_of
+from canprobe.protocol.cia402 import describe_state
 from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, unpack_heartbeat
@@ -148,7 +148,7 @@ class Monitor:
             word, counts, *_ = layout.unpack(data)
         except ProtocolError:
             return
-        self._nodes[node_id].drive = state_of(word).name
+        self._nodes[node_id].drive = describe_state(word)
         self._counts[axis] = counts
 
     def _take_taxels(self, can_id: int, data: bytes, t_ns: int) -> None:

@@ -61,7 +61,8 @@ class Limits:
         joint_speed: speed limits (6,), rad/s.
         count: joint angle of one encoder count (6,), rad.
         workspace: lowest and highest position (2, 3) of the probe's tip, m, base frame; None without one.
-        tip_of: position of the probe's tip (3,), m, base frame, of joint angles (6,), rad; None without an arm.
+        T_base_tip_of: transform (4, 4) from the probe's tip (z = pole, towards the object) to base, of joint angles
+            (6,), rad; None without an arm.
     """
 
     period_ns: int
@@ -83,7 +84,7 @@ class Limits:
     joint_speed: Vector | None = None
     count: Vector | None = None
     workspace: Vector | None = None
-    tip_of: Callable[[Vector], Vector] | None = None
+    T_base_tip_of: Callable[[Vector], Vector] | None = None
 
     @property
     def cycles_to_feel(self) -> int:

@@ -8,12 +8,14 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from canprobe.bus.port import ControllerState, PortCounters
 from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
 from canprobe.cell.hidden_force import HiddenForce
 from canprobe.cell.joint_guard import JointGuard
 from canprobe.cell.measurement import Command, Measurement, TactileSample
-from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Reaction, Seen
+from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Reaction, Seen, Vector
 from canprobe.errors import CanprobeError
 
 if TYPE_CHECKING:
@@ -22,6 +24,45 @@ if TYPE_CHECKING:
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
 SECOND_NS = 1_000_000_000
+LOOK_NS = 20_000_000
+"""Between two looks at where the probe presses: less than a millimetre of a retreat."""
+MEMORY = 0.25
+"""Share of a force that the array may show when it is gone: creep, 5 % a decade, of a press of a quarter of an hour."""
+CLEAR = 3e-3
+"""m, straight back along the pole: half a retreat, and more than `MEMORY` of 50 N presses the softest pad in."""
+
+
+class Press:
+    """Whether what the array shows is a press, or what it remembers of one.
+
+    After a long press the array creeps back for as long as it was pressed. By its size alone that is a light touch. But
+    a press needs the probe to be there: once it has gone straight back from where it pressed last, further than any pad
+    is pressed in, the rest is memory, and only what comes on top of it is a new press.
+    """
+
+    def __init__(self) -> None:
+        self._T_base_tip: Vector | None = None
+        self._highest = 0.0
+        self._remembered = 0.0
+
+    def look(self, force: float, T_base_tip: Vector) -> None:
+        """Take the array's force, N, and where the probe's tip is (4, 4)."""
+        if self.holds(force) and force >= MEMORY * self._highest:
+            self._T_base_tip, self._highest = T_base_tip, max(force, self._highest)
+        elif self._T_base_tip is None:
+            self._remembered = min(force, self._remembered)
+        elif self._is_clear(T_base_tip[:3, 3] - self._T_base_tip[:3, 3]):
+            self._T_base_tip, self._highest, self._remembered = None, 0.0, force
+
+    def holds(self, force: float) -> bool:
+        """Whether a force that the array shows, N, is a press."""
+        return force >= TOUCH_FORCE + (self._remembered if self._T_base_tip is None else 0.0)
+
+    def _is_clear(self, way: Vector) -> bool:
+        assert self._T_base_tip is not None
+        pole = self._T_base_tip[:3, 2]
+        back = -float(way @ pole)
+        return back > CLEAR and float(np.linalg.norm(way + back * pole)) < back
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +92,8 @@ class Supervisor:
         self._patch_from = patch_from
         self._force = 0.0
         self._sample: TactileSample | None = None
+        self._press = Press()
+        self._look_ns = 0
         self._hidden, self._off_pad = HiddenForce(), HiddenForce()
         self._untouched = math.isfinite(seen.limits.preload_max)
         self._joints = JointGuard(seen.limits)
@@ -88,6 +131,9 @@ class Supervisor:
             self._untouched = not measurement.enabled
             if measurement.tactile is not None:
                 seen.preload = max(seen.preload, self.felt())
+        if measurement.t_ns >= self._look_ns:
+            self._look_ns = measurement.t_ns + LOOK_NS
+            self._look()
         counts = [count(seen) for count in self._counters]
         if counts != self._counted:
             self._note(counts, measurement.cycle)
@@ -130,6 +176,17 @@ class Supervisor:
         if self._sample is None or self._patch_from is None:
             return 0.0
         return self._patch_from(self._sample).force
+
+    def pressing(self) -> float:
+        """The force with which the probe presses on something, N; 0 where the array only remembers that it did."""
+        self._look()
+        force = self.felt()
+        return force if self._press.holds(force) else 0.0
+
+    def _look(self) -> None:
+        q, T_base_tip_of = self.seen.measurement.q, self.seen.limits.T_base_tip_of
+        if self._sample is not None and q is not None and T_base_tip_of is not None:
+            self._press.look(self.felt(), T_base_tip_of(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
         """What must not go on in a touch, whatever the controller thinks of it."""

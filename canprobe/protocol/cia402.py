@@ -157,10 +157,21 @@ def state_of(statusword: int) -> DriveState:
     Raises:
         ProtocolError: a bit pattern that is no state.
     """
-    try:
-        return _STATES[statusword & 0x6F]
-    except KeyError:
-        raise ProtocolError(f"statusword {statusword:#06x} is no CiA 402 state") from None
+    state = known_state(statusword)
+    if state is None:
+        raise ProtocolError(f"statusword {statusword:#06x} is no CiA 402 state")
+    return state
+
+
+def known_state(statusword: int) -> DriveState | None:
+    """The drive state that a statusword tells; None for a bit pattern that is no state."""
+    return _STATES.get(statusword & 0x6F)
+
+
+def describe_state(statusword: int) -> str:
+    """Say what a statusword tells, to be put behind "the drive is"."""
+    state = known_state(statusword)
+    return state.name if state is not None else f"in no CiA 402 state (statusword {statusword:#06x})"
 
 
 def statusword_of(state: DriveState) -> int:

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, checked, positive, read_only
 from canprobe.touch.contact import Doubt
-from canprobe.touch.patch_beyond import WORTH_COMPLETING, Continuation
+from canprobe.touch.patch_beyond import LEAST_PEAK, WORTH_COMPLETING, Continuation
 from canprobe.touch.patch_mending import mended
 
 SIDE = 16
@@ -186,7 +186,8 @@ def compute_patch(
     counts = taxels.tobytes()
     peak = max(counts)
     peak_pa, at_pad, at_window = calibration.pascals.take((peak, *_edges(counts, window))).tolist()
-    if window is not None and at_window > WORTH_COMPLETING * peak_pa:
+    shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
+    if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
     moments = (pressure.reshape(-1) @ calibration.weights).tolist()
     return _patch(

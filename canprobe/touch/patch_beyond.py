@@ -20,6 +20,9 @@ from canprobe.touch._arrays import Array
 
 WORTH_COMPLETING = 0.1
 """Share of the peak at the window's edge up to which a patch ends within the next taxel."""
+LEAST_PEAK = 3
+"""Highest count over the threshold up to which whole counts and noise hide the shape: what creep leaves of a long press
+was carried on to up to five times its force."""
 LEAST_SHARE = 0.2
 """Share of the peak below which a taxel is left out of the fit: blur and threshold bend the rim."""
 LEAST_TAXELS = 12

@@ -12,23 +12,29 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.bus.sdo_client import upload
 from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
 from canprobe.eds import eds_path
+from canprobe.emulator.build import make_world
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
-from canprobe.errors import NodeError
+from canprobe.errors import BusError, InterfaceError, NodeError
 from canprobe.session import Session
 
 MS = 1_000_000
 
 
-def open_session(tmp_path, *, faults=(), change=None, nodes=None, scene="free", rate_hz=400.0, **bring_up):
+def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), scene="free", rate_hz=400.0, **bring_up):
+    """A session in lockstep; `beside` are participants besides its nodes."""
+    beside = list(beside)
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
     session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
 
     def join(participant):
+        while beside:
+            session.lockstep.attach(beside.pop())
         if hasattr(participant, "node_id"):
             if nodes is not None:
                 if participant.node_id in nodes:
@@ -51,6 +57,95 @@ def frames(tmp_path):
 
 def writes_to(log, node_id):
     return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
+
+
+class Somebody:
+    """Does something 100 ms after the cell's port was opened, while it listens; or at a frame of the cell's."""
+
+    def __init__(self, act, at=None):
+        self.next_deadline_ns = 100 * MS if at is None else None
+        self._act, self._at = act, at
+
+    def start(self, t_ns):
+        return []
+
+    def receive(self, can_id, data, t_ns):
+        if self._at is not None and self._at(can_id, data):
+            self._at = None
+            return self._act()
+        return []
+
+    def advance(self, t_ns):
+        self.next_deadline_ns = None
+        return self._act()
+
+
+def sending(can_id, data):
+    return lambda: [(can_id, bytes.fromhex(data))]
+
+
+def raising(error):
+    def act():
+        raise error
+
+    return act
+
+
+def is_reset(can_id, data):
+    return can_id == 0 and data[0] == 0x81
+
+
+def is_write(can_id, data):
+    return can_id == 0x603 and data[0] >> 5 == 1
+
+
+REFUSED = {
+    "a heartbeat of our own id": (sending(0x77F, "05"), BusError),
+    "SYNC": (sending(0x080, ""), BusError),
+    "an NMT command": (sending(0x000, "0103"), BusError),
+    "Ctrl-C": (raising(KeyboardInterrupt()), KeyboardInterrupt),
+    "the interface is lost": (raising(InterfaceError("can0: lost")), InterfaceError),
+}
+
+
+@pytest.mark.parametrize("what", REFUSED)
+def test_what_did_not_take_over_the_nodes_sends_nothing(tmp_path, what):
+    act, kind = REFUSED[what]
+    with pytest.raises(kind) as refused:
+        open_session(tmp_path, beside=[Somebody(act)]).__enter__()
+    assert kind is not BusError or str(refused.value).endswith("another master is at work here; stop it first")
+    sent = [frame for frame in frames(tmp_path) if frame[0] < 100 * MS or frame[1] not in (0x77F, 0x080, 0x000)]
+    assert sorted(i for _, i, _ in sent) == [0x700 + n for n in range(1, 7)], "the nodes' boot-ups and nothing else"
+    assert len(frames(tmp_path)) - len(sent) == (kind is BusError)
+
+
+def refuse_a_write(node):
+    if node.node_id == 3:
+        node.dictionary.entries.pop(0x606500)
+
+
+FAILED = {
+    "Ctrl-C at the reset": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_reset)]}, KeyboardInterrupt),
+    "Ctrl-C while they are configured": ({"beside": [Somebody(raising(KeyboardInterrupt()), is_write)]}, BaseException),
+    "SYNC after the reset": ({"beside": [Somebody(sending(0x080, ""), is_write)]}, BusError),
+    "a value is refused": ({"change": refuse_a_write}, NodeError),
+}
+
+
+@pytest.mark.parametrize("what", FAILED)
+def test_what_took_over_the_nodes_leaves_them_pre_operational(tmp_path, what):
+    """Another device, a drive that does not start and a pressed probe: see below, and `test_preload`."""
+    options, kind = FAILED[what]
+    with pytest.raises(kind):
+        open_session(tmp_path, **options).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def assert_left_pre_operational(tmp_path, before=(0x81,)):
+    """The last that each node was told; and what they were told before."""
+    commands = [d for _, i, d in frames(tmp_path) if i == 0]
+    assert commands[-6:] == [bytes((0x80, n)) for n in range(1, 7)]
+    assert {d[0] for d in commands[:-6]} == set(before)
 
 
 def test_the_nodes_are_configured_side_by_side(tmp_path):
@@ -238,6 +333,104 @@ def test_a_value_that_does_not_fit_its_object_is_named(tmp_path, answer, got):
     entry = f"{answer[2]:02X}{answer[1]:02X}h:{answer[3]:02X}"
     with pytest.raises(NodeError, match=rf"^node 3: \(joint 3\) read of {entry} failed: {got}$"):
         open_session(tmp_path, change=change).__enter__()
+
+
+def silent(node):
+    if node.node_id == 3:
+        node.receive = lambda can_id, data, t_ns: []
+
+
+def other_device(node):
+    if node.node_id == 3:
+        node.dictionary.set_default(0x1018, 2, 7)
+
+
+@pytest.mark.parametrize("change", [deaf_to_starts(9), silent, other_device, refuse_a_write])
+def test_a_failure_ends_with_the_last_emcy_of_the_node(tmp_path, change):
+    """Whatever it fails in; the EMCY came before anybody had spoken to it."""
+    reports = Somebody(sending(0x083, "0050810000000000"))
+    with pytest.raises(NodeError, match=r"^node 3: .*; node 3: EMCY 5000h, device hardware$"):
+        open_session(tmp_path, beside=[reports], change=change, boot_up_s=0.2).__enter__()
+
+
+def test_what_a_node_sent_before_we_listened_is_in_its_error_history(tmp_path):
+    def remember(node):
+        deaf_to_starts(9)(node)
+        if node.node_id == 3:
+            node.dictionary.on_read(0x1003, lambda _: node.dictionary.put(0x1003, 1, 0x12345000))
+
+    told = r"PRE_OPERATIONAL; its error history \(1003h\) begins with 5000h, device hardware$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, change=remember).__enter__()
+
+
+def late(by_s, **bring_up):
+    """Each answer of node 3 comes late."""
+    fault = Fault(FaultKind.DELAY, 3, 0, 9000 * MS, amount_ns=round(by_s * 1e9))
+    return {"faults": [fault], "sdo_s": 0.05, "retries": 2, **bring_up}
+
+
+def test_late_answers_are_taken_for_what_they_answer(tmp_path):
+    """A write is read back from the same entry: a late answer to the one is none to the other."""
+    with open_session(tmp_path, **late(0.06)) as session:
+        reports = session.cell.bring_up_reports
+    assert str(reports[2]).startswith("node 3: (joint 3) configured, software 1.0, ")
+    assert reports[2].repeated > 20 and reports[1].repeated == 0
+
+
+def test_a_late_answer_is_no_segment():
+    talk = upload(0x100A, 0)
+    begin, text = bytes.fromhex("410a100006000000"), b"9.8.76"
+    assert next(talk) == bytes.fromhex("400a100000000000")
+    assert talk.send(begin) == bytes.fromhex("6000000000000000")
+    assert talk.send(begin) is None, "asked twice, answered twice"
+    with pytest.raises(StopIteration) as ended:
+        talk.send(b"\x03" + text + b"\0")
+    assert ended.value.value == text
+
+
+def test_answers_that_come_far_too_late_are_told_with_the_way_out(tmp_path):
+    told = r"failed: No SDO response received within 0.05 s, 3 times; .* a larger bring_up.sdo_s$"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, **late(1.0)).__enter__()
+
+
+def boots_twice(node):
+    if node.node_id != 3:
+        return
+    hear = node.receive
+
+    def receive(can_id, data, t_ns):
+        answers = list(hear(can_id, data, t_ns))
+        return answers * 2 if answers == [(0x703, b"\0")] else answers
+
+    node.receive = receive
+
+
+def test_a_node_that_boots_twice_is_brought_up(tmp_path):
+    said = []
+    session = open_session(tmp_path, change=boots_twice)
+    session._say = said.append
+    with session:
+        pass
+    assert "node 3: (joint 3) sent 2 boot-ups after its reset" in said
+
+
+def test_two_nodes_with_one_id_are_told_from_one_that_boots_twice(tmp_path):
+    plan = canprobe.plan(canprobe.load_scene("free"))
+    (twin,) = make_world(plan, (3,)).nodes
+    told = r"node 3: \(joint 3\) answered .* 2 boot-ups and a request with 2 answers: the node id is in use twice"
+    with pytest.raises(NodeError, match=told):
+        open_session(tmp_path, beside=[twin]).__enter__()
+    assert_left_pre_operational(tmp_path)
+
+
+def test_a_node_that_boots_again_ends_bring_up(tmp_path):
+    """It would run with its defaults. On this bus, full of SDOs, its boot-up comes through after them."""
+    booting = Somebody(sending(0x703, "00"), is_write)
+    with pytest.raises(NodeError, match=r"node 3: \(joint 3\) booted again after it was configured: check its power"):
+        open_session(tmp_path, beside=[booting]).__enter__()
+    assert_left_pre_operational(tmp_path, before=(0x81, 0x01))
 
 
 def other_make(tmp_path):

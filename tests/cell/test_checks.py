@@ -85,7 +85,8 @@ def test_a_heartbeat_is_lost_after_its_time_and_not_in_it():
 @pytest.mark.parametrize(("gap_ms", "told"), [(12.5, False), (42.0, True)])
 def test_a_drive_that_stopped_because_the_master_was_held_up_says_so(gap_ms, told):
     found = seen(measurement=Measurement(100, 0, enabled=False), gap_ns=round(gap_ms * 1e6))
-    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=4)], states=(DriveState.QUICK_STOP_ACTIVE,))
+    first = (0, DriveState.QUICK_STOP_ACTIVE.name)
+    found.drives = SimpleNamespace(axes=[SimpleNamespace(node_id=4)], first_not_in=lambda _: first)
     text = str(checks.drive_not_enabled(found))
     assert text.startswith("node 4: (joint 1) left operation enabled: QUICK_STOP_ACTIVE")
     cause = "; the last SYNC was sent 42 ms after the one before, and the drives stop by themselves 12.5 ms after one"

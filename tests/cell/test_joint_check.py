@@ -133,7 +133,7 @@ def test_beyond_a_stop_nothing_moves(limits):
 
 
 def test_a_workspace_without_room_is_left_alone(limits):
-    tip = limits.tip_of(START)
+    tip = limits.T_base_tip_of(START)[:3, 3]
     check = check_of(replace(limits, workspace=np.array([tip - 1e-5, tip + 1e-5])))
     targets, last = run(check)
     assert last.done

@@ -100,6 +100,12 @@ def test_a_silent_node_and_an_emergency_are_shown(recorded, in_hold):
     assert "EMCY 4310h, drive over-temperature" in text.split("joint 4")[1].splitlines()[0]
 
 
+def test_a_statusword_of_no_state_is_shown(recorded, in_hold):
+    view = heard(recorded, in_hold[1], lambda fs: [(i, b"\x01" + d[1:] if i == 0x183 else d, t) for i, d, t in fs])
+    assert view.nodes[2].drive.startswith("in no CiA 402 state (statusword 0x")
+    assert {node.drive for node in (*view.nodes[:2], *view.nodes[3:6])} == {"OPERATION_ENABLED"}
+
+
 def test_the_screen_is_plain_ansi_in_place(in_hold):
     _, _, view = in_hold
     text = screen(view)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from dataclasses import replace
 from itertools import count
 from struct import pack, unpack
 
@@ -10,13 +11,18 @@ import numpy as np
 import pytest
 from injected import HOLD_CYCLE, Injected, altered, send
 
+import canprobe
 from canprobe.bus.interrupts import Terminated
 from canprobe.bus.port import ControllerState
+from canprobe.cell.build import make_task
 from canprobe.cell.lift_off import WAY
 from canprobe.cell.measurement import Command
+from canprobe.cell.supervision import TOUCH_FORCE
+from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
 from canprobe.protocol.frames import SYNC_ID, NmtState
+from canprobe.session import Session, resolve_scene
 
 
 def lifted(run):
@@ -36,6 +42,7 @@ LOST = {
     "joint 3 boots again": ("nmt_state", lambda r: r.fault(FaultKind.REBOOT, 3, duration_ns=1_000_000)),
     "joint 5 has a fault": ("drive_fault", lambda r: r.nodes[5].node.application.inject_fault(0x4310)),
     "joint 6 is frozen": ("drive_silent", lambda r: r.fault(FaultKind.FREEZE, 6)),
+    "joint 2 tells no state": ("drive_fault", lambda r: altered(r.nodes[2], 0x182, lambda d: b"\x01\x06" + d[2:])),
     "the sensor is stopped": ("nmt_state", lambda r: r.nodes[16].node._enter(NmtState.STOPPED, r.now())),
 }
 
@@ -84,8 +91,49 @@ def test_a_drive_that_tells_what_cannot_be_may_be_moving():
 def test_with_another_master_nothing_moves():
     run = Injected("press", HOLD_CYCLE, lambda r: send(r, (SYNC_ID, b"")))
     pressed_on(run, "another master")
-    (told,) = (fault for fault in run.session.cell.faults if "left pressing" in fault)
-    assert 1.8 < float(told.split(" N")[0].split()[-1]) < 2.2 and "free it; a run does not begin" in told
+    (force,) = left_pressing(run.session)
+    assert 1.8 < force < 2.2
+    assert any(
+        fault.endswith("free it; a run does not begin while the array feels a force")
+        for fault in run.session.cell.faults
+    )
+
+
+def left_pressing(session):
+    """The forces that the user is told to free, N."""
+    return [float(fault.split(" N")[0].split()[-1]) for fault in session.cell.faults if "left pressing" in fault]
+
+
+def test_a_light_press_after_a_strong_one_is_told():
+    class Softer(Injected):
+        def command(self, measurement, command):
+            share = np.clip((self.at - measurement.cycle) / 200.0, 0.0, 1.0)
+            if share < 1.0:
+                self.task.set_target("target_force_n", 0.4 + 1.6 * float(share))
+            return command
+
+    run = Softer("press", HOLD_CYCLE + 200, lambda r: send(r, (SYNC_ID, b"")))
+    assert run.session.truth["force"].max() > 1.8 and 0.15 < run.session.truth["force"][-1] < 0.5
+    assert left_pressing(run.session) == [pytest.approx(run.session.truth["force"][-1], abs=0.15)]
+
+
+def test_what_the_array_remembers_is_no_press_and_what_comes_on_top_of_it_is():
+    """After 3 s at 4.5 N the array shows for a while what a touch would."""
+    scene = resolve_scene(canprobe.load_scene("press"), duration_s=3.0)
+    scene = replace(scene, task=replace(scene.task, force_n=4.5, clearance_mm=0.8))
+    scene = replace(scene, limits=replace(scene.limits, force_max_n=8.0))
+    remembered = []
+    for pressed_again in (False, True):
+        with Session(scene) as session:
+            session.run(make_task(session.plan))
+            remembered.append(session.cell.supervisor.felt())
+            if pressed_again:
+                task = make_task(session.plan)
+                session.run(lambda m, step=task.step: replace(step(m), done=task.phase is Phase.SCAN))  # noqa: B023
+        told = left_pressing(session)
+        assert told == ([pytest.approx(session.truth["force"][-1], abs=0.3)] if pressed_again else [])
+        assert bool(session.truth["force"][-1] > 4.0) is pressed_again
+    assert min(remembered) > TOUCH_FORCE, "by its size it could be a press"
 
 
 def test_after_bus_off_nothing_can_be_sent():

@@ -11,6 +11,7 @@ from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.supervision import Reaction
 from canprobe.errors import SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
+from canprobe.protocol.frames import NmtState
 from canprobe.scene_geometry import true_object
 from canprobe.session import Session, resolve_scene
 
@@ -43,6 +44,7 @@ def test_no_drive_is_enabled():
     assert np.ptp(session.truth["q"], axis=0).max() == 0.0
     words = session.cell.log.arrays()["statusword"]
     assert {state_of(int(word)) for word in words[np.isfinite(words)]} == {DriveState.SWITCH_ON_DISABLED}
+    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_a_larger_limit_lets_an_array_with_offsets_begin():

@@ -20,6 +20,7 @@ from canprobe.cell.measurement import Command
 from canprobe.cell.supervision import Reaction
 from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import FaultKind
+from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import InterfaceError, NodeError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.emcy import Emcy
@@ -393,14 +394,37 @@ def test_the_workspace_ends_a_press():
 
 def test_the_workspace_ends_an_own_controllers_motion():
     scene = canprobe.load_scene("free")
-    tip_of = limits_of(Session(scene).plan).tip_of
-    start = 1e3 * tip_of(np.radians(scene.arm.start_deg))
+    T_base_tip_of = limits_of(Session(scene).plan).T_base_tip_of
+    start = 1e3 * T_base_tip_of(np.radians(scene.arm.start_deg))[:3, 3]
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
     assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)
-    tips = np.array([tip_of(q) for q in run.session.truth["q"][::5]])
+    tips = np.array([T_base_tip_of(q)[:3, 3] for q in run.session.truth["q"][::5]])
     assert (1e3 * tips < start + 15.0 + 3.0).all()
     run.assert_drives_off()
+
+
+def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stopped_in_order():
+    run = Injected("free", FREE_CYCLE, lambda r: altered(r.nodes[3], 0x183, lambda d: b"\x01\x06" + d[2:]))
+    run.assert_within("drive_fault").assert_drives_off()
+    told = "node 3: (joint 3) left operation enabled: in no CiA 402 state (statusword 0x0601)"
+    assert str(run.error) == told
+    assert run.session.cell.faults == ["while stopping: node 3 did not confirm that it is disabled"]
+
+
+def test_a_drive_that_is_never_in_a_state_is_not_enabled():
+    session = Session(canprobe.load_scene("free"))
+
+    def join(participant):
+        if getattr(participant, "node_id", None) == 3:
+            altered(participant := FaultyNode(participant), 0x183, lambda d: b"\x01\x06" + d[2:])
+        return participant
+
+    session.joins = join
+    told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after it was told to enable operation"
+    with pytest.raises(NodeError, match=told), session:
+        session.run(lambda _: Command())
+    assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}
 
 
 def test_a_drive_that_keeps_telling_a_wrong_position_is_lost():

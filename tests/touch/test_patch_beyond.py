@@ -127,3 +127,17 @@ def around(image, side):
     """First row and column of the window that has the centroid in its middle."""
     places = np.indices(image.shape).reshape(2, -1) @ image.reshape(-1).astype(float) / image.sum()
     return [int(np.clip(round(place - (side - 1) / 2), 0, SIDE - side)) for place in places]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_an_array_remembers_is_not_made_larger(seed):
+    """After a long press few taxels are above the threshold, in whole counts and noise: no summit that can be seen."""
+    array = TaxelArray(TaxelConfig(), np.random.default_rng(seed))
+    kappa, axes, origin = SHAPES["cylinder"], np.eye(2), middle()
+    for t_s in np.arange(0.0, 3.0, 0.05):
+        array.image((0.0, 0.0), depth_for_force(4.5, kappa, 0.04, 1.27e8), kappa, axes, t_s)
+    for t_s in np.arange(3.2, 5.0, 0.005):
+        image = array.image((0.0, 0.0), -1.0, kappa, axes, t_s)
+        origin = follow(image, origin)
+        window = (*origin, 8, 8)
+        assert compute_patch(seen(image, window), EXACT, window).force <= 1.2 * compute_patch(image, EXACT).force

@@ -38,8 +38,14 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
             assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
-def test_up_ends_with_an_interrupt(bench: Any) -> None:
+def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_an_interrupt(bench: Any) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    bench.bus.until_enabled(1, by=command)
+    second = bench.start("up", bench.scene("free"), *ON_VCAN0)
+    while second.running:
+        heard = {can_id for can_id, _, _ in bench.bus.hear()}
+        assert not heard.intersection((0x000, *(base + n for base in (0x580, 0x600) for n in NODES)))
+    assert second.end(3)[-1].endswith("another master is at work here; stop it first")
     bench.bus.until_enabled(1, by=command)
     command.send(signal.SIGINT)
     lines = command.end(0)
@@ -108,10 +114,12 @@ def test_emulated_nodes_go_with_a_master_that_is_killed(bench: Any) -> None:
 )
 def test_another_master_is_at_work(bench: Any, frame: tuple[int, bytes], what: str) -> None:
     command = bench.start("run", bench.scene("free", emulated=False), *ON_VCAN0, "--out", "results")
+    heard = []
     while command.running:
         bench.bus.port.send_batch([frame])
-        bench.bus.hear()
+        heard += bench.bus.hear()
     (line,) = command.end(3)
+    assert heard + bench.bus.hear() == [], "it has sent nothing"
     assert line.startswith(f"canprobe: vcan0: {what}")
     assert line.endswith("another master is at work here; stop it first")
 

@@ -130,9 +130,9 @@ class JointCheck:
 
     def _leaves_workspace(self, q: Vector) -> bool:
         limits = self._limits
-        if limits.workspace is None or limits.tip_of is None:
+        if limits.workspace is None or limits.T_base_tip_of is None:
             return False
-        return outside_workspace(limits.tip_of(q), limits.workspace) is not None
+        return outside_workspace(limits.T_base_tip_of(q)[:3, 3], limits.workspace) is not None
 
     # ------------------------------------------------------------------ parts of the script
 

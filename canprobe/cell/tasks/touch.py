@@ -266,13 +266,14 @@ class TouchTask(ProbingTask):
         assert self._line is not None
         pose = self._line.at(self._t)
         if self._t >= self._line.duration + self._lead_s + 0.1:
+            self._floor = self._force  # an array that was pressed for long shows some of it for a while
             self._enter(Phase.APPROACH)
         return pose
 
     def _approach(self) -> ProbePose:
         distance = self._task.approach.clearance - self._task.approach.speed * self._t
         pose = self._above(distance)
-        if self._contact is not None and self._force > TOUCH_FORCE:
+        if self._contact is not None and self._force > TOUCH_FORCE + self._floor:
             self._touch_down(self._contact, pose)
         elif distance < -self._task.approach.search:
             self._leave(f"no object found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected point")
