@@ -175,14 +175,15 @@ def _viewer(case: Case, bridges: Bridges) -> Iterator[None]:
 
 
 def _draw(rows: Sequence[Row], path: Path) -> None:
-    from matplotlib.figure import Figure
+    from canprobe.studies.figure import BLUE, SKY, legend, picture
 
-    figure = Figure(figsize=(7.0, 3.2), layout="constrained")
-    axes = figure.subplots()
-    names = [row["bridge"] + (", watched" if row["watched"] != "–" else "") for row in rows]
-    axes.barh(names, [row["added_p99_us"] for row in rows], color="#bbccee", label="99 of 100 cycles")
-    axes.barh(names, [row["added_p50_us"] for row in rows], color="#4477aa", label="median", height=0.5)
-    axes.invert_yaxis()
-    axes.set_xlabel("added to a cycle of 2500 µs (µs)")
-    axes.legend(frameon=False)
-    figure.savefig(path, dpi=150)
+    title = "Time that bridges add to a cycle of 2500 µs; watched: while a process takes every topic"
+    with picture(path, title, 3.6) as figure:
+        axes = figure.subplots()
+        names = [row["bridge"] + (", watched" if row["watched"] != "–" else "") for row in rows]
+        axes.barh(names, [row["added_p99_us"] for row in rows], color=SKY, label="99 of 100 cycles")
+        axes.barh(names, [row["added_p50_us"] for row in rows], color=BLUE, label="median", height=0.5)
+        axes.invert_yaxis()
+        axes.grid(visible=False, axis="y")
+        axes.set_xlabel("added to a cycle (µs)")
+        legend(figure)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from canprobe.planning import Plan
 from canprobe.planning.timeline import Part, timeline
 from canprobe.planning.traffic import on_the_wire
+from canprobe.studies.figure import AMBER, BLUE, GREY, INK, ORANGE, SHADE, SKY, legend, picture
 
-INK, FAINT, LATE = "#1f2933", "#d9dee4", "#c2410c"
 COLOURS: dict[Part, str] = {
-    "SYNC": "#1f2933", "feedback": "#0f6e84", "controller": "#a3aab4", "command": "#b7791f", "tactile": "#7aa6c2",
+    "SYNC": INK, "feedback": BLUE, "controller": GREY, "command": AMBER, "tactile": SKY,
 }  # fmt: skip
 NAMES: dict[Part, str] = {
     "SYNC": "SYNC", "feedback": "feedback (TPDO)", "controller": "controller", "command": "commands (RPDO)",
@@ -31,17 +30,14 @@ def draw_plan(plan: Plan, path: Path | str) -> None:
         path: of the picture; its suffix names the form.
     """
     messages = on_the_wire(plan.pdos)
-    heights = [0.55 * (len(plan.buses) + 1) + 0.5, _ROW_INCHES * len(messages) + 0.6]
-    figure = Figure(figsize=(11.0, sum(heights) + 1.2), dpi=110, layout="constrained")
+    heights = [0.45 * (len(plan.buses) + 1) + 0.5, _ROW_INCHES * len(messages) + 0.6]
     loads = ", ".join(f"{bus.channel} {100 * bus.traffic.load:.0f} %" for bus in plan.buses)
-    title = f"{plan.scene.name} at {plan.sync.rate_hz:g} Hz, {plan.scene.bus.bitrate / 1e6:g} Mbit/s: worst-case load"
-    figure.suptitle(f"{title} {loads}", x=0.01, ha="left", fontsize=12, color=INK)
-    upper, lower = figure.subplots(2, 1, height_ratios=heights)
-    _draw_cycles(upper, plan)
-    _draw_responses(lower, plan)
-    handles = [Patch(color=COLOURS[part], label=NAMES[part]) for part in _parts(plan)]
-    figure.legend(handles=handles, loc="outside lower left", ncols=5, frameon=False, fontsize=9)
-    figure.savefig(path)
+    title = f"{plan.scene.name} at {plan.sync.rate_hz:g} Hz, {plan.scene.bus.bitrate / 1e6:g} Mbit/s"
+    with picture(path, f"{title}: worst-case load {loads}", sum(heights) + 1.1) as figure:
+        upper, lower = figure.subplots(2, 1, height_ratios=heights)
+        _draw_cycles(upper, plan)
+        _draw_responses(lower, plan)
+        legend(figure, [Patch(color=COLOURS[part], label=NAMES[part]) for part in _parts(plan)])
 
 
 def _parts(plan: Plan) -> list[Part]:
@@ -61,8 +57,7 @@ def _draw_cycles(axes: Axes, plan: Plan) -> None:
     axes.set_yticks(range(len(rows)), [row or "controller" for row in rows])
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(-0.01 * cycles * period_us, 1.01 * cycles * period_us)
-    axes.set_xlabel("µs after SYNC", fontsize=9)
-    axes.set_title("As it goes, every frame of its worst-case length", loc="left", fontsize=10)
+    axes.set(title="As it goes, every frame of its worst-case length; line: SYNC", xlabel="time after SYNC (µs)")
     _bare(axes)
 
 
@@ -71,24 +66,24 @@ def _draw_responses(axes: Axes, plan: Plan) -> None:
     for y, pdo in enumerate(messages):
         part: Part = "tactile" if pdo.kind == "tactile" else "command" if pdo.direction == "rpdo" else "feedback"
         share = None if pdo.response_ns is None else 100 * pdo.response_ns / pdo.deadline_ns
-        axes.barh(y, 100, height=0.72, color=FAINT, alpha=0.5)
+        axes.barh(y, 100, height=0.72, color=SHADE)
         if share is None:
-            axes.text(1, y, "no bound", va="center", fontsize=7.5, color=LATE)
+            axes.text(1, y, "no bound", va="center", fontsize=8, color=ORANGE)
             continue
-        axes.barh(y, share, height=0.72, color=COLOURS[part] if share <= 100 else LATE)
+        axes.barh(y, share, height=0.72, color=COLOURS[part] if share <= 100 else ORANGE)
         text = f"{pdo.response_ns / 1000:.0f} of {pdo.deadline_ns / 1000:.0f} µs" if pdo.response_ns is not None else ""
-        axes.text(101, y, text, va="center", fontsize=7.5, color=INK)
+        axes.text(101, y, text, va="center", fontsize=8)
     labels = [f"{pdo.cob_id:03X}h  node {pdo.node_id:2} {pdo.direction.upper()}{pdo.number}" for pdo in messages]
-    axes.set_yticks(range(len(messages)), labels, fontsize=7.5, family="monospace")
+    axes.set_yticks(range(len(messages)), labels, fontsize=8, family="monospace")
     axes.set_ylim(len(messages) - 0.4, -0.6)
     axes.set_xlim(0, 115)
     axes.set_xticks(range(0, 101, 20))
-    axes.set_xlabel("worst-case response time, % of the deadline", fontsize=9)
-    axes.set_title("At the latest, with everything else on the bus", loc="left", fontsize=10)
+    axes.set(
+        title="At the latest, with everything else on the bus", xlabel="worst-case response time, % of the deadline"
+    )
     _bare(axes)
 
 
 def _bare(axes: Axes) -> None:
-    axes.tick_params(labelsize=8)
-    for side in ("top", "right", "left"):
-        axes.spines[side].set_visible(False)
+    axes.grid(visible=False)
+    axes.spines["left"].set_visible(False)

@@ -8,88 +8,58 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
+from matplotlib.figure import SubFigure
+
+from canprobe.studies.figure import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 
 if TYPE_CHECKING:
     from canprobe.studies.cycle_times import Times
     from canprobe.studies.realtime_cases import Measured
 
-INK, FAINT = "#1f2933", "#d9dee4"
-OURS, PLAIN, THIRD = "#0f6e84", "#b7791f", "#c2410c"
-CROWDED = 500.0
-"""Width of an axis from which its labels would run into each other at 1, 2 and 5."""
+LINES = ((BLUE, "-"), (ORANGE, "--"), (SKY, ":"))
 
 
 def draw_realtime(measured: Sequence[Measured], path: Path) -> None:
     """Lateness of SYNC, computing time, answer latency, and held over asked rate."""
-    figure = Figure(figsize=(11.5, 7.4), dpi=110, layout="constrained")
     scan, plain, bare = measured[:3]
-    figure.suptitle(
-        f"{scan.rate_hz:g} Hz on a real SocketCAN interface, {scan.times.seconds:.0f} s, emulated nodes beside it",
-        x=0.01, ha="left", fontsize=12, color=INK,
-    )  # fmt: skip
-    grid = figure.subplots(2, 2)
-    _histogram(
-        grid[0][0],
-        "lateness of SYNC (µs)",
-        {
-            "canprobe": scan.times.lateness_ns,
-            "plain canopen": plain.times.lateness_ns,
-            "a loop that does nothing": bare.times.lateness_ns,
-        },
-    )
-    _histogram(
-        grid[0][1],
-        "from the last TPDO, whole controller (µs)",
-        {"until the RPDOs are out": scan.times.response_ns, "with the work behind them": scan.times.compute_ns},
-    )
-    grid[0][1].axvline(
-        scan.times.period_ns * 0.3e-3, color=INK, linewidth=1.0, linestyle=":", label="30 % of the period"
-    )
-    grid[0][1].legend(frameon=False, fontsize=9)
-    _histogram(grid[1][0], "SYNC → last TPDO (µs)", {"canprobe": scan.times.latency_ns})
-    _rates(grid[1][1], measured)
-    figure.savefig(path)
+    rate, seconds = f"{scan.rate_hz:g} Hz", f"{scan.times.seconds:.0f} s"
+    title = f"{rate} on a real SocketCAN interface, {seconds}, emulated nodes beside it; from a microsecond up"
+    with picture(path, title, 6.6) as figure:
+        panels = parts(figure, 2, 2)
+        late = {"canprobe": scan, "plain canopen": plain, "a loop that does nothing": bare}
+        _histogram(panels[0], "lateness of SYNC (µs)", {name: m.times.lateness_ns for name, m in late.items()})
+        done = {"RPDOs out": scan.times.response_ns, "work behind them done": scan.times.compute_ns}
+        axes = _histogram(panels[1], "from the last TPDO, whole controller (µs)", done)
+        axes.axvline(scan.times.period_ns * 0.3e-3, color=INK, linewidth=0.9, label="30 % of the period")
+        _histogram(panels[2], "SYNC → last TPDO (µs)", {"canprobe": scan.times.latency_ns})
+        _rates(panels[3].subplots(), measured)
+        for part in panels:
+            legend(part)
 
 
-def _histogram(axes: Axes, what: str, series: dict[str, Times]) -> None:
+def _histogram(part: SubFigure, what: str, series: dict[str, Times]) -> Axes:
+    axes: Axes = part.subplots()
     values = {name: np.maximum(v, 1000) / 1e3 for name, v in series.items() if len(v)}
     if values:
         every = np.concatenate(list(values.values()))
         bins = np.geomspace(max(1.0, float(every.min())), float(every.max()) * 1.01, 60).tolist()
-        for (name, v), colour in zip(values.items(), (OURS, PLAIN, THIRD), strict=False):
-            axes.hist(v, bins=bins, weights=np.full(len(v), 100 / len(v)), color=colour, alpha=0.6, label=name)
-        axes.set_xscale("log")
-        wide = bins[-1] > CROWDED * bins[0]
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
-        axes.xaxis.set_major_formatter(ScalarFormatter())
-        axes.xaxis.set_minor_formatter(NullFormatter())
-        axes.set_yscale("log")
+        for (name, v), (colour, line) in zip(values.items(), LINES, strict=False):
+            share = np.full(len(v), 100 / len(v))
+            axes.hist(v, bins, weights=share, histtype="step", color=colour, linestyle=line, linewidth=1.3, label=name)
         axes.set_ylim(5e-3, 100)
-        axes.legend(frameon=False, fontsize=9)
-    axes.set_xlabel(what)
-    axes.set_ylabel("share of cycles (%)")
-    _plain(axes)
+        log_scale(axes, "xy")
+    axes.set(xlabel=what, ylabel="share of cycles (%)")
+    return axes
 
 
 def _rates(axes: Axes, measured: Sequence[Measured]) -> None:
     holds = [m for m in measured if m.case == "hold"]
-    for mode, colour in zip(dict.fromkeys(m.sensor for m in holds), (OURS, PLAIN, THIRD), strict=False):
+    for mode, (colour, line) in zip(dict.fromkeys(m.sensor for m in holds), LINES, strict=False):
         mine = [m for m in holds if m.sensor == mode]
-        axes.plot([m.rate_hz for m in mine], [m.times.rate_hz for m in mine], "o-", color=colour, label=mode)
+        axes.plot(
+            [m.rate_hz for m in mine], [m.times.rate_hz for m in mine], "o", linestyle=line, color=colour, label=mode
+        )
     top = max((m.rate_hz for m in holds), default=1.0)
-    axes.plot([0, top], [0, top], color=FAINT, zorder=0)
-    axes.axvline(639, color=FAINT, linestyle=":", zorder=0)
-    axes.annotate("1 Mbit/s ends", (639, 0), fontsize=8, color=INK, rotation=90, va="bottom", ha="right")
-    axes.set_xlabel("rate asked (Hz), joints held")
-    axes.set_ylabel("cycles a second")
-    axes.legend(frameon=False, fontsize=9)
-    _plain(axes)
-
-
-def _plain(axes: Axes) -> None:
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    axes.grid(color=FAINT, linewidth=0.5)
-    axes.set_axisbelow(True)
+    axes.plot([0, top], [0, top], color=GREY, linewidth=0.8, zorder=0, label="as asked")
+    axes.axvline(639, color=GREY, linestyle="-.", zorder=0, label="end of 1 Mbit/s, six drives")
+    axes.set(xlabel="rate asked, joints held (Hz)", ylabel="cycles a second")

@@ -6,19 +6,19 @@ import math
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from matplotlib.figure import SubFigure
 
 from canprobe.cell.mapping import SAME_DIRECTION_RAD
 from canprobe.results import RunResult
 from canprobe.scene_geometry import true_object
+from canprobe.studies.figure import BLUE, FAINT, GREEN, INK, ORANGE, legend, parts, picture
 from canprobe.studies.surface_tiles import draw_tiles
-from canprobe.studies.surface_view import ACCENT, FAINT, INK, SECOND, THIRD, MapView, rejected, view_of
+from canprobe.studies.surface_view import MapView, rejected, view_of
 from canprobe.touch.consistency import Consistency, check_consistency
 from canprobe.touch.objects import PlacedShape
 from canprobe.touch.surface_map import SurfaceMap
 
-PARTS = (("curvature", ACCENT), ("normal", SECOND), ("height", THIRD))
+PARTS = (("curvature", ORANGE), ("normal", BLUE), ("height", GREEN))
 
 
 def draw_surface(result: RunResult, path: Path) -> None:
@@ -53,69 +53,62 @@ def draw_map(
         title: first line.
     """
     view = view_of(surface_map, consistency or check_consistency(surface_map), shape)
-    figure = Figure(figsize=(13.0, 7.6), dpi=110, layout="constrained")
     crossings = len(view.consistency.crossings)
-    figure.suptitle(
+    told = (
         f"{title}\n{len(surface_map)} patches over {1e3 * surface_map.travelled[-1]:.0f} mm of path by"
-        f" {surface_map.method or 'an estimator'}, {crossings} crossings",
-        x=0.01, ha="left", fontsize=11, color=INK,
-    )  # fmt: skip
-    grid = figure.add_gridspec(2, 5, height_ratios=(1.0, 1.15))
-    draw_tiles(figure.add_subplot(grid[:, 0:3], projection="3d", computed_zorder=False), view)
-    _draw_crossings(figure.add_subplot(grid[0, 3:5] if crossings else grid[:, 3:5]), view)
-    if crossings:
-        _draw_p_values(figure.add_subplot(grid[1, 3:5]), view.consistency)
-    figure.savefig(path)
+        f" {surface_map.method or 'an estimator'}, {crossings} crossings"
+    )
+    with picture(path, told, 7.8) as figure:
+        upper, lower = parts(figure, 2, 1, height_ratios=(4, 3))
+        draw_tiles(upper, view)
+        left, *right = parts(lower, 1, 2 if crossings else 1)
+        _draw_crossings(left, view)
+        for part in right:
+            _draw_p_values(part, view.consistency)
 
 
-def _draw_crossings(axes: Axes, view: MapView) -> None:
+def _draw_crossings(part: SubFigure, view: MapView) -> None:
+    axes = part.subplots()
     path = view.plane(view.map.path)
     axes.plot(path[:, 0], path[:, 1], color=FAINT, linewidth=0.9, zorder=1)
     crossings = view.consistency.crossings
     if crossings:
-        places = view.plane(np.array([crossing.T_base_common[:3, 3] for crossing in crossings]))
+        places = view.plane(np.array([c.T_base_common[:3, 3] for c in crossings]))
         differ = rejected(view.consistency)
         same = np.array([not c.angle >= SAME_DIRECTION_RAD for c in crossings])
         for is_same, marker, where in ((True, "o", "same direction"), (False, "X", "other direction")):
-            for is_bad, colour, what in ((False, SECOND, "agree"), (True, ACCENT, "differ, p < 0.05")):
+            for is_bad, colour, what in ((False, BLUE, "agree"), (True, ORANGE, "differ")):
                 chosen = (same == is_same) & (differ == is_bad)
                 if chosen.any():
                     axes.scatter(
                         places[chosen, 0], places[chosen, 1], s=26, marker=marker, color=colour, linewidths=0.4,
                         edgecolors="white", zorder=3 if is_bad else 2, label=f"{where}: {chosen.sum()} {what}",
                     )  # fmt: skip
-        axes.legend(frameon=False, fontsize=7.5, ncols=2, loc="lower center", columnspacing=1.0, handletextpad=0.2)
     axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(y=0.25)
-    _style(axes, "path and its crossings (joint test)", "along the scan (mm)", "across (mm)")
+    axes.set(
+        title="path and crossings; differ: p < 0.05 in the joint test",
+        xlabel="along the scan (mm)",
+        ylabel="across (mm)",
+    )
+    legend(part)
 
 
-def _draw_p_values(axes: Axes, consistency: Consistency) -> None:
+def _draw_p_values(part: SubFigure, consistency: Consistency) -> None:
+    axes = part.subplots()
     axes.plot([0, 1], [0, 1], color=INK, linewidth=0.9, linestyle=":", label="one surface, exact covariances")
-    for part, colour in PARTS:
-        for style, name, low, high in (
+    for name, colour in PARTS:
+        for style, way, low, high in (
             ("-", "same direction", 0.0, SAME_DIRECTION_RAD),
             ("--", "other", SAME_DIRECTION_RAD, math.inf),
         ):
-            tests = [getattr(c, part) for c in consistency.crossings if low <= c.angle < high]
+            tests = [getattr(c, name) for c in consistency.crossings if low <= c.angle < high]
             p = np.sort([test.p for test in tests if test.dof])
             if len(p):
                 share = np.arange(1, len(p) + 1) / len(p)
                 axes.step(
-                    [0.0, *p, 1.0], [0.0, *share, 1.0], where="post", color=colour, linestyle=style, linewidth=1.1,
-                    label=f"{part}, {name}",
+                    [0.0, *p, 1.0], [0.0, *share, 1.0], where="post", color=colour, linestyle=style,
+                    label=f"{name}, {way}",
                 )  # fmt: skip
-    axes.set_xlim(0, 1)
-    axes.set_ylim(0, 1.02)
-    axes.legend(frameon=False, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.17), columnspacing=1.2)
-    _style(axes, "p-values of the tests at the crossings", "p", "share of crossings below")
-
-
-def _style(axes: Axes, title: str, x: str, y: str) -> None:
-    axes.set_title(title, loc="left", fontsize=10, color=INK)
-    axes.set_xlabel(x)
-    axes.set_ylabel(y)
-    axes.grid(color=FAINT, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.set(xlim=(0, 1), ylim=(0, 1.02), xlabel="p", ylabel="share of crossings below")
+    axes.set_title("p-values of the tests at the crossings")
+    legend(part)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
-from canprobe.studies.surface_view import ACCENT, FAINT, GHOST, INK, Array, MapView, rejected
+from canprobe.studies.figure import GREY, INK, ORANGE, Part, box, parts
+from canprobe.studies.surface_view import Array, MapView, rejected, true_surface
 from canprobe.touch.local_patch import LocalPatch
 from canprobe.touch.objects import PlacedShape
 from canprobe.touch.surface_map import SurfaceMap
@@ -19,22 +19,22 @@ TILE_M, RINGS, SECTORS = 1.8e-3, 3, 20
 """Radius of a tile; it is drawn as rings of sectors."""
 APART_M = 2.9e-3
 """Least distance of two tiles: where passes overlap, the best known patch stands for all."""
-MARGIN_M, GRID = 5e-3, 34
-LEAST_DEPTH_MM = 6.0
-"""Least height of the box, for a plane."""
 
 
-def draw_tiles(axes: Any, view: MapView) -> None:
-    """Draw tiles, path and true surface on 3-D axes; tiles are coloured by the error of K, or by mean curvature."""
+def draw_tiles(part: Part, view: MapView) -> None:
+    """Draw tiles, coloured by the error of K or by mean curvature, path and true surface in three dimensions."""
+    part, scale = parts(part, 1, 2, width_ratios=(8, 1))
+    axes = part.add_subplot(projection="3d", computed_zorder=False)
     path = view.plane(view.map.path)
     if view.shape is not None:
-        axes.plot_surface(*_ghost(view, view.shape), color=GHOST, alpha=0.25, linewidth=0, shade=True, zorder=1)
+        near = true_surface(view.shape, view.map.path, view.axes, view.origin)
+        axes.plot_surface(*near, color=GREY, alpha=0.25, linewidth=0, shade=True, zorder=1)
     patches = tiles_of(view.map)
     values = np.array([_value(patch, view.shape) for patch in patches])
     known = values[np.isfinite(values)]
     norm, colours = _scale(known, from_zero=view.shape is not None), colormaps["viridis"]
     for patch, value in zip(patches, values, strict=True):
-        face = colours(norm(value)) if math.isfinite(value) else GHOST
+        face = colours(norm(value)) if math.isfinite(value) else GREY
         grid = tile(patch)
         x, y, z = view.plane(grid.reshape(-1, 3)).T.reshape(3, *grid.shape[:2])
         axes.plot_surface(x, y, z, color=face, linewidth=0, shade=False, antialiased=False, zorder=2)
@@ -42,15 +42,12 @@ def draw_tiles(axes: Any, view: MapView) -> None:
     differ = rejected(view.consistency)
     if differ.any():
         places = np.array([c.T_base_common[:3, 3] for c in view.consistency.crossings])[differ]
-        axes.plot(*view.plane(places).T, "o", color=ACCENT, markersize=3.5, zorder=4)
-    _style_3d(axes)
+        axes.plot(*view.plane(places).T, "o", color=ORANGE, markersize=3.5, zorder=4)
+    labels = ("along the scan (mm)", "across (mm)", "outward (mm)")
+    box(part, axes, _title(view, len(patches) - len(known), bool(differ.any())), labels, elev=42, azim=-68)
     if len(known):
-        place = axes.inset_axes((0.2, 0.05, 0.6, 0.022))
-        bar = axes.figure.colorbar(ScalarMappable(norm, colours), cax=place, orientation="horizontal")
-        bar.ax.tick_params(labelsize=8)
-        what = "mean curvature" if view.shape is None else "‖K − K true‖"
-        bar.set_label(f"{what} (1/m)", fontsize=9, color=INK)
-    axes.set_title(_title(view, len(patches) - len(known), bool(differ.any())), loc="left", fontsize=10, color=INK)
+        what = "mean curvature (1/m)" if view.shape is None else "‖K − K true‖ (1/m)"
+        scale.colorbar(ScalarMappable(norm, colours), cax=scale.subplots(), label=what)
 
 
 def _scale(values: Array, *, from_zero: bool) -> Normalize:
@@ -61,15 +58,14 @@ def _scale(values: Array, *, from_zero: bool) -> Normalize:
 
 
 def _title(view: MapView, hidden: int, differ: bool) -> str:
-    first = ["where passes overlap, the best known patch"]
+    shown = ["where passes overlap, the best known patch"]
     if view.shape is not None:
-        first.append("true surface in light grey")
-    second = []
+        shown.append("true surface in light grey")
     if hidden:
-        second.append(f"{hidden} patches in dark grey: not all curvature observed")
+        shown.append(f"{hidden} in dark grey: not all curvature observed")
     if differ:
-        second.append("orange: passes differ, p < 0.05")
-    return " · ".join(first) + "\n" + " · ".join(second)
+        shown.append("orange: passes differ, p < 0.05")
+    return "\n".join(" · ".join(shown[i : i + 3]) for i in range(0, len(shown), 3))
 
 
 def tiles_of(surface_map: SurfaceMap) -> list[LocalPatch]:
@@ -108,32 +104,3 @@ def _value(patch: LocalPatch, shape: PlacedShape | None) -> float:
     P = patch.T_base_contact[:3, :2]
     tensor = (true.directions.T * true.kappa) @ true.directions
     return float(np.linalg.norm(K - P.T @ tensor @ P))
-
-
-def _ghost(view: MapView, shape: PlacedShape) -> tuple[Array, Array, Array]:
-    """True surface below the path, mm along, across, outward."""
-    flat = view.plane(view.map.path) * 1e-3
-    low, high = flat.min(axis=0) - MARGIN_M, flat.max(axis=0) + MARGIN_M
-    us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
-    above = np.stack((us, vs, np.full_like(us, high[2])), axis=-1) @ view.axes + view.origin
-    feet = view.plane(np.array([shape.closest(p).point for p in above.reshape(-1, 3)])).reshape(GRID, GRID, 3)
-    return feet[..., 0], feet[..., 1], feet[..., 2]
-
-
-def _style_3d(axes: Any) -> None:
-    axes.set_xlabel("along the scan (mm)")
-    axes.set_ylabel("across (mm)")
-    axes.set_zlabel("outward (mm)", labelpad=-2)
-    low, high = axes.get_zlim()
-    spare = max(0.0, LEAST_DEPTH_MM - (high - low)) / 2
-    axes.set_zlim(low - spare, high + spare)
-    axes.set_aspect("equal")
-    axes.set_box_aspect(axes.get_box_aspect(), zoom=1.08)
-    axes.view_init(elev=42, azim=-68)
-    axes.locator_params(nbins=5)
-    axes.locator_params(axis="z", nbins=3)
-    axes.tick_params(labelsize=8, pad=1)
-    for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
-        axis.pane.set_facecolor("white")
-        axis.pane.set_edgecolor(FAINT)
-        axis._axinfo["grid"].update(color=FAINT, linewidth=0.6)

@@ -13,7 +13,8 @@ from canprobe.touch.objects import PlacedShape
 from canprobe.touch.surface_map import SurfaceMap
 
 Array = NDArray[np.float64]
-INK, FAINT, GHOST, ACCENT, SECOND, THIRD = "#1f2933", "#d9dee4", "#8a94a0", "#c2410c", "#0f6e84", "#6b4fa0"
+MARGIN_M, GRID = 5e-3, 34
+"""How far a drawn surface goes beyond a path, and its points a side."""
 
 
 class MapView(NamedTuple):
@@ -47,3 +48,14 @@ def view_of(surface_map: SurfaceMap, consistency: Consistency, shape: PlacedShap
 def rejected(consistency: Consistency) -> NDArray[np.bool_]:
     """(n,) whether the joint test of each crossing rejects one surface."""
     return np.array([c.joint.p < LEVEL for c in consistency.crossings], dtype=bool)
+
+
+def true_surface(shape: PlacedShape, path: Array, axes: Array, origin: Array) -> Array:
+    """An object's surface below a path (n, 3): (3, GRID, GRID) mm along the rows of `axes` (3, 3) from `origin`."""
+    flat = (path - origin) @ axes.T
+    low, high = flat.min(axis=0) - MARGIN_M, flat.max(axis=0) + MARGIN_M
+    us, vs = np.meshgrid(np.linspace(low[0], high[0], GRID), np.linspace(low[1], high[1], GRID))
+    above = np.stack((us, vs, np.full_like(us, high[2])), axis=-1) @ axes + origin
+    feet = np.array([shape.closest(point).point for point in above.reshape(-1, 3)])
+    result: Array = ((feet - origin) @ axes.T * 1e3).T.reshape(3, GRID, GRID)
+    return result

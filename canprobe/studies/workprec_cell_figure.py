@@ -7,42 +7,37 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import LogFormatter, StrMethodFormatter
 
+from canprobe.studies.figure import FAINT, INK, METHODS, legend, log_scale, picture
 from canprobe.studies.workprec_cell import CLASSICAL, FASTER, FD, FIDELITIES, default_of, good
 
-INK, FAINT = "#1f2933", "#d9dee4"
-COLOURS = {"chen1996": "#ca8a04", "chord": "#64748b", "ml": "#c2410c", "recursive": "#0f6e84"}
 MARKS = {"features": "^", "window": "o", "image": "s"}
 SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
 PANELS = (
-    ("curvature_percent", "curvature error, %"),
-    ("normal_deg", "normal error, deg"),
-    ("force_percent", "force error, %"),
+    ("curvature_percent", "curvature error (%)"),
+    ("normal_deg", "normal error (deg)"),
+    ("force_percent", "force error (%)"),
 )
 Row = dict[str, Any]
 
 
 def draw_cell(rows: Sequence[Row], path: Path) -> None:
     """Error against cost: a row of panels a measure, a column a fidelity."""
-    figure = Figure(figsize=(10.5, 11.0), dpi=110, layout="constrained")
-    figure.suptitle(
+    title = (
         "Whole cell: error against processor time a second of the scan, master, bus, nodes and plant in one process\n"
-        f"ring: the default; star: the knee; not drawn: {_left_out(rows)}",
-        x=0.01, ha="left", fontsize=11, color=INK,
-    )  # fmt: skip
-    grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")
-    for (key, label), line in zip(PANELS, grid, strict=True):
-        for fidelity, axes in zip(FIDELITIES, line, strict=True):
-            _draw(axes, rows, key, fidelity)
-        line[0].set_ylabel(label)
-    for fidelity, top, bottom in zip(FIDELITIES, grid[0], grid[-1], strict=True):
-        top.set_title(f"{fidelity} plant", loc="left", fontsize=10)
-        bottom.set_xlabel("ms of processor time a second")
-    figure.legend(handles=_keys(rows), loc="outside lower center", ncols=5, frameon=False, fontsize=9)
-    figure.savefig(path)
+        f"ring: the default; star: the knee; not drawn: {_left_out(rows)}"
+    )
+    with picture(path, title, 9.6) as figure:
+        grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")
+        for (key, label), line in zip(PANELS, grid, strict=True):
+            for fidelity, axes in zip(FIDELITIES, line, strict=True):
+                _draw(axes, rows, key, fidelity)
+            line[0].set_ylabel(label)
+        for fidelity, top, bottom in zip(FIDELITIES, grid[0], grid[-1], strict=True):
+            top.set_title(f"{fidelity} plant")
+            bottom.set_xlabel("processor time a second (ms)")
+        legend(figure, _keys(rows))
 
 
 def _left_out(rows: Sequence[Row]) -> str:
@@ -54,10 +49,10 @@ def _left_out(rows: Sequence[Row]) -> str:
 def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
     mine = [r for r in rows if r["fidelity"] == fidelity and r.get(key) is not None]
     for r in mine:
-        filled = {CLASSICAL: COLOURS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
+        filled = {CLASSICAL: METHODS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
         axes.scatter(
             r["cost_ms_per_s"], r[key], s=SIZES.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
-            facecolor=filled, edgecolor=COLOURS[r["method"]], linewidth=1.2,
+            facecolor=filled, edgecolor=METHODS[r["method"]], linewidth=1.2,
         )  # fmt: skip
     knee, default = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
     for chosen, mark, size in ((default, "o", 260.0), (knee, "*", 420.0)):
@@ -66,15 +61,8 @@ def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
                 chosen["cost_ms_per_s"], chosen[key], s=size, marker=mark, facecolor="none", edgecolor=INK,
                 linewidth=1.4,
             )  # fmt: skip
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.set_minor_formatter(LogFormatter(minor_thresholds=(2.0, 0.7)))
-    axes.grid(color=FAINT, linewidth=0.6)
-    axes.set_axisbelow(True)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
+    axes.margins(0.12)
+    log_scale(axes, "xy")
 
 
 def _keys(rows: Sequence[Row]) -> list[Line2D]:
@@ -87,7 +75,7 @@ def _keys(rows: Sequence[Row]) -> list[Line2D]:
         )
 
     done = [r for r in rows if r["ended"] == "done"]
-    found = [dot(m, c, "o", 7.0) for m, c in COLOURS.items() if any(r["method"] == m for r in done)]
+    found = [dot(m, c, "o", 7.0) for m, c in METHODS.items() if any(r["method"] == m for r in done)]
     found += [dot(m, INK, mark, 7.0) for m, mark in MARKS.items() if any(r["mode"] == m for r in done)]
     rates = sorted({r["rate_hz"] for r in done})
     found += [dot(f"{rate:.0f} Hz", INK, "o", SIZES.get(rate, 110.0) ** 0.5) for rate in rates]

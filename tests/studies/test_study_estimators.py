@@ -106,21 +106,3 @@ def test_run_prints_the_table_and_writes_files(monkeypatch, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["rows"][0] == {"name": "a", "x_mm": 1.25}
     assert main(["study", "estimators", "--out", str(tmp_path)]) == 0
     assert "a      1.2" in capsys.readouterr().out
-
-
-def test_pictures_are_drawn(tmp_path):
-    from canprobe.studies.bound_figure import draw_bound
-    from canprobe.studies.estimators_figure import draw_estimators
-
-    shared = {"surface": "plane", "sigma_point_um": 5.0, "sigma_normal_mrad": 1.0}
-    draw_estimators(
-        [shared | {"method": s.method, "window_samples": s.window, "lag_samples": s.lag, "error_percent": 1.0,
-                   "bound_percent": 0.5, "add_us": 10.0, "answer_us": 100.0} for s in FEW],
-        tmp_path / "a.png",
-    )  # fmt: skip
-    draw_bound(
-        [shared | {"method": m, "path": "weave", "inside": m == "ml", "size_mm": 5.0, "ratio": 1.0, "coverage": 0.9}
-         for m in ("ml", "recursive")],
-        tmp_path / "b.png",
-    )  # fmt: skip
-    assert all((tmp_path / name).stat().st_size > 10_000 for name in ("a.png", "b.png"))
