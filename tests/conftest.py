@@ -53,6 +53,14 @@ def vcan0() -> str:
     return _CHANNEL
 
 
+@pytest.fixture
+def hangup_heard() -> Iterator[None]:
+    """SIGHUP as a terminal has it: a test of what it does passes under `nohup` too, which has it ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
         signal.signal(signal.SIGINT, signal.default_int_handler)  # or no child would hear the interrupt of its test

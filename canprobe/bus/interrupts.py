@@ -23,12 +23,16 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only."""
+    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only.
+
+    Ignored signals stay ignored, as `nohup` has SIGHUP, and a shell without job control SIGINT in the background.
+    """
     came: list[int] = []
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
         for number in (signal.SIGINT, *TERMINATIONS):
-            before[number] = signal.signal(number, lambda n, _: came.append(n))
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                before[number] = signal.signal(number, lambda n, _: came.append(n))
     try:
         yield
     finally:
