@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from canprobe.bus.interrupts import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
 from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
 
@@ -74,7 +75,8 @@ def run(args: argparse.Namespace) -> int:
     except KeyboardInterrupt:
         say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
         raise
-    paths = write_study(result, out)
+    with interrupts_repeated():
+        paths = write_study(result, out)
     if args.json:
         print_json(as_document(result))
     else:

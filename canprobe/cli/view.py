@@ -9,7 +9,7 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.interrupts import interrupts_held
+from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
@@ -59,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
         recorded = read_run(folder)
         if args.html is not None:
-            write_page(recorded, args.html)
+            with interrupts_repeated():
+                write_page(recorded, args.html)
             print(args.html)
         else:
             serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, whole=interrupts_held)
