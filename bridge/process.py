@@ -28,6 +28,8 @@ from canprobe.scene_writer import dump_scene
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
 """For everything that is still in the queue, however slow the machine; an interrupt cuts it short."""
+CLOSE_TIMEOUT_S = 1.0
+"""For the process to end once its bridge is done: a viewer that does not read is not waited for."""
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
@@ -57,6 +59,7 @@ class BridgeProcess:
         self._where: str | None = None
         self._error: str | None = None
         self._received: int | None = None
+        self._ends_by_ns: int | None = None
         self._text = b""
         self._poll_in = self._batch = max(1, round(LATENCY_S * plan.scene.cycle.rate_hz))
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by end
@@ -132,6 +135,7 @@ class BridgeProcess:
         self._error = document.get("error", self._error)
         if "done" in document:
             self._received = document["done"]["received"]
+            self._ends_by_ns = elapsed_ns() + round(CLOSE_TIMEOUT_S * 1e9)
         if "request" in document:
             self.requests.append(document["request"])
 
@@ -167,7 +171,7 @@ class BridgeProcess:
 
     def _wait(self, deadline_ns: int) -> None:
         """Until the process has said its last, or its time is up."""
-        while (left := _left_s(deadline_ns)) > 0:
+        while (left := _left_s(min(deadline_ns, self._ends_by_ns or deadline_ns))) > 0:
             if not self._listen(left):
                 with contextlib.suppress(subprocess.TimeoutExpired):
                     self._process.wait(max(left, 0.1))

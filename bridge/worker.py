@@ -2,6 +2,7 @@
 
 Back go `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or `{"error":
 text}` at any time. The end of stdin without a last record means that the cell is gone: the sink is closed all the same.
+A file is done when it is closed. A live view is done before that: a viewer that does not read holds its close up.
 """
 
 from __future__ import annotations
@@ -53,8 +54,13 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
         context = _context(marshal.loads(next(records)), send)
         sink: Sink = importlib.import_module(f"canprobe.bridge.{BRIDGES[name].module}").open_sink(context)
         send({"ready": sink.where})
-        received = _serve(sink, SampleSource(context.plan), records)
-        send({"done": {"received": received, "where": sink.where}})
+        received, summary = _serve(sink, SampleSource(context.plan), records)
+        done: dict[str, object] = {"done": {"received": received, "where": sink.where}}
+        if BRIDGES[name].live:
+            send(done)
+        sink.close(summary)
+        if not BRIDGES[name].live:
+            send(done)
     except BrokenPipeError:
         return 1  # the cell is gone, and the sink is closed
     except (CanprobeError, OSError) as error:
@@ -73,7 +79,8 @@ def _context(config: dict[str, Any], send: Any) -> Context:
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
 
 
-def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> int:
+def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[int, str | None]:
+    """Give the sink every sample; how many there were, and the summary."""
     received = 0
     summary: str | None = None
     started = False
@@ -87,8 +94,7 @@ def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> int:
             sink.start(int.from_bytes(body[:8], "little"))
         sink.write(source.sample(unpack_observation(body[8:])))
         received += 1
-    sink.close(summary)
-    return received
+    return received, summary
 
 
 def main() -> int:

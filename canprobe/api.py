@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from canprobe.bridging import Bridges
-from canprobe.bus.interrupts import interrupts_held
+from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
@@ -184,7 +184,8 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
         try:
             with interrupts_held():
                 write_files(result, session.out)
-            _draw(result, session.out)
+            with interrupts_repeated():
+                _draw(result, session.out)
         except OSError as error:  # a full disk: what stopped the run counts for more, and the cell is safe
             told = f"{session.out}: not all results could be written: {error.strerror or error}"
             summary["faults"].append(told)

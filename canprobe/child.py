@@ -150,7 +150,7 @@ class EmulatorChild:
         """Stop the process, first politely, harder at an interrupt; the plant's truth where it left any."""
         if self._process is not None:
             patience_s = END_TIMEOUT_S + TRUTH_SHARE * (self._clock.now_ns() - self._started_ns) * 1e-9
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGKILL):  # SIGINT is ignored in the background
                 self._process.send_signal(number)
                 self._process.send_signal(signal.SIGCONT)  # one that was stopped hears it only then
                 with contextlib.suppress(subprocess.TimeoutExpired, KeyboardInterrupt):

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import _thread
 import contextlib
 import signal
+import sys
+import threading
 from collections.abc import Callable, Iterator
 from types import FrameType, TracebackType
 from typing import Any
 
 TERMINATIONS = (signal.SIGTERM, signal.SIGHUP)
 """What ends a process from outside: a service that is stopped, a terminal that is closed."""
+REPEAT_S = 0.1
 
 
 class Terminated(KeyboardInterrupt):
@@ -23,12 +27,16 @@ def raise_terminated(_number: int, _frame: FrameType | None) -> None:
 
 @contextlib.contextmanager
 def interrupts_held() -> Iterator[None]:
-    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only."""
+    """An interrupt waits for the end of the block: what is begun in it is done whole. In the main thread only.
+
+    Ignored signals stay ignored, as `nohup` has SIGHUP, and a shell without job control SIGINT in the background.
+    """
     came: list[int] = []
     before: dict[int, Any] = {}
     with contextlib.suppress(ValueError):  # not the main thread: signals are not ours to receive
         for number in (signal.SIGINT, *TERMINATIONS):
-            before[number] = signal.signal(number, lambda n, _: came.append(n))
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                before[number] = signal.signal(number, lambda n, _: came.append(n))
     try:
         yield
     finally:
@@ -36,6 +44,53 @@ def interrupts_held() -> Iterator[None]:
             signal.signal(held, handler)
         if came:
             signal.raise_signal(came[0])
+
+
+@contextlib.contextmanager
+def interrupts_repeated() -> Iterator[None]:
+    """An interrupt is raised every `REPEAT_S` until the block is left. In the main thread only.
+
+    For work with libraries that draw: Python drops what is raised in the callback of a weak reference or in `__del__`,
+    of which they have thousands, so that one Ctrl-C in twenty was lost in them, with a traceback on stderr.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[signal.Signals] = []
+    left = threading.Event()
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, *TERMINATIONS)}
+    handlers = {number: handler for number, handler in before.items() if callable(handler)}
+    hook = sys.unraisablehook
+
+    def raise_it(number: int, frame: FrameType | None) -> None:
+        came.append(kind := signal.Signals(number))
+        if not left.is_set():
+            handlers[kind](number, frame)
+
+    def repeat() -> None:
+        while not left.wait(REPEAT_S):
+            if came:
+                _thread.interrupt_main(came[0])
+
+    def unraisable(dropped: Any) -> None:
+        if not issubclass(dropped.exc_type, KeyboardInterrupt):
+            hook(dropped)
+
+    repeater = threading.Thread(target=repeat, daemon=True)
+    sys.unraisablehook = unraisable
+    try:
+        for number in handlers:
+            signal.signal(number, raise_it)
+        repeater.start()
+        yield
+    finally:
+        left.set()
+        repeater.join()
+        for number in handlers:
+            signal.signal(number, before[number])
+        sys.unraisablehook = hook
+    if came:
+        signal.raise_signal(came[0])
 
 
 class Interrupts:

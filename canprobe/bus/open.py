@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from canprobe.bus.clock import Clock
 from canprobe.bus.port import CanFilter, Port
-from canprobe.errors import InterfaceError
+from canprobe.errors import UsageError
 
 
 def open_port(
@@ -29,6 +29,7 @@ def open_port(
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
 
     Raises:
+        UsageError: there is no interface of that name.
         InterfaceError: it is missing, down, or cannot be opened; with what to do.
     """
     if interface == "socketcan":
@@ -36,7 +37,7 @@ def open_port(
 
         return SocketCanPort(channel, clock, filters=filters, fd=data_bitrate is not None)
     if interface == "lockstep":
-        raise InterfaceError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
+        raise UsageError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
     from canprobe.bus.pythoncan import PythonCanPort
 
     return PythonCanPort(interface, channel, bitrate, clock, filters=filters, data_bitrate=data_bitrate)

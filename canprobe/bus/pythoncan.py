@@ -16,7 +16,7 @@ import can
 from canprobe.bus.clock import Clock
 from canprobe.bus.echoes import Echoes
 from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
-from canprobe.errors import InterfaceError
+from canprobe.errors import InterfaceError, UsageError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
 _STANDARD_MASK = 0x7FF
@@ -47,6 +47,7 @@ class PythonCanPort:
         state: the controller's state as python-can told it at the last error frame.
 
     Raises:
+        UsageError: python-can has no such interface.
         InterfaceError: python-can cannot open it, with its reason.
     """
 
@@ -144,6 +145,9 @@ def _open(
     interface: str, channel: str, bitrate: int, filters: Sequence[CanFilter] | None, data_bitrate: int | None
 ) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
+    if interface not in can.VALID_INTERFACES:
+        names = ", ".join(sorted(can.VALID_INTERFACES))
+        raise UsageError(f"{channel}: no interface {interface!r}; python-can has: {names}")
     options: dict[str, Any] = {"interface": interface, "channel": channel, "bitrate": bitrate}
     if data_bitrate is not None:
         options |= {"fd": True, "data_bitrate": data_bitrate}
@@ -153,9 +157,6 @@ def _open(
         options["can_filters"] = [_filter(can_id, mask) for can_id, mask in filters]
     try:
         return can.Bus(**options)
-    except can.CanInterfaceNotImplementedError as error:
-        names = ", ".join(sorted(can.VALID_INTERFACES))
-        raise InterfaceError(f"{channel}: no interface {interface!r}: {error}; python-can has: {names}") from error
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
         raise InterfaceError(f"{channel}: {interface} cannot be opened: {error}") from error
     except Exception as error:  # where a driver's library is missing, python-can trips over anything

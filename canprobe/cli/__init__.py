@@ -15,6 +15,7 @@ from collections.abc import Sequence
 
 import canprobe
 from canprobe.bus.interrupts import Terminated
+from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import CanprobeError
 
@@ -58,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     _prepare_streams()
     try:
         args = _parser(arguments).parse_args(arguments)
-        status = int(args.run(args))
+        with termination_interrupts():
+            status = int(args.run(args))
         sys.stdout.flush()
         return status
     except SystemExit as leaving:

@@ -7,12 +7,11 @@ ideal axis where the file describes a drive.
 from __future__ import annotations
 
 import argparse
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_id, node_ids, number_of_32_bits, whole
 from canprobe.cli.target import add_realtime, real_target, target_of, with_realtime
@@ -81,14 +80,14 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Serve until an interrupt, which is the normal way to leave."""
+    """Serve until Ctrl-C, which is the normal way to leave."""
     if [args.scene is not None, bool(args.eds), args.bus_yml is not None].count(True) != 1:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
     from canprobe.child import end_with_parent
 
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    with left_by_ctrl_c():
         if args.parent is not None:
             end_with_parent(args.parent)
         serve()

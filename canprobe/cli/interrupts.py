@@ -1,4 +1,4 @@
-"""SIGTERM and SIGHUP as interrupts, so that all ways of being told to stop take the same safe way out."""
+"""SIGTERM and SIGHUP as interrupts: every way of being told to stop takes the same safe way out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import signal
 from collections.abc import Iterator
 
-from canprobe.bus.interrupts import TERMINATIONS, raise_terminated
+from canprobe.bus.interrupts import TERMINATIONS, Terminated, raise_terminated
 
 
 @contextlib.contextmanager
@@ -25,3 +25,14 @@ def termination_interrupts() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def left_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C is the normal way to leave the block; SIGTERM and SIGHUP go on to the caller, for status 143."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        pass

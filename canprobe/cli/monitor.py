@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.bus.interrupts import Terminated
 from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds
 from canprobe.cli.target import target_of
@@ -41,8 +40,8 @@ def run(args: argparse.Namespace) -> int:
 
     on_terminal = sys.stdout.isatty() and not args.json
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0
-    view = None
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    view, ended = None, None
+    try:
         for view in api.monitor(
             scene,
             interface=target.interface,
@@ -54,8 +53,12 @@ def run(args: argparse.Namespace) -> int:
             if on_terminal:
                 sys.stdout.write(screen(view))
                 sys.stdout.flush()
+    except KeyboardInterrupt as interrupt:
+        ended = interrupt
     if args.json and view is not None:
         print_json(view.as_document())
     elif not on_terminal and view is not None:
         print("\n".join(lines(view)))
+    if isinstance(ended, Terminated):
+        raise ended
     return 0

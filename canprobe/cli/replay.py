@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
 
@@ -59,8 +58,7 @@ def _run_into(args: argparse.Namespace) -> int:
     from canprobe.recorded_bridges import replay_into
     from canprobe.results import bridge_lines
 
-    with termination_interrupts():
-        replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=say)
+    replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=say)
     if replayed.result is not None and args.out is not None:
         replayed.result.save(args.out)
     if args.json:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_json, add_scene, folder_path, seconds, whole
 from canprobe.cli.target import add_realtime, target_of, with_realtime
@@ -39,7 +38,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.set_defaults(run=run)
 
 
-@termination_interrupts()
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     from canprobe.scene_loader import load_scene

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.bus.interrupts import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
 from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
 
@@ -70,15 +70,13 @@ def run(args: argparse.Namespace) -> int:
     out = args.out or Path("runs") / f"study-{args.name}"
     options = {"workers": args.workers, "dask": args.dask, "fresh": args.fresh}
     try:
-        with (
-            termination_interrupts(),
-            open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep,
-        ):
+        with open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep:
             result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
         say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
         raise
-    paths = write_study(result, out)
+    with interrupts_repeated():
+        paths = write_study(result, out)
     if args.json:
         print_json(as_document(result))
     else:

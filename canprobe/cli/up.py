@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
 import sys
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
 from canprobe.cli.target import Target, add_realtime, target_of, with_realtime
@@ -40,7 +39,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Hold the cell until an interrupt, which is the normal way to leave."""
+    """Hold the cell until Ctrl-C, which is the normal way to leave."""
     if args.yes and not args.check_joints:
         raise UsageError("up: --yes goes with --check-joints")
     if args.bridge and args.check_joints:
@@ -54,7 +53,7 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
 
-    with contextlib.suppress(KeyboardInterrupt), termination_interrupts():
+    with left_by_ctrl_c():
         api.up(
             scene,
             interface=target.interface,
@@ -74,14 +73,13 @@ def _check_joints(scene: Scene, target: Target, *, ask: bool) -> int:
     from canprobe import api
     from canprobe.cli.operator import TerminalOperator
 
-    with termination_interrupts():
-        api.check_joints(
-            scene,
-            interface=target.interface,
-            channel=target.channel,
-            sensor_channel=target.sensor_channel,
-            bitrate=target.bitrate,
-            operator=TerminalOperator() if ask else None,
-            say=say,
-        )
+    api.check_joints(
+        scene,
+        interface=target.interface,
+        channel=target.channel,
+        sensor_channel=target.sensor_channel,
+        bitrate=target.bitrate,
+        operator=TerminalOperator() if ask else None,
+        say=say,
+    )
     return 0

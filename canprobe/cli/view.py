@@ -9,8 +9,8 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.interrupts import interrupts_held
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
+from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
 from canprobe.cli.target import target_of
@@ -50,8 +50,7 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
-    ends = () if args.html is not None else (KeyboardInterrupt,)  # how to leave a page, but not to write a file
-    with contextlib.suppress(*ends), termination_interrupts():
+    with contextlib.nullcontext() if args.html is not None else left_by_ctrl_c():  # a page is left, a file is not
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.page import write_page
@@ -60,7 +59,8 @@ def run(args: argparse.Namespace) -> int:
 
         recorded = read_run(folder)
         if args.html is not None:
-            write_page(recorded, args.html)
+            with interrupts_repeated():
+                write_page(recorded, args.html)
             print(args.html)
         else:
             serve_run(recorded, port=browser.port, host=args.host, ready=browser.show, whole=interrupts_held)

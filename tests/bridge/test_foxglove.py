@@ -6,8 +6,10 @@ Source: Foxglove WebSocket protocol, `foxglove.sdk.v1`: JSON text for control, b
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import re
+import socket
 import struct
 from importlib import resources
 
@@ -19,8 +21,9 @@ from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 
 import canprobe
-from canprobe.bridge.process import BridgeProcess
+from canprobe.bridge.process import END_TIMEOUT_S, BridgeProcess
 from canprobe.bridge.topics import TOPICS
+from canprobe.bus.clock import MonotonicClock
 from canprobe.errors import UsageError
 from canprobe.scene_loader import parse_scene
 from canprobe.scene_writer import dump_scene
@@ -34,8 +37,9 @@ def plan_with(scene, section):
 
 @pytest.fixture
 def bridge(recorded):
+    """A server that is given every sample, and its address."""
     text = dump_scene(recorded.result.plan.scene).replace("foxglove_port = 8765", "foxglove_port = 0")
-    one = BridgeProcess("foxglove", canprobe.plan(parse_scene(text)), None, virtual=False)
+    one = BridgeProcess("foxglove", canprobe.plan(parse_scene(text)), None, virtual=True)
     yield one, re.match(r"ws://127\.0\.0\.1:\d+", one.await_ready())[0]
     one.kill()
 
@@ -66,6 +70,13 @@ def messages(client, feed, wanted):
     return got
 
 
+def fed(recorded, bridge):
+    """The run, again and again, in parts that a bridge is given when they are called."""
+    for _ in range(50):
+        for first in range(0, len(recorded.observations), 8):
+            yield lambda: [bridge.observe(o) for o in recorded.observations[first : first + 8]]  # noqa: B023
+
+
 def decode(channel, payload):
     schema = Schema(id=1, name=channel["schemaName"], encoding="ros2msg", data=channel["schema"].encode())
     return DecoderFactory().decoder_for("cdr", schema)(payload)
@@ -83,13 +94,7 @@ def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
         asked = {"/joint_states": 7, "/surface_patch": 8, "/tf_static": 9, "/taxels/image": 10}
         subscriptions = [{"id": i, "channelId": channels[topic]["id"]} for topic, i in asked.items()]
         client.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
-
-        def feed():
-            for first in range(0, len(recorded.observations), 8):
-                yield lambda: [one.observe(o) for o in recorded.observations[first : first + 8]]  # noqa: B023
-
-        rounds = (part for _ in range(50) for part in feed())
-        got = messages(client, rounds, set(asked.values()))
+        got = messages(client, fed(recorded, one), set(asked.values()))
     assert got.keys() == set(asked.values())  # and nothing that was not subscribed
     _, payload = got[7]
     q = recorded.log("q_rad")
@@ -98,6 +103,26 @@ def test_a_plain_client_negotiates_lists_and_receives(recorded, bridge):
     assert [t.child_frame_id for t in decode(channels["/tf_static"], got[9][1]).transforms] == ["flange", "probe"]
     status = one.end("{}")
     assert status["error"] is None
+
+
+def test_a_client_that_does_not_read_holds_up_no_end(recorded, bridge):
+    """It subscribes to everything and takes nothing: neither the server's queue nor the connection's ever empties."""
+    one, address = bridge
+    with socket.socket() as narrow:
+        narrow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        narrow.connect(("127.0.0.1", int(address.rpartition(":")[2])))
+        client = connect(address, sock=narrow, subprotocols=[PROTOCOL], max_queue=1)
+        _, channels = advertised(client)
+        subscriptions = [{"id": i, "channelId": channel["id"]} for i, channel in enumerate(channels.values())]
+        client.send(json.dumps({"op": "subscribe", "subscriptions": subscriptions}))
+        messages(client, fed(recorded, one), {0})  # and from here on nothing is read
+        for part in itertools.islice(fed(recorded, one), 300):  # some 6 MB
+            part()
+        clock = MonotonicClock()
+        started_ns = clock.now_ns()
+        status = one.end("{}")
+        assert clock.now_ns() - started_ns < 0.5e9 * END_TIMEOUT_S
+        assert (status["error"], status["dropped"]) == (None, 0)
 
 
 def test_a_client_without_the_protocol_is_refused(bridge):

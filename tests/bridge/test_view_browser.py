@@ -73,14 +73,14 @@ def served(recorded):
     process.communicate()
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_run_is_served_until_it_is_told_to_end(served, number):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_a_run_is_served_until_it_is_told_to_end(served, number, status):
     process, address = served
     assert "<title>Viser</title>" in page_at(address)
     messages(address, {"/arm/3/forearm", "/object/ghost", "/patch/above", "GuiSliderMessage", "GuiUplotMessage"})
     process.send_signal(number)
     out, err = process.communicate(timeout=30)
-    assert (process.returncode, out, err) == (0, "", "")
+    assert (process.returncode, out, err) == (status, "", "")
     assert port_is_free(address)
     with pytest.raises(ProcessLookupError):
         os.killpg(process.pid, 0)

@@ -13,7 +13,7 @@ BOTH = [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, Terminated), (signa
 
 
 @pytest.fixture(autouse=True)
-def handlers_are_put_back():
+def handlers_are_put_back(hangup_heard):
     before = [signal.getsignal(number) for number, _ in BOTH]
     yield
     assert [signal.getsignal(number) for number, _ in BOTH] == before
@@ -55,14 +55,15 @@ def test_nothing_waits_for_a_program_that_is_stuck():
         signal.raise_signal(signal.SIGINT)
 
 
-def test_what_is_ignored_stays_ignored():
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_what_is_ignored_stays_ignored(number):
+    before = signal.signal(number, signal.SIG_IGN)
     try:
         with Interrupts() as interrupts:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
             interrupts.take()
     finally:
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before)
 
 
 def test_a_thread_without_signals_runs_on():

@@ -25,8 +25,13 @@ NO_AF_CAN = pytest.mark.skipif(has_socketcan(), reason="this kernel has SocketCA
 
 def start(folder, *words):
     """`canprobe` in a session of its own, so that a signal to it reaches nobody else."""
+    return start_command([sys.executable, "-m", "canprobe", *map(str, words)], folder)
+
+
+def start_command(command, folder):
+    """A command in a session of its own."""
     return subprocess.Popen(
-        [sys.executable, "-m", "canprobe", *map(str, words)],
+        command,
         cwd=folder,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdin=subprocess.DEVNULL,
@@ -133,8 +138,9 @@ def test_no_socketcan_in_this_kernel(words, tmp_path):
 
 
 def test_an_interface_that_python_can_does_not_know(tmp_path):
-    (line,) = lines_of(tmp_path, 3, "run", "press", "--bus", "token-ring", "--channel", "x")
+    (line,) = lines_of(tmp_path, 2, "run", "press", "--bus", "token-ring", "--channel", "x")
     assert line.startswith("canprobe: x: no interface 'token-ring'")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_emulated_nodes_cannot_be_reached_over_a_virtual_bus_of_one_process(tmp_path):
@@ -189,6 +195,19 @@ def test_an_interrupted_run_stops_the_cell_and_keeps_its_files(number, status, t
         assert state_of(int.from_bytes(last[0x180 + node_id][:2], "little")) not in POWERED_STATES
         assert last[0x700 + node_id] == b"\x7f"
     assert last[0x710] == b"\x7f"
+
+
+def test_a_run_that_ignores_the_terminal_is_ended_by_sigterm(tmp_path):
+    """As `nohup` and the background of a script start it."""
+    line = f"trap '' HUP INT; exec {sys.executable} -m canprobe run free --duration 600 --out results"
+    process = start_command(["sh", "-c", line], tmp_path)
+    log = tmp_path / "results" / "bus.log"
+    for size, number in ((1 << 16, signal.SIGHUP), (1 << 18, signal.SIGINT), (1 << 19, signal.SIGTERM)):
+        wait_for_size(log, size, process)
+        process.send_signal(number)
+    _, err = process.communicate()
+    assert process.returncode == 143, err
+    assert json.loads((tmp_path / "results" / "summary.json").read_text())["stop_reason"] == "interrupted"
 
 
 def test_a_terminal_without_our_letters(tmp_path, monkeypatch):

@@ -13,6 +13,7 @@ import pytest
 import canprobe
 from canprobe import api
 from canprobe.bus.interrupts import Terminated
+from canprobe.cell.monitor import Monitor
 from canprobe.cli import COMMANDS, main
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar
@@ -165,14 +166,60 @@ def test_a_run_hears_sigterm_from_its_beginning(monkeypatch, tmp_path):
     assert main(["run", "free"]) == 143
 
 
-@pytest.mark.parametrize("command", ["up", "emulate"])
-@pytest.mark.parametrize("interrupt", [KeyboardInterrupt, Terminated])
-def test_an_interrupt_is_the_normal_end_of_what_holds(command, interrupt, monkeypatch):
-    def fail(*_, **__):
-        raise interrupt
+BUSY = {
+    "run": ("run", "free"),
+    "up": ("up", "free"),
+    "check_joints": ("up", "free", "--check-joints", "--yes"),
+    "emulate": ("emulate", "free", "--channel", "vcan0"),
+    "emulate_eds": ("emulate", "--eds", "puma260_joint.eds", "--node-id", "5", "--channel", "vcan0"),
+    "monitor": ("monitor", "free", "--channel", "vcan0"),
+    "scan": ("scan", "--channel", "vcan0"),
+    "commission": ("scan", "--lss", "--channel", "vcan0"),
+}
+"""Command lines by the function of the API that keeps each of them busy."""
+UNTIL_CTRL_C = ("up", "emulate", "emulate_eds", "monitor")
 
-    monkeypatch.setattr(api, command, fail)
-    assert main([command, "free", "--channel", "vcan0"]) == 0
+
+@pytest.mark.parametrize("name", BUSY)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
+    """Ctrl-C is the normal end of what only holds or shows; SIGTERM is 143 everywhere."""
+    monkeypatch.setattr(api, name, lambda *_, **__: signal.raise_signal(number))
+    assert main(BUSY[name]) == (143 if number == signal.SIGTERM else 0 if name in UNTIL_CTRL_C else 130)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("recorded.replay", ("replay", "log")), ("studies.study.run_study", ("study", "bound"))]
+)
+def test_sigterm_ends_what_computes(name, words, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(f"canprobe.{name}", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    assert main(words) == 143
+
+
+@pytest.mark.parametrize("json_too", [[], ["--json"]])
+def test_a_monitor_that_is_ended_shows_what_it_knows(json_too, monkeypatch, capsys):
+    """`timeout 5 canprobe monitor …` is a way to look for five seconds."""
+
+    def views(*_, **__):
+        plan = canprobe.plan(canprobe.load_scene("free"))
+        yield Monitor(plan).view(0)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(api, "monitor", views)
+    assert main(["monitor", "free", "--channel", "vcan0", *json_too]) == 143
+    assert "can0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["run press", "up press", "emulate press", "monitor press", "view press", "scan"])
+def test_a_bus_that_python_can_does_not_know_is_wrong_usage(command, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [*command.split(), "--bus", "token-ring", "--channel", "x"]
+    assert main(words + (["--html", "page.html"] if command.startswith("view") else [])) == 2
+    err = capsys.readouterr().err.splitlines()[-1]
+    assert err.startswith("canprobe: x: no interface 'token-ring'; python-can has: ") and "socketcan" in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_run_passes_everything_on(calls, tmp_path, capsys):

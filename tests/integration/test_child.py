@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,13 +11,14 @@ from types import SimpleNamespace
 import pytest
 
 import canprobe
-from canprobe.bus.clock import VirtualClock
+from canprobe.bus.clock import MonotonicClock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Port, TimedFrame
 from canprobe.cell.build import make_cell
-from canprobe.child import EmulatorChild
+from canprobe.child import END_TIMEOUT_S, EmulatorChild
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import Frame
+from canprobe.session import resolve_scene
 
 
 class Nodes:
@@ -75,6 +77,20 @@ def test_a_node_that_does_not_boot_in_time_is_named_with_the_way_out(tmp_path: P
     told = r"node 4: the emulated node did not boot within 60 s, and its process still runs: .* \[bring_up\] emulated_s"
     with pytest.raises(NodeError, match=told):
         await_boot_ups(tmp_path, 1.0, silent=4)
+
+
+def test_in_the_background_of_a_script_it_ends_at_once_too(tmp_path: Path) -> None:
+    """A shell without job control starts there with SIGINT ignored, and the nodes' process inherits it."""
+    child = EmulatorChild(resolve_scene(canprobe.load_scene("free"), interface="virtual"), tmp_path, "nodes")
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        child.start()
+        clock = MonotonicClock()
+        started_ns = clock.now_ns()
+        child.end()
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert clock.now_ns() - started_ns < 0.5e9 * END_TIMEOUT_S
 
 
 def test_a_process_that_has_ended_is_not_waited_for(tmp_path: Path) -> None:

@@ -159,6 +159,7 @@ LEFT = {
 }
 
 
+@pytest.mark.usefixtures("hangup_heard")
 @pytest.mark.parametrize("what", LEFT)
 def test_whoever_ends_the_run_the_probe_is_taken_off(what):
     action, kind = LEFT[what]

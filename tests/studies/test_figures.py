@@ -15,7 +15,6 @@ from matplotlib.transforms import Bbox
 
 import canprobe
 from canprobe.emulator.faults import FaultKind
-from canprobe.planning import make_plan
 from canprobe.studies import bridges, estimators, stability, stability_figure, workprec
 from canprobe.studies.bound import AT
 from canprobe.studies.bound_cases import NOISES, REGION, SIZES_M
@@ -187,7 +186,7 @@ def bridge_bars(path):
 
 
 def plan_of(scene):
-    return lambda path: draw_plan(make_plan(canprobe.load_scene(scene)), path)
+    return lambda path: draw_plan(canprobe.plan(canprobe.load_scene(scene)), path)
 
 
 FOUND = {"tool_centre_mm": [0.394, None, 80.478], "sigma_mm": [0.05, None, 0.08], "believed_mm": [0.0, 0.0, 80.0],

@@ -265,7 +265,8 @@ def test_workers_that_do_not_hear_are_ended_too(demo, tmp_path):
 
 @pytest.mark.filterwarnings("default")
 def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed")
+    import distributed
+
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
     monkeypatch.setattr(study, "STUDIES", {"demo": "a demonstration"})
     monkeypatch.setitem(sys.modules, "canprobe.studies.demo", demo)

@@ -38,7 +38,10 @@ def test_an_interrupt_in_mid_run(bench: Any, name: str, cycles: int, number: int
             assert any(fault.startswith("lift off, at ") for fault in results.summary["faults"])
 
 
-def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_an_interrupt(bench: Any) -> None:
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 0), (signal.SIGTERM, 143)])
+def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_a_signal(
+    bench: Any, number: int, status: int
+) -> None:
     command = bench.start("up", bench.scene("free"), *ON_VCAN0)
     bench.bus.until_enabled(1, by=command)
     second = bench.start("up", bench.scene("free"), *ON_VCAN0)
@@ -47,8 +50,8 @@ def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_an
         assert not heard.intersection((0x000, *(base + n for base in (0x580, 0x600) for n in NODES)))
     assert second.end(3)[-1].endswith("another master is at work here; stop it first")
     bench.bus.until_enabled(1, by=command)
-    command.send(signal.SIGINT)
-    lines = command.end(0)
+    command.send(number)
+    lines = command.end(status)
     bench.bus.hear()
     bench.assert_left_safe(bench.bus.last, *NODES[:6])
     assert "the cell is up: nodes 1, 2, 3, 4, 5, 6; Ctrl-C stops it" in lines
@@ -93,7 +96,7 @@ def test_one_node_is_missing_then_there_then_killed(bench: Any) -> None:
     bench.assert_left_safe(results.last, 1, 2, 4, 5, 6)
 
     five.send(signal.SIGTERM)
-    five.end(0)
+    five.end(143)
 
 
 def test_emulated_nodes_go_with_a_master_that_is_killed(bench: Any) -> None:

@@ -133,10 +133,55 @@ def test_what_the_inner_session_never_reported_is_an_error(project: Path) -> Non
 def test_without_a_vcan_they_are_skipped_loudly_or_fail(
     project: Path, required: str, expected: dict[str, int], workers: tuple[str, ...]
 ) -> None:
-    status, output = run(project, *workers, STAND_IN="none", CANPROBE_REQUIRE_VCAN=required)
+    status, output = run(project, *workers, STAND_IN="none", CANPROBE_NO_SKIPS=required)
     assert (status, counts(output)) == (1 if required else 0, expected)
     assert "apt-get install -y something" in output
     assert ("9 tests were NOT RUN" in output) == (not required)
+
+
+SKIPPED = """
+import pytest
+
+@pytest.mark.skipif(True, reason="no chromium here")
+def test_marked():
+    pass
+
+@pytest.fixture
+def tool():
+    pytest.skip("no tshark here")
+
+def test_told_by_a_fixture(tool):
+    pass
+
+@pytest.mark.parametrize("reason", ["vcan0 carries CAN FD here", "this kernel has SocketCAN"])
+def test_allowed(reason):
+    pytest.skip(reason)
+
+@pytest.mark.xfail
+def test_expected():
+    assert False
+"""
+
+
+@pytest.mark.parametrize(
+    ("strict", "workers", "status", "expected"),
+    [
+        ("", (), 0, {"passed": 1, "skipped": 6, "xfailed": 1}),
+        ("1", WORKERS, 1, {"passed": 1, "skipped": 2, "xfailed": 1, "failed": 1, "error": 3}),
+    ],
+    ids=["allowed", "workers"],
+)
+def test_a_skip_whose_reason_is_not_listed_is_a_failure_where_all_is_installed(
+    project: Path, strict: str, workers: tuple[str, ...], status: int, expected: dict[str, int]
+) -> None:
+    """By a mark, by a fixture, of a whole file, and by a test where the vcan is."""
+    (project / "test_skipped.py").write_text(SKIPPED)
+    (project / "test_file.py").write_text("import pytest\npytest.importorskip('no_such_package')\n")
+    words = ("test_it.py::test_skipped", "test_skipped.py", "test_file.py", "test_native.py")
+    ended, output = run(project, *words, *workers, STAND_IN="runs", CANPROBE_NO_SKIPS=strict)
+    assert (ended, counts(output)) == (status, expected), output
+    for reason in ("no chromium here", "no tshark here", "could not import 'no_such_package'", "for its own reason"):
+        assert (f"not among ALLOWED_SKIPS of tests/conftest.py: {reason}" in output) == bool(strict)
 
 
 STANDSTILL = """
