@@ -22,7 +22,7 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, Reports, is_bus_error
 from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
@@ -262,13 +262,11 @@ class Session:
 
     def _error_writer(self, channel: str) -> Write:
         """Error frames go into the log, and beside the plan."""
-        meter = self.meters[channel]
-        write = self._candump.on(channel) if self._candump is not None else None
 
         def note(can_id: int, data: bytes, t_ns: int) -> None:
-            meter.error_frames += 1
-            if write is not None:
-                write(can_id, data, t_ns)
+            self.traffic[channel].error_frames += is_bus_error(can_id)
+            if self._candump is not None:
+                self._candump.on(channel)(can_id, data, t_ns)
 
         return note
 
@@ -323,7 +321,9 @@ class Session:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         clock = MonotonicClock()
         t0_ns = clock.now_ns()
-        real = self._stack.enter_context(open_ports(self.plan, clock))
+        real = self._stack.enter_context(
+            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel)))
+        )
         return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:

@@ -20,7 +20,18 @@ from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
-from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import (
+    EFF_FLAG,
+    ERR_FLAG,
+    RTR_FLAG,
+    CanFilter,
+    ControllerState,
+    Frame,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
@@ -31,8 +42,6 @@ _CAN_RAW_FD_FRAMES = 5
 _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
 _CAN_ERR_MASK = 0x1FFFFFFF
-_CAN_ERR_CRTL, _CAN_ERR_BUSOFF, _CAN_ERR_RESTARTED = 0x004, 0x040, 0x100
-_CRTL_ACTIVE, _CRTL_PASSIVE, _CRTL_WARNING = 0x40, 0x30, 0x0C
 _SO_RCVBUFFORCE = 33
 _SIOCGIFFLAGS = 0x8913
 _SIOCGIFMTU = 0x8921
@@ -53,10 +62,11 @@ class SocketCanPort:
         filters: what the kernel lets in; everything by default.
         batched: use recvmmsg and sendmmsg where they exist.
         fd: send and receive CAN FD frames too.
+        reports: who hears of error frames.
 
     Attributes:
-        counters: what has passed; `overruns` are frames that the kernel dropped for this socket.
-        state: the controller's state as the last error frame told; always ACTIVE on vcan.
+        counters: what has passed.
+        state: the controller's state as the last error frame told; ACTIVE before the first.
 
     Raises:
         InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
@@ -71,7 +81,9 @@ class SocketCanPort:
         filters: Sequence[CanFilter] | None = None,
         batched: bool = True,
         fd: bool = False,
+        reports: Reports | None = None,
     ) -> None:
+        self._reports = reports or Reports()
         check_interface(channel)
         if fd:
             check_fd(channel)
@@ -133,7 +145,7 @@ class SocketCanPort:
         offset_ns = self._offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
-            self._note_errors(rows)
+            self._note_errors(rows, offset_ns)
         self.counters.received += len(frames)
         return frames
 
@@ -213,19 +225,21 @@ class SocketCanPort:
         return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
 
     def _count_drops(self, which: int, rows: Sequence[Row]) -> None:
-        self._dropped[which] = max(self._dropped[which], rows[-1][3])
-        self.counters.overruns = sum(self._dropped)
+        dropped = max(0, rows[-1][3] - self._dropped[which])
+        self._dropped[which] += dropped
+        self.counters.overruns += dropped
 
     def _follow_clock(self, stamp_ns: int) -> None:
         if not 0 <= stamp_ns - self._calibrated_ns < _RECALIBRATE_NS:
             self._calibrated_ns = stamp_ns
             self._offset_ns = _realtime_minus_monotonic()
 
-    def _note_errors(self, rows: Sequence[Row]) -> None:
-        for can_id, data, _, _ in rows:
+    def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
+        for can_id, data, t_ns, _ in rows:
             if can_id & ERR_FLAG:
-                self.counters.error_frames += 1
-                self.state = _state_after(self.state, can_id, data)
+                self.counters.note_error(can_id, data)
+                self.state = state_after(self.state, can_id, data)
+                self._reports.error_frame(can_id, data, t_ns - offset_ns)
 
 
 def has_socketcan() -> bool:
@@ -343,23 +357,6 @@ def _realtime_minus_monotonic() -> int:
         after = time.monotonic_ns()
         readings.append((after - before, realtime - (before + after) // 2))
     return min(readings)[1]
-
-
-def _state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerState:
-    """Return the controller's state after an error frame. Source: Linux include/uapi/linux/can/error.h."""
-    if can_id & _CAN_ERR_BUSOFF:
-        return ControllerState.BUS_OFF
-    if can_id & _CAN_ERR_RESTARTED:
-        return ControllerState.ACTIVE
-    if can_id & _CAN_ERR_CRTL and len(data) > 1:
-        for bits, told in (
-            (_CRTL_PASSIVE, ControllerState.PASSIVE),
-            (_CRTL_WARNING, ControllerState.WARNING),
-            (_CRTL_ACTIVE, ControllerState.ACTIVE),
-        ):
-            if data[1] & bits:
-                return told
-    return state
 
 
 class _PollFd(ctypes.Structure):
