@@ -26,9 +26,11 @@ from canprobe.bus.port import Port, Reports, is_bus_error
 from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
+from canprobe.cell.link_checks import expected_of
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
+from canprobe.link_report import check_links, need_controllers
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
@@ -131,6 +133,7 @@ class Session:
         self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
+        self._ports: dict[str, Port] = {}
         self._candump: CandumpWriter | None = None
         self.world: World | None = None
         self.joins: Callable[[Any], Any] = lambda participant: participant
@@ -189,8 +192,9 @@ class Session:
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
             self._observe_frames(port)
-        except BaseException:
+        except BaseException as error:
             self._close()
+            need_controllers(self.scene.bus.interface, self._ports, error)
             raise
         return self
 
@@ -319,9 +323,10 @@ class Session:
             )
         if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
+        check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
         t0_ns = clock.now_ns()
-        real = self._stack.enter_context(
+        real = self._ports = self._stack.enter_context(
             open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel)))
         )
         return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})

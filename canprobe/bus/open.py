@@ -36,7 +36,9 @@ def open_port(
     if interface == "socketcan":
         from canprobe.bus.socketcan import SocketCanPort
 
-        return SocketCanPort(channel, clock, filters=filters, fd=data_bitrate is not None, reports=reports)
+        return SocketCanPort(
+            channel, clock, filters=filters, bitrate=bitrate, data_bitrate=data_bitrate, reports=reports
+        )
     if interface == "lockstep":
         raise InterfaceError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
     from canprobe.bus.pythoncan import PythonCanPort

@@ -2,8 +2,8 @@
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
 the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
-29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With `fd` frames of more than 8 bytes
-are CAN FD frames with bit-rate switch; without it none are received.
+29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
+than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
+from canprobe.bus.link import TX_QUEUE, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import (
     EFF_FLAG,
@@ -61,7 +62,8 @@ class SocketCanPort:
         clock: a clock that shows CLOCK_MONOTONIC.
         filters: what the kernel lets in; everything by default.
         batched: use recvmmsg and sendmmsg where they exist.
-        fd: send and receive CAN FD frames too.
+        bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
+        data_bitrate: send and receive CAN FD frames too; None: classical frames only.
         reports: who hears of error frames.
 
     Attributes:
@@ -80,14 +82,16 @@ class SocketCanPort:
         *,
         filters: Sequence[CanFilter] | None = None,
         batched: bool = True,
-        fd: bool = False,
+        bitrate: int = 1_000_000,
+        data_bitrate: int | None = None,
         reports: Reports | None = None,
     ) -> None:
+        self._fd = fd = data_bitrate is not None
+        self._setting = setting_line(channel, bitrate, data_bitrate)
         self._reports = reports or Reports()
-        check_interface(channel)
+        check_interface(channel, self._setting)
         if fd:
-            check_fd(channel)
-        self._fd = fd
+            _check_fd(channel, self._setting)
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
@@ -215,13 +219,13 @@ class SocketCanPort:
         if tries >= _RETRIES:
             raise InterfaceError(
                 f"{self.channel}: the transmit queue stays full, {left} frames not sent: nobody acknowledges, the bus "
-                f"is overloaded, or the queue is short; type: {_sudo()}ip link set {self.channel} txqueuelen 1000"
+                f"is overloaded, or the queue is short; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
             ) from error
         time.sleep(_RETRY_S)
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:
-            return _down(self.channel)
+            return _down(self.channel, self._setting)
         return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
 
     def _count_drops(self, which: int, rows: Sequence[Row]) -> None:
@@ -251,8 +255,12 @@ def has_socketcan() -> bool:
     return True
 
 
-def check_interface(channel: str) -> None:
+def check_interface(channel: str, setting: str | None = None) -> None:
     """Return if `channel` is a CAN interface that is up.
+
+    Args:
+        channel: its name.
+        setting: the line that sets it up; None where it needs no setting.
 
     Raises:
         InterfaceError: it is not, with the line to type.
@@ -271,24 +279,18 @@ def check_interface(channel: str) -> None:
         except OSError as error:
             raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
         if not flags & _IFF_UP:
-            raise _down(channel)
+            raise _down(channel, setting or ip_line(f"{channel} up"))
 
 
-def check_fd(channel: str) -> None:
-    """Return if the interface carries CAN FD frames.
-
-    Raises:
-        InterfaceError: it does not, with the line to type.
-    """
+def _check_fd(channel: str, setting: str) -> None:
+    """Return if the interface carries CAN FD frames."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
             mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
     if mtu < _CANFD_MTU:
-        real = f"{channel} down && {_sudo()}ip link set {channel} up type can bitrate 1000000 dbitrate 5000000 fd on"
-        how = f"{channel} mtu {_CANFD_MTU}" if channel.startswith("v") else real
-        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {_sudo()}ip link set {how}")
+        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 
 def _ifreq(channel: str) -> bytes:
@@ -298,20 +300,14 @@ def _ifreq(channel: str) -> bytes:
     return struct.pack("=16sH14x", name, 0)
 
 
-def _down(channel: str) -> InterfaceError:
-    options = "" if channel.startswith("v") else " type can bitrate 1000000"
-    return InterfaceError(f"{channel}: interface is down; type: {_sudo()}ip link set {channel} up{options}")
+def _down(channel: str, setting: str) -> InterfaceError:
+    return InterfaceError(f"{channel}: interface is down; type: {setting}")
 
 
 def _how_to_make(channel: str) -> str:
     if channel.startswith("vcan"):
-        sudo = _sudo()
-        return f"type: {sudo}ip link add dev {channel} type vcan && {sudo}ip link set {channel} up"
+        return f"type: {sudo()}ip link add dev {channel} type vcan && {setting_line(channel, 1_000_000)}"
     return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
-
-
-def _sudo() -> str:
-    return "" if os.geteuid() == 0 else "sudo "
 
 
 def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True, fd: bool = False) -> socket.socket:

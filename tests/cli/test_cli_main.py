@@ -249,7 +249,7 @@ def test_scan_prints_a_table_or_json(calls, capsys):
     header, row = capsys.readouterr().out.splitlines()
     assert header.split() == ["node_id", "state", "vendor_id", "product_code"]
     assert row.split() == ["1", "pre-operational", "0xca5e", "-"]
-    assert calls[0] == ("scan", ("socketcan", "vcan0", 1_000_000), {})
+    assert calls[0][:2] == ("scan", ("socketcan", "vcan0", 1_000_000))
 
 
 def test_scenes(capsys):

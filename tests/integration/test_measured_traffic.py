@@ -135,6 +135,7 @@ def real_bus(monkeypatch):
 
     monkeypatch.setattr("canprobe.bus.open.open_port", open_port)
     monkeypatch.setattr("canprobe.session.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.session.check_links", lambda *_: None)
     return scene, reports
 
 
