@@ -157,13 +157,22 @@ def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
 def _free_port(
     interface: str, channel: str, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
-    """A port on a bus where nobody has these node ids."""
+    """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
+    from canprobe.bus.port import Reports
     from canprobe.bus.probe import answering_nodes
 
     check_links(interface, {channel: wanted}, say)
-    port = open_port(interface, channel, wanted.bitrate, MonotonicClock(), data_bitrate=wanted.data_bitrate)
+    port = open_port(
+        interface,
+        channel,
+        wanted.bitrate,
+        MonotonicClock(),
+        data_bitrate=wanted.data_bitrate,
+        waits=True,
+        reports=Reports(say=say),
+    )
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")

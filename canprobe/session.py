@@ -327,7 +327,7 @@ class Session:
         clock = MonotonicClock()
         t0_ns = clock.now_ns()
         real = self._ports = self._stack.enter_context(
-            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel)))
+            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
         )
         return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
 

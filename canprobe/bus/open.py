@@ -17,6 +17,7 @@ def open_port(
     *,
     filters: Sequence[CanFilter] | None = None,
     data_bitrate: int | None = None,
+    waits: bool = False,
     reports: Reports | None = None,
 ) -> Port:
     """Open `channel` of `interface`.
@@ -28,7 +29,8 @@ def open_port(
         clock: a clock in real time.
         filters: what is let in; everything by default.
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
-        reports: who hears of error frames.
+        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
+        reports: who hears of error frames, and of what the user has to know.
 
     Raises:
         InterfaceError: it is missing, down, or cannot be opened; with what to do.
@@ -37,7 +39,7 @@ def open_port(
         from canprobe.bus.socketcan import SocketCanPort
 
         return SocketCanPort(
-            channel, clock, filters=filters, bitrate=bitrate, data_bitrate=data_bitrate, reports=reports
+            channel, clock, filters=filters, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports
         )
     if interface == "lockstep":
         raise InterfaceError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")

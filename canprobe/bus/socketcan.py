@@ -4,6 +4,9 @@ Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CL
 the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
 29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
 than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
+
+What the controller cannot send waits in two places: the interface's transmit queue (`txqueuelen`; ENOBUFS when it is
+full) and, counted in bytes, the socket's send buffer (about 277 frames; EAGAIN). Closing the socket empties neither.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
-from canprobe.bus.link import TX_QUEUE, ip_line, setting_line, sudo
+from canprobe.bus.link import TX_QUEUE, emptying_line, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import (
     EFF_FLAG,
@@ -44,13 +47,19 @@ _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
 _CAN_ERR_MASK = 0x1FFFFFFF
 _SO_RCVBUFFORCE = 33
+_SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
 _SIOCGIFFLAGS = 0x8913
 _SIOCGIFMTU = 0x8921
+_SIOCGIFTXQLEN = 0x8942
 _CANFD_MTU = 72
 _IFF_UP = 0x1
 _RECEIVE_BUFFER = 4 << 20
-_RETRIES = 50
-_RETRY_S = 200e-6
+_RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
+_PATIENCE_NS = 10_000_000
+_TELL_NS = 1_000_000_000
+"""A queue that has been full for so long is told to the user, where it is waited for."""
+_STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
+"""How long a port that closes waits for the next queued frame to leave, and for all of them."""
 _RECALIBRATE_NS = 1_000_000_000
 
 
@@ -64,7 +73,8 @@ class SocketCanPort:
         batched: use recvmmsg and sendmmsg where they exist.
         bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
         data_bitrate: send and receive CAN FD frames too; None: classical frames only.
-        reports: who hears of error frames.
+        waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
+        reports: who hears of error frames, of a queue that is waited for and of frames that are left in it.
 
     Attributes:
         counters: what has passed.
@@ -84,10 +94,12 @@ class SocketCanPort:
         batched: bool = True,
         bitrate: int = 1_000_000,
         data_bitrate: int | None = None,
+        waits: bool = False,
         reports: Reports | None = None,
     ) -> None:
         self._fd = fd = data_bitrate is not None
         self._setting = setting_line(channel, bitrate, data_bitrate)
+        self._waits = waits
         self._reports = reports or Reports()
         check_interface(channel, self._setting)
         if fd:
@@ -104,12 +116,12 @@ class SocketCanPort:
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
-        self._offset_ns = self._calibrated_ns = self._patience_ns = 0
+        self._offset_ns = self._calibrated_ns = self._patience_ns = self._told_ns = 0
 
     stamps_arrival = True
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` in order; a full queue is waited for up to 10 ms.
+        """Send `frames` in order; a full queue is waited for.
 
         Raises:
             InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
@@ -120,13 +132,14 @@ class SocketCanPort:
             if long or (can_id > 0x7FF and can_id < ERR_FLAG):
                 kind = "CAN or CAN FD" if self._fd else "classic CAN"
                 raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no {kind} frame")
-        sent = tries = 0
+        sent = 0
+        full_ns: int | None = None
         while sent < len(frames):
             try:
                 sent += self._frames.send(frames[sent:] if sent else frames)
             except OSError as error:
-                self._retry_or_raise(error, tries, len(frames) - sent)
-                tries += 1
+                full_ns = self.clock.now_ns() if full_ns is None else full_ns
+                self._await_room(error, full_ns, len(frames) - sent)
         self.counters.sent += sent
 
     def drain(self) -> list[TimedFrame]:
@@ -203,25 +216,68 @@ class SocketCanPort:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-        if self._patient is not None:
-            self._patient.close()
+        """Close the socket once its frames have left, or none leaves any more: then the user hears what to do."""
+        if self._socket.fileno() < 0:
+            return
+        try:
+            if not self._await_empty():
+                self._reports.say(
+                    f"{self.channel}: frames wait in its transmit queue that nobody acknowledges, and are sent when"
+                    f" somebody does; to drop them type: {emptying_line(self.channel)}"
+                )
+        finally:
+            self._socket.close()
+            if self._patient is not None:
+                self._patient.close()
+
+    def _await_empty(self) -> bool:
+        """Wait while the queue empties; whether it is empty."""
+        now_ns = self.clock.now_ns()
+        end_ns, moved_ns, left = now_ns + _LINGER_NS, now_ns, self._queued_bytes()
+        while left and self.clock.now_ns() < min(end_ns, moved_ns + _STUCK_NS):
+            time.sleep(_LATER_RETRY_S)
+            if (still := self._queued_bytes()) != left:
+                left, moved_ns = still, self.clock.now_ns()
+        return not left
+
+    def _queued_bytes(self) -> int:
+        """Memory of this socket's frames that the driver has not taken yet."""
+        numbers = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        return int(_MEMINFO.unpack(numbers)[_WMEM_ALLOC])
 
     def _check_open(self) -> None:
         if self._socket.fileno() < 0:
             raise InterfaceError(f"{self.channel}: this port is closed")
 
-    def _retry_or_raise(self, error: OSError, tries: int, left: int) -> None:
+    def _await_room(self, error: OSError, full_ns: int, left: int) -> None:
+        """Sleep a little where the queue is full, since `full_ns`; raise anything else."""
         if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
             raise self._failed(error) from error
         self.counters.transmit_full += 1
-        if tries >= _RETRIES:
-            raise InterfaceError(
-                f"{self.channel}: the transmit queue stays full, {left} frames not sent: nobody acknowledges, the bus "
-                f"is overloaded, or the queue is short; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
-            ) from error
-        time.sleep(_RETRY_S)
+        full_for_ns = self.clock.now_ns() - full_ns
+        if full_for_ns >= _PATIENCE_NS and not self._waits:
+            why = f"{self._full_queue(error)}, {left} frames not sent{self._longer_queue(error)}"
+            raise InterfaceError(why) from error
+        if full_for_ns >= _TELL_NS and full_ns != self._told_ns:
+            self._told_ns = full_ns
+            self._reports.say(f"{self._full_queue(error)}: waiting for the bus{self._longer_queue(error)}")
+        time.sleep(_RETRY_S if full_for_ns < _PATIENCE_NS else _LATER_RETRY_S)
+
+    def _full_queue(self, error: OSError) -> str:
+        what = "the transmit queue" if error.errno == errno.ENOBUFS else "the socket's send buffer"
+        return f"{self.channel}: {what} stays full, as nobody acknowledges or the bus is overloaded"
+
+    def _longer_queue(self, error: OSError) -> str:
+        """What to type where it is the interface's queue that is full, and short."""
+        if error.errno != errno.ENOBUFS:
+            return ""
+        try:
+            length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
+        except OSError:  # the interface has gone meanwhile
+            return ""
+        if length >= TX_QUEUE:
+            return ""
+        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:

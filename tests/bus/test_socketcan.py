@@ -152,10 +152,10 @@ def test_error_frames_are_read_by_their_classes(
 
 
 class FullQueue:
-    """Says ENOBUFS a number of times, then takes two frames a call."""
+    """Refuses frames a number of times, then takes two frames a call."""
 
-    def __init__(self, full: int) -> None:
-        self.full, self.taken = full, list[Frame]()
+    def __init__(self, full: int, number: int = errno.ENOBUFS) -> None:
+        self.full, self.taken, self.number = full, list[Frame](), number
 
     def receive(self) -> list[Row]:
         return []
@@ -163,7 +163,7 @@ class FullQueue:
     def send(self, frames: Sequence[Frame]) -> int:
         if self.full:
             self.full -= 1
-            raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+            raise OSError(self.number, os.strerror(self.number))
         self.taken += frames[:2]
         return len(frames[:2])
 
@@ -174,9 +174,25 @@ def test_a_full_queue_is_waited_for_then_an_error(vcan0: str) -> None:
     port._frames = queue = FullQueue(3)
     port.send_batch(batch)
     assert (queue.taken, port.counters.transmit_full, port.counters.sent) == (batch, 3, 5)
-    port._frames = FullQueue(10**6)
-    with pytest.raises(InterfaceError, match=r"vcan0: the transmit queue stays full, 5 frames.*txqueuelen 1000"):
-        port.send_batch(batch)
+    port.close()
+
+
+def test_what_stays_full_is_named_and_a_longer_queue_advised_where_it_is_short(link: str) -> None:
+    port = SocketCanPort(link, MonotonicClock())
+    why = "stays full, as nobody acknowledges or the bus is overloaded, 5 frames not sent"
+    queue, buffer = f"vcan7: the transmit queue {why}", f"vcan7: the socket's send buffer {why}"
+    short = f"{queue}; it holds 10 frames; type: ip link set vcan7 txqueuelen 1000"
+    for length, number, told in (
+        (10, errno.ENOBUFS, short),
+        (1000, errno.ENOBUFS, queue),
+        (10, errno.EAGAIN, buffer),
+        (1000, errno.EAGAIN, buffer),
+    ):
+        subprocess.run(["ip", "link", "set", link, "txqueuelen", str(length)], check=True)
+        port._frames = FullQueue(10**6, number)
+        with pytest.raises(InterfaceError) as caught:
+            port.send_batch([(0x100 + k, b"") for k in range(5)])
+        assert str(caught.value) == told
     port.close()
 
 

@@ -1,7 +1,9 @@
-"""A controller as its driver shows it: bit rate and states."""
+"""A controller as its driver shows it: bit rate, states, and a transmit queue that fills while nobody acknowledges."""
 
 from __future__ import annotations
 
+import os
+import signal
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -11,11 +13,15 @@ from waiting import wait_until
 from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.link import LinkState, read_link, setting_line
 from canprobe.bus.open import open_port
+from canprobe.bus.port import Reports
+from canprobe.bus.socketcan import SocketCanPort
 from canprobe.cli import main
 from canprobe.errors import InterfaceError
 
 pytestmark = pytest.mark.vcan
 MakeAdapter = Callable[..., SerialAdapter]
+FRAMES = [(0x100 + k, bytes(8)) for k in range(400)]
+"""More than a socket's send buffer holds."""
 
 
 @pytest.fixture
@@ -56,6 +62,61 @@ def test_its_setting_and_its_state_are_read(make_adapter: MakeAdapter) -> None:
     assert read_link(name) == LinkState(
         name, "can", True, 20, 250_000, restart_ms=0, state="ERROR-ACTIVE", bus_errors=0, bus_offs=0
     )
+
+
+@pytest.mark.parametrize(
+    ("queue", "what"),
+    [(10, "the transmit queue stays full"), (1000, "the socket's send buffer stays full")],
+)
+def test_what_is_full_while_nobody_acknowledges(make_adapter: MakeAdapter, queue: int, what: str) -> None:
+    adapter = make_adapter(queue=queue)
+    told: list[str] = []
+    port = SocketCanPort(adapter.name, MonotonicClock(), reports=Reports(say=told.append))
+    adapter.acknowledge(False)
+    with pytest.raises(InterfaceError, match=f"^{adapter.name}: {what}") as caught:
+        port.send_batch(FRAMES)
+    assert ("type: ip link set" in str(caught.value)) is (queue == 10)
+    port.close()
+    (line,) = told
+    assert line.startswith(f"{adapter.name}: frames wait in its transmit queue that nobody acknowledges")
+    assert line.endswith(f"type: ip link set {adapter.name} down && ip link set {adapter.name} up")
+
+
+@pytest.mark.parametrize("queue", [10, 1000])
+def test_a_device_waits_for_its_bus_and_leaves_nothing_behind(make_adapter: MakeAdapter, queue: int) -> None:
+    adapter = make_adapter(queue=queue)
+    told: list[str] = []
+
+    def say(line: str) -> None:
+        told.append(line)
+        adapter.acknowledge(True)
+
+    port = SocketCanPort(adapter.name, MonotonicClock(), waits=True, reports=Reports(say=say))
+    adapter.acknowledge(False)
+    port.send_batch(FRAMES)
+    port.close()
+    (line,) = told
+    assert "stays full, as nobody acknowledges or the bus is overloaded: waiting for the bus" in line
+    wait_until(lambda: len(adapter.frames) >= len(FRAMES), lambda: True, str)  # the terminal held some
+    assert adapter.frames == [can_id for can_id, _ in FRAMES]
+
+
+def test_emulated_nodes_wait_for_their_bus_until_ctrl_c(
+    make_adapter: MakeAdapter, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    adapter = make_adapter(queue=1)
+    adapter.acknowledge(False)
+    told: list[str] = []
+
+    def say(line: str) -> None:
+        told.append(line)
+        if "waiting for the bus" in line:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr("canprobe.cli.emulate.say", say)
+    nodes = [word for n in range(1, 7) for word in ("--eds", "puma260_joint", "--node-id", str(n))]
+    assert main(["emulate", *nodes, "--channel", adapter.name]) == 0
+    assert told[-1].startswith(f"{adapter.name}: frames wait in its transmit queue that nobody acknowledges")
 
 
 def test_a_scan_that_nobody_acknowledges_says_so(make_adapter: MakeAdapter, capsys: pytest.CaptureFixture[str]) -> None:
