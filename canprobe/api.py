@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +17,9 @@ from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
 from canprobe.cell.tasks.shape import ShapeRecord
 from canprobe.emulation import emulate, emulate_eds
-from canprobe.errors import CanprobeError, ResultsError, UsageError
+from canprobe.errors import BusError, CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
-from canprobe.link_report import check_links
+from canprobe.link_report import check_links, need_controllers
 from canprobe.note_report import news_teller, telling_notes
 from canprobe.planning import Plan, make_plan
 from canprobe.results import RunResult, log_columns, summarise, write_files
@@ -28,12 +29,15 @@ from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolv
 from canprobe.session_bus import open_ports
 
 if TYPE_CHECKING:
+    from canprobe.bus.port import Port
     from canprobe.cell.commission import Commissioned
     from canprobe.cell.monitor import CellView
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
 
 MONITOR_PERIOD_NS = 100_000_000
+SILENCE_NS = 1_000_000_000
+"""A bus on which nothing was heard for so long has its controller looked at."""
 
 __all__ = [
     "Command",
@@ -307,7 +311,6 @@ def up(
         scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
     )
     plan = make_plan(resolve(resolved))
-    check_links(plan, say)
     with (
         Bridges(plan, None, virtual=False, say=say) as bridges,
         telling_notes(Session(plan, None, say, bridges.observers, ROWS_OF_UP), say) as session,
@@ -316,20 +319,43 @@ def up(
         session.run(_requested(plan, None, lambda: make_task(plan), bridges), news_teller(session, say))
 
 
-def scan(interface: str, channel: str, bitrate: int, timeout_s: float = 0.2) -> list[dict[str, Any]]:
+def scan(
+    interface: str, channel: str, bitrate: int, timeout_s: float = 0.2, *, say: Say = quiet
+) -> list[dict[str, Any]]:
     """List the nodes that answer on a bus, with the identity that 1018h gives.
 
+    Args:
+        interface, channel, bitrate: of the bus.
+        timeout_s: to wait for an answer.
+        say: called with what is wrong with the interface's setting.
+
     Raises:
-        InterfaceError: no such interface.
+        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.bus.open import open_port
     from canprobe.cell.scan import scan_nodes
 
+    with _bus_without_scene(interface, channel, bitrate, say) as port:
+        nodes = scan_nodes(port, timeout_s)
+    if not nodes:
+        need_controllers(interface, {channel: port})
+    return nodes
+
+
+@contextlib.contextmanager
+def _bus_without_scene(interface: str, channel: str, bitrate: int, say: Say) -> Iterator[Port]:
+    """A port of a bus of which nothing more is known, whose setting is no reason to leave it alone."""
+    from canprobe.bus.clock import MonotonicClock
+    from canprobe.bus.open import open_port
+    from canprobe.cell.link_checks import Expected
+
     hush_canopen()
+    check_links(interface, {channel: Expected(bitrate, of_scene=False)}, say, must=False)
     port = open_port(interface, channel, bitrate, MonotonicClock())
     try:
-        return scan_nodes(port, timeout_s)
+        yield port
+    except BusError as error:
+        need_controllers(interface, {channel: port}, error)
+        raise
     finally:
         port.close()
 
@@ -342,6 +368,7 @@ def commission(
     scene: Scene | None = None,
     assign: Sequence[tuple[tuple[int | None, int | None, int | None, int | None], int]] = (),
     store: bool = True,
+    say: Say = quiet,
 ) -> Commissioned:
     """Find the nodes that have no id and give them theirs by LSS (CiA 305).
 
@@ -350,26 +377,24 @@ def commission(
         scene: whose nodes get their ids; as far as its EDS files and serial numbers tell which is which.
         assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
         store: let the devices keep their ids when their power goes.
+        say: called with what is wrong with the interface's setting.
 
     Raises:
         UsageError: the scene does not fit.
         BusError: see :func:`canprobe.cell.commission.commission`.
-        InterfaceError: no such interface.
+        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.bus.open import open_port
     from canprobe.cell.commission import commission, wanted_by
     from canprobe.cell.lss_choice import Wanted
 
-    hush_canopen()
     wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
     if scene is not None:
         wanted = wanted_by(make_plan(resolve(resolve_scene(scene, interface=interface))))
-    port = open_port(interface, channel, bitrate, MonotonicClock())
-    try:
-        return commission(port, wanted, must=scene is None, store=store)
-    finally:
-        port.close()
+    with _bus_without_scene(interface, channel, bitrate, say) as port:
+        done = commission(port, wanted, must=scene is None, store=store)
+    if not done.nodes and not done.unconfigured:
+        need_controllers(interface, {channel: port})
+    return done
 
 
 def monitor(
@@ -380,6 +405,7 @@ def monitor(
     sensor_channel: str | None = None,
     bitrate: int | None = None,
     duration_s: float | None = None,
+    say: Say = quiet,
 ) -> Iterator[CellView]:
     """Look at a running cell ten times a second, sending nothing.
 
@@ -387,15 +413,17 @@ def monitor(
         scene: what is on the bus.
         interface, channel, sensor_channel, bitrate: in the place of the scene's.
         duration_s: how long; for ever by default.
+        say: called with what is wrong with the interface's setting.
 
     Yields:
         What is known by then; the same object each time.
 
     Raises:
         UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
-        InterfaceError: no such interface, or it was lost.
+        InterfaceError: no such interface, or it was lost; or a bus is silent and its CAN controller's state is why.
     """
     from canprobe.bus.clock import MonotonicClock
+    from canprobe.cell.link_checks import expected_of
     from canprobe.cell.monitor import Monitor
 
     resolved = resolve_scene(
@@ -403,13 +431,23 @@ def monitor(
     )
     if resolved.bus.interface == LOCKSTEP:
         raise UsageError("monitor: a lockstep bus lives inside one run; name a real interface with --bus")
-    plan, clock = make_plan(resolve(resolved)), MonotonicClock()
+    plan, clock, interface = make_plan(resolve(resolved)), MonotonicClock(), resolved.bus.interface
+    wanted = {name: replace(expected, frames_at_once=0) for name, expected in expected_of(plan).items()}
+    check_links(interface, wanted, say, must=False)
     with open_ports(plan, clock) as ports:
         listener = Monitor(plan)
         start_ns = next_ns = clock.now_ns()
-        while duration_s is None or next_ns < start_ns + duration_s * 1e9:
+        duration_ns = None if duration_s is None else duration_s * 1e9
+        patience_ns = SILENCE_NS if duration_ns is None else min(SILENCE_NS, duration_ns)
+        heard_ns = dict.fromkeys(ports, start_ns)
+        while duration_ns is None or next_ns < start_ns + duration_ns:
             next_ns += MONITOR_PERIOD_NS
             clock.sleep_until_ns(next_ns)
             for name, port in ports.items():
-                listener.push(port.drain(), name)
+                if frames := port.drain():
+                    listener.push(frames, name)
+                    heard_ns[name] = next_ns
+                elif next_ns - heard_ns[name] >= patience_ns:
+                    need_controllers(interface, {name: port})
+                    heard_ns[name] = next_ns  # the state is asked for once a second at most
             yield listener.view(clock.now_ns())

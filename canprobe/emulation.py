@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.errors import NodeError, UsageError
+from canprobe.link_report import check_links
 from canprobe.npz_file import write_npz
 from canprobe.protocol.lss import UNCONFIGURED
 from canprobe.rehearsal import rehearse
@@ -20,6 +21,7 @@ from canprobe.session_bus import data_bitrate
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
+    from canprobe.cell.link_checks import Expected
     from canprobe.emulator.node import SlaveNode
     from canprobe.emulator.serve import Participant
 
@@ -55,6 +57,7 @@ def emulate(
         NodeError: somebody on the bus has one of the node ids already.
         OSError: `truth_path` or `store_folder` cannot be there; told before anything is served.
     """
+    from canprobe.cell.link_checks import Expected
     from canprobe.emulator.build import make_world
     from canprobe.planning import make_plan
     from canprobe.scene_resolve import resolve
@@ -67,7 +70,8 @@ def emulate(
     way_out = "end that node, or name others with --nodes"
     busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
     _make_places(truth_path, store_folder)
-    with _free_port(interface, channel, bitrate, busy, way_out, data_bitrate=fast) as port:
+    wanted = Expected(bitrate, fast)
+    with _free_port(interface, channel, wanted, busy, way_out=way_out, say=say) as port:
         rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
         _keep(world.nodes, store_folder)
@@ -114,6 +118,7 @@ def emulate_eds(
         NodeError: somebody on the bus has one of the node ids already.
         OSError: `store_folder` cannot be there.
     """
+    from canprobe.cell.link_checks import Expected
     from canprobe.eds import check_eds
     from canprobe.emulator.any_eds import make_eds_node
 
@@ -131,7 +136,8 @@ def emulate_eds(
             say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` tells them")
     _check_addresses(nodes)
     _make_places(None, store_folder)
-    with _free_port(interface, channel, bitrate, node_ids, "end that node, or give another --node-id") as port:
+    wanted, way_out = Expected(bitrate, of_scene=False), "end that node, or give another --node-id"
+    with _free_port(interface, channel, wanted, node_ids, way_out=way_out, say=say) as port:
         for node in nodes:
             if node.lss is not None:
                 node.lss.bitrate = bitrate
@@ -151,20 +157,24 @@ def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
 
 @contextlib.contextmanager
 def _free_port(
-    interface: str,
-    channel: str,
-    bitrate: int,
-    node_ids: tuple[int, ...],
-    way_out: str,
-    *,
-    data_bitrate: int | None = None,
+    interface: str, channel: str, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
-    """A port on a bus where nobody has these node ids."""
+    """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.bus.clock import MonotonicClock
     from canprobe.bus.open import open_port
+    from canprobe.bus.port import Reports
     from canprobe.bus.probe import answering_nodes
 
-    port = open_port(interface, channel, bitrate, MonotonicClock(), data_bitrate=data_bitrate)
+    check_links(interface, {channel: wanted}, say)
+    port = open_port(
+        interface,
+        channel,
+        wanted.bitrate,
+        MonotonicClock(),
+        data_bitrate=wanted.data_bitrate,
+        waits=True,
+        reports=Reports(say=say),
+    )
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
             raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from canprobe.errors import NodeError, UsageError
-from canprobe.link_report import check_links
 from canprobe.planning import make_plan
 from canprobe.scene import Scene
 from canprobe.scene_resolve import resolve
@@ -57,7 +56,6 @@ def check_joints(
             resolve_scene(scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate)
         )
     )
-    check_links(plan, say)
     check = JointCheck(MODELS[scene.arm.model], limits_of(plan), plan.sync.period_ns * 1e-9, operator)
     try:
         with Session(plan.scene, None, say, (), ROWS_KEPT) as session:

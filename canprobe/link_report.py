@@ -1,40 +1,78 @@
-"""The check of a cell's SocketCAN interfaces before it is brought up: warnings are said, an error ends it."""
+"""SocketCAN interfaces and CAN controllers: what is wrong with them is said, or ends what was begun."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
-from canprobe.errors import InterfaceError
-from canprobe.planning import Plan
+from canprobe.errors import BusError, InterfaceError
+
+if TYPE_CHECKING:
+    from canprobe.bus.port import Port
+    from canprobe.cell.link_checks import Expected
+
+SOCKETCAN = "socketcan"
 
 
-def check_links(plan: Plan, say: Callable[[str], None]) -> None:
-    """Check every SocketCAN interface of a plan.
+def check_links(
+    interface: str, channels: Mapping[str, Expected], say: Callable[[str], None], *, must: bool = True
+) -> None:
+    """Check SocketCAN interfaces before anything is sent; of others, and of virtual ones, there is nothing to check.
 
     Args:
-        plan: of the cell.
+        interface: of all channels.
+        channels: and what is wanted of each.
         say: called with each warning.
+        must: an interface that cannot work ends it; else that is a warning too.
 
     Raises:
-        InterfaceError: an interface is set so that the cell cannot work; with the line to type.
+        InterfaceError: an interface is set so that nothing can work; with the line to type.
     """
-    if plan.scene.bus.interface != "socketcan":
+    if interface != SOCKETCAN:
         return
-    from canprobe.bus.link import VIRTUAL, read_link
-    from canprobe.cell.link_checks import check_link, expected_of
+    from canprobe.bus.link import read_link
+    from canprobe.cell.link_checks import check_link
 
     errors: list[str] = []
-    for bus in plan.buses:
-        link = read_link(bus.channel)
+    for channel, expected in channels.items():
+        link = read_link(channel)
         if link is None:
-            say(f"{bus.channel}: its setting is not checked: `ip` of iproute2 does not tell it")
-        elif link.kind in VIRTUAL:
-            say(f"{bus.channel}: virtual, without a bit rate")
+            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not tell it")
         elif link.is_up:  # else it cannot be opened either, which is told with the line to type
-            remarks = check_link(link, expected_of(plan, bus.channel))
-            errors += [f"{bus.channel}: {remark.text}" for remark in remarks if remark.is_error]
-            for remark in remarks:
-                if not remark.is_error:
-                    say(f"warning: {bus.channel}: {remark.text}")
+            for remark in check_link(link, expected):
+                if must and remark.is_error:
+                    errors.append(f"{channel}: {remark.text}")
+                else:
+                    say(f"warning: {channel}: {remark.text}")
     if errors:
         raise InterfaceError("\n".join(errors))
+
+
+def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseException | None = None) -> None:
+    """Return where every CAN controller can send and hear, as far as is known.
+
+    Args:
+        interface: of all ports.
+        ports: by channel; closed ones still know their last state.
+        error: what went wrong on the bus, which a controller's state may explain; anything else is no matter of it.
+
+    Raises:
+        InterfaceError: a controller is bus-off or error-passive; with what to look at, the line to type, and `error`.
+    """
+    if error is not None and not isinstance(error, BusError):
+        return
+    from canprobe.bus.link import LinkState, read_link
+    from canprobe.bus.port import ControllerState
+    from canprobe.cell.link_checks import controller_trouble
+
+    troubles: list[str] = []
+    for channel, port in ports.items():
+        link = (read_link(channel) if interface == SOCKETCAN else None) or LinkState(channel)
+        if link.state is None:  # a virtual one, another interface, or no `ip`: as the last error frame told
+            state = port.state
+            link = replace(link, state="BUS-OFF" if state is ControllerState.BUS_OFF else f"ERROR-{state.name}")
+        if (trouble := controller_trouble(link, typed=interface == SOCKETCAN)) is not None:
+            troubles.append(f"{channel}: its CAN controller is {trouble}")
+    if troubles:
+        raise InterfaceError("; ".join([*troubles, *([str(error)] if error is not None else [])])) from error

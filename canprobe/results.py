@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -164,14 +165,19 @@ def _without_nan(value: Any) -> Any:
 
 
 def _traffic(session: Session) -> dict[str, Any]:
-    """What was on each bus beside the plan; on a real one counted afterwards, from the log."""
-    if session.out is None or session.meters:
+    """What was on each bus beside the plan; on a real one counted afterwards, from the log.
+
+    Where there is no log, or it ended before the first SYNC, only the bus errors are known.
+    """
+    if session.meters:
         return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
-    log, plan = session.out / LOG, session.plan
-    try:
-        return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
-    except UsageError:  # it ended before the first SYNC
-        return {}
+    plan = session.plan
+    with contextlib.suppress(UsageError):
+        if session.out is not None:
+            log = session.out / LOG
+            return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
+    errors = {channel: counter.error_frames for channel, counter in session.traffic.items()}
+    return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
 
 
 def _truth(session: Session) -> dict[str, Array]:

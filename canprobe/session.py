@@ -22,13 +22,15 @@ from canprobe.bus.clock import MonotonicClock, VirtualClock, elapsed_ns
 from canprobe.bus.joined import JoinedPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.memory import garbage_collection_paused, reserve_memory
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, Reports, is_bus_error
 from canprobe.bus.priority import MASTER_PRIORITY, realtime
 from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
+from canprobe.cell.link_checks import expected_of
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
 from canprobe.errors import UsageError
+from canprobe.link_report import check_links, need_controllers
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
@@ -132,6 +134,7 @@ class Session:
         self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
+        self._ports: dict[str, Port] = {}
         self._candump: CandumpWriter | None = None
         self.world: World | None = None
         self.joins: Callable[[Any], Any] = lambda participant: participant
@@ -190,8 +193,9 @@ class Session:
             self._stack.callback(self._observe_frames, port)
             self._stack.enter_context(self._cell)
             self._observe_frames(port)
-        except BaseException:
+        except BaseException as error:
             self._close()
+            need_controllers(self.scene.bus.interface, self._ports, error)
             raise
         return self
 
@@ -263,13 +267,11 @@ class Session:
 
     def _error_writer(self, channel: str) -> Write:
         """Error frames go into the log, and beside the plan."""
-        meter = self.meters[channel]
-        write = self._candump.on(channel) if self._candump is not None else None
 
         def note(can_id: int, data: bytes, t_ns: int) -> None:
-            meter.error_frames += 1
-            if write is not None:
-                write(can_id, data, t_ns)
+            self.traffic[channel].error_frames += is_bus_error(can_id)
+            if self._candump is not None:
+                self._candump.on(channel)(can_id, data, t_ns)
 
         return note
 
@@ -322,9 +324,12 @@ class Session:
             )
         if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
+        check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
         t0_ns = clock.now_ns()
-        real = self._stack.enter_context(open_ports(self.plan, clock))
+        real = self._ports = self._stack.enter_context(
+            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
+        )
         return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:

@@ -8,7 +8,7 @@ from functools import partial
 
 from canprobe.bus.clock import Clock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.port import Port
+from canprobe.bus.port import Port, Reports
 from canprobe.planning import Plan
 from canprobe.planning.wire_bits import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
@@ -22,12 +22,16 @@ class TrafficCounter:
     Args:
         write: of the log.
         speed_up: data bit rate of CAN FD over the nominal one.
+
+    Attributes:
+        error_frames: bus errors, to be counted by who hears of them.
     """
 
     def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
         self._write = write
         self._by_length = [0] * 65
         self._speed_up = speed_up
+        self.error_frames = 0
 
     @property
     def frames(self) -> int:
@@ -53,8 +57,15 @@ def data_bitrate(bus: BusSettings) -> int | None:
 
 
 @contextmanager
-def open_ports(plan: Plan, clock: Clock) -> Iterator[dict[str, Port]]:
+def open_ports(
+    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports()
+) -> Iterator[dict[str, Port]]:
     """The ports of a plan's buses, by channel; closed at the end.
+
+    Args:
+        plan: whose buses.
+        clock: in real time.
+        reports: makes, of a channel, who hears what its port has to report.
 
     Raises:
         InterfaceError: one is missing, down, or cannot be opened.
@@ -65,9 +76,12 @@ def open_ports(plan: Plan, clock: Clock) -> Iterator[dict[str, Port]]:
     with ExitStack() as stack:
         ports: dict[str, Port] = {}
         for planned in plan.buses:
-            port = open_port(bus.interface, planned.channel, bus.bitrate, clock, data_bitrate=data_bitrate(bus))
+            name = planned.channel
+            port = open_port(
+                bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
+            )
             stack.callback(port.close)
-            ports[planned.channel] = port
+            ports[name] = port
         yield ports
 
 

@@ -6,7 +6,7 @@ from collections import Counter
 from pathlib import Path
 
 from canprobe.bus.candump import read_candump
-from canprobe.bus.port import ERR_FLAG
+from canprobe.bus.port import ERR_FLAG, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.measured import MeasuredTraffic
@@ -44,8 +44,8 @@ def measure_traffic(
         meter = meters.get(name)
         if meter is None:
             meter = meters[name] = TrafficMeter(plan, name, exact)
-        if can_id & ERR_FLAG and can_id <= 0x3FFFFFFF:
-            meter.error_frames += 1
+        if can_id & ERR_FLAG:
+            meter.error_frames += is_bus_error(can_id)
         else:
             meter.write(can_id, data, t_ns)
             syncs[name] += can_id == 0x080

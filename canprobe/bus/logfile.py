@@ -15,7 +15,7 @@ from typing import Any
 import can
 
 from canprobe.bus.candump import format_line, read_candump
-from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG
+from canprobe.bus.port import EFF_FLAG, ERR_BUS, ERR_FLAG, RTR_FLAG
 from canprobe.errors import UsageError
 
 _READERS: dict[str, Any] = {".asc": can.ASCReader, ".blf": can.BLFReader, ".trc": can.TRCReader}
@@ -97,8 +97,10 @@ def _write_foreign(frames: Iterable[tuple[int, str, int, bytes]], target: Path) 
 
 
 def _can_id(message: can.Message) -> int:
+    if message.is_error_frame:  # most of these formats say no more than that there was an error
+        return ERR_FLAG | (int(message.arbitration_id) or ERR_BUS)
     flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
-    return int(message.arbitration_id) | flags | (ERR_FLAG if message.is_error_frame else 0)
+    return int(message.arbitration_id) | flags
 
 
 def _message(t_ns: int, channel: str, can_id: int, data: bytes) -> can.Message:

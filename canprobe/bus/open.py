@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from canprobe.bus.clock import Clock
-from canprobe.bus.port import CanFilter, Port
+from canprobe.bus.port import CanFilter, Port, Reports
 from canprobe.errors import UsageError
 
 
@@ -17,6 +17,8 @@ def open_port(
     *,
     filters: Sequence[CanFilter] | None = None,
     data_bitrate: int | None = None,
+    waits: bool = False,
+    reports: Reports | None = None,
 ) -> Port:
     """Open `channel` of `interface`.
 
@@ -27,6 +29,8 @@ def open_port(
         clock: a clock in real time.
         filters: what is let in; everything by default.
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
+        reports: who hears of error frames, and of what the user has to know.
 
     Raises:
         UsageError: there is no interface of that name.
@@ -35,9 +39,13 @@ def open_port(
     if interface == "socketcan":
         from canprobe.bus.socketcan import SocketCanPort
 
-        return SocketCanPort(channel, clock, filters=filters, fd=data_bitrate is not None)
+        return SocketCanPort(
+            channel, clock, filters=filters, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports
+        )
     if interface == "lockstep":
         raise UsageError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
     from canprobe.bus.pythoncan import PythonCanPort
 
-    return PythonCanPort(interface, channel, bitrate, clock, filters=filters, data_bitrate=data_bitrate)
+    return PythonCanPort(
+        interface, channel, bitrate, clock, filters=filters, data_bitrate=data_bitrate, reports=reports
+    )

@@ -2,12 +2,15 @@
 
 A frame is `(can_id, data)`. Identifiers above 11 bits and remote requests carry the flags of Linux's `struct
 can_frame`: `EFF_FLAG` for a 29-bit identifier, `RTR_FLAG` for a remote request; plain data frames are the bare
-identifier. Error frames are never passed on: they are counted, and a hardware port shows its controller's state.
+identifier. Error frames are never passed on as frames: a hardware port reads their class bits, counts bus errors and
+lost frames, shows its controller's state, and hands each of them to whoever writes a log.
+
+Source: Linux include/uapi/linux/can/error.h (error classes).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Protocol
@@ -24,10 +27,17 @@ __all__ = [
     "Frame",
     "Port",
     "PortCounters",
+    "Reports",
     "TimedFrame",
+    "is_bus_error",
+    "state_after",
 ]
 
 ERR_FLAG = 0x20000000
+ERR_CONTROLLER, ERR_PROTOCOL, ERR_ACK, ERR_BUS_OFF, ERR_BUS, ERR_RESTARTED = 0x004, 0x008, 0x020, 0x040, 0x080, 0x100
+_BUS_ERRORS = ERR_PROTOCOL | ERR_ACK | ERR_BUS
+_OVERFLOWS, _WARNINGS, _PASSIVES, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
+"""Bits of the second byte of an ERR_CONTROLLER frame, each for reception and transmission."""
 
 TimedFrame = tuple[int, bytes, int]
 """A received frame: can_id, data, time of reception in ns on the port's clock."""
@@ -45,6 +55,34 @@ class ControllerState(IntEnum):
     BUS_OFF = 3
 
 
+def is_bus_error(can_id: int) -> bool:
+    """Whether this is an error frame of a frame that went wrong: protocol, acknowledgement or bit error.
+
+    A lost arbitration, which some drivers report every time, and a change of the controller's state are none.
+    """
+    return bool(can_id & ERR_FLAG and can_id & _BUS_ERRORS)
+
+
+def state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerState:
+    """The controller's state after an error frame."""
+    if can_id & ERR_BUS_OFF:
+        return ControllerState.BUS_OFF
+    if can_id & ERR_RESTARTED:
+        return ControllerState.ACTIVE
+    for bits, told in (
+        (_PASSIVES, ControllerState.PASSIVE),
+        (_WARNINGS, ControllerState.WARNING),
+        (_ACTIVE, ControllerState.ACTIVE),
+    ):
+        if _of_controller(can_id, data) & bits:
+            return told
+    return state
+
+
+def _of_controller(can_id: int, data: bytes) -> int:
+    return data[1] if can_id & ERR_CONTROLLER and len(data) > 1 else 0
+
+
 @dataclass(slots=True)
 class PortCounters:
     """What a port has counted since it was opened.
@@ -52,9 +90,10 @@ class PortCounters:
     Attributes:
         sent: frames handed to the bus.
         received: data and remote frames given to the reader.
-        error_frames: error frames seen and not passed on.
-        overruns: frames that the kernel dropped because the reader was late.
-        transmit_full: times that the transmit queue was full (ENOBUFS), retries included.
+        error_frames: bus errors, as error frames report them.
+        overruns: frames that were lost on this machine: dropped by the kernel because the reader was late, and
+            overflows of the controller's buffers.
+        transmit_full: times that the transmit queue was full, retries included.
         ignored: frames that classic CAN cannot carry (CAN FD) and that were dropped.
     """
 
@@ -64,6 +103,28 @@ class PortCounters:
     overruns: int = 0
     transmit_full: int = 0
     ignored: int = 0
+
+    def note_error(self, can_id: int, data: bytes) -> None:
+        """Count an error frame for what it is; an overflow is one lost frame, whichever way it was to go."""
+        self.error_frames += is_bus_error(can_id)
+        self.overruns += bool(_of_controller(can_id, data) & _OVERFLOWS)
+
+
+def _nobody(*_: object) -> None:
+    """Hears nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reports:
+    """Who hears what a port does not hand to its reader.
+
+    Attributes:
+        error_frame: called with (can_id, data, t_ns) of every error frame.
+        say: called with what the user has to know.
+    """
+
+    error_frame: Callable[[int, bytes, int], None] = _nobody
+    say: Callable[[str], None] = _nobody
 
 
 class Port(Protocol):

@@ -15,7 +15,19 @@ import can
 
 from canprobe.bus.clock import Clock
 from canprobe.bus.echoes import Echoes
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import (
+    EFF_FLAG,
+    ERR_BUS,
+    ERR_FLAG,
+    RTR_FLAG,
+    CanFilter,
+    ControllerState,
+    Frame,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
@@ -29,6 +41,8 @@ _STATES = {
 }
 _HEARS_ITSELF = ("udp_multicast",)
 """Interfaces on which python-can gives a sender its own frames back, without a mark on them."""
+_HAS_CLASSES = ("socketcan", "socketcand")
+"""Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
 class PythonCanPort:
@@ -41,10 +55,11 @@ class PythonCanPort:
         clock: the clock for waits and stamps.
         filters: what is let in; everything by default.
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
+        reports: who hears of error frames.
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
-        state: the controller's state as python-can told it at the last error frame.
+        state: the controller's state as the last error frame told, or python-can at that time.
 
     Raises:
         UsageError: python-can has no such interface.
@@ -60,8 +75,11 @@ class PythonCanPort:
         *,
         filters: Sequence[CanFilter] | None = None,
         data_bitrate: int | None = None,
+        reports: Reports | None = None,
     ) -> None:
         self._fd = data_bitrate is not None
+        self._reports = reports or Reports()
+        self._has_classes = interface in _HAS_CLASSES
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
@@ -127,8 +145,7 @@ class PythonCanPort:
 
     def _frame(self, message: can.Message, t_ns: int) -> TimedFrame | None:
         if message.is_error_frame:
-            self.counters.error_frames += 1
-            self.state = _STATES.get(self._open_bus().state, self.state)
+            self._note_error(message, t_ns)
             return None
         if message.is_fd and not self._fd:
             self.counters.ignored += 1
@@ -139,6 +156,17 @@ class PythonCanPort:
         if message.is_remote_frame:
             return can_id | RTR_FLAG, b"", t_ns
         return can_id, bytes(message.data), t_ns
+
+    def _note_error(self, message: can.Message, t_ns: int) -> None:
+        data = bytes(message.data)
+        if self._has_classes:
+            can_id = ERR_FLAG | message.arbitration_id
+            self.state = state_after(self.state, can_id, data)
+        else:
+            can_id = ERR_FLAG | ERR_BUS
+            self.state = _STATES.get(self._open_bus().state, self.state)
+        self.counters.note_error(can_id, data)
+        self._reports.error_frame(can_id, data, t_ns)
 
 
 def _open(

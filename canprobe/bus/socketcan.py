@@ -2,8 +2,11 @@
 
 Time stamps are those of the kernel at reception (CLOCK_REALTIME), brought to CLOCK_MONOTONIC by the difference between
 the two clocks, which is measured when the port opens and again when the stamps have moved on by a second or stepped.
-29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With `fd` frames of more than 8 bytes
-are CAN FD frames with bit-rate switch; without it none are received.
+29-bit identifiers and remote requests are passed with `EFF_FLAG` and `RTR_FLAG`. With a data bit rate frames of more
+than 8 bytes are CAN FD frames with bit-rate switch; without it none are received.
+
+What the controller cannot send waits in two places: the interface's transmit queue (`txqueuelen`; ENOBUFS when it is
+full) and, counted in bytes, the socket's send buffer (about 277 frames; EAGAIN). Closing the socket empties neither.
 """
 
 from __future__ import annotations
@@ -19,8 +22,20 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.clock import Clock, Timespec
+from canprobe.bus.link import TX_QUEUE, emptying_line, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
-from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG, CanFilter, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import (
+    EFF_FLAG,
+    ERR_FLAG,
+    RTR_FLAG,
+    CanFilter,
+    ControllerState,
+    Frame,
+    PortCounters,
+    Reports,
+    TimedFrame,
+    state_after,
+)
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 
@@ -31,16 +46,20 @@ _CAN_RAW_FD_FRAMES = 5
 _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
 _CAN_ERR_MASK = 0x1FFFFFFF
-_CAN_ERR_CRTL, _CAN_ERR_BUSOFF, _CAN_ERR_RESTARTED = 0x004, 0x040, 0x100
-_CRTL_ACTIVE, _CRTL_PASSIVE, _CRTL_WARNING = 0x40, 0x30, 0x0C
 _SO_RCVBUFFORCE = 33
+_SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
 _SIOCGIFFLAGS = 0x8913
 _SIOCGIFMTU = 0x8921
+_SIOCGIFTXQLEN = 0x8942
 _CANFD_MTU = 72
 _IFF_UP = 0x1
 _RECEIVE_BUFFER = 4 << 20
-_RETRIES = 50
-_RETRY_S = 200e-6
+_RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
+_PATIENCE_NS = 10_000_000
+_TELL_NS = 1_000_000_000
+"""A queue that has been full for so long is told to the user, where it is waited for."""
+_STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
+"""How long a port that closes waits for the next queued frame to leave, and for all of them."""
 _RECALIBRATE_NS = 1_000_000_000
 
 
@@ -52,11 +71,14 @@ class SocketCanPort:
         clock: a clock that shows CLOCK_MONOTONIC.
         filters: what the kernel lets in; everything by default.
         batched: use recvmmsg and sendmmsg where they exist.
-        fd: send and receive CAN FD frames too.
+        bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
+        data_bitrate: send and receive CAN FD frames too; None: classical frames only.
+        waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
+        reports: who hears of error frames, of a queue that is waited for and of frames that are left in it.
 
     Attributes:
-        counters: what has passed; `overruns` are frames that the kernel dropped for this socket.
-        state: the controller's state as the last error frame told; always ACTIVE on vcan.
+        counters: what has passed.
+        state: the controller's state as the last error frame told; ACTIVE before the first.
 
     Raises:
         InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
@@ -70,12 +92,18 @@ class SocketCanPort:
         *,
         filters: Sequence[CanFilter] | None = None,
         batched: bool = True,
-        fd: bool = False,
+        bitrate: int = 1_000_000,
+        data_bitrate: int | None = None,
+        waits: bool = False,
+        reports: Reports | None = None,
     ) -> None:
-        check_interface(channel)
+        self._fd = fd = data_bitrate is not None
+        self._setting = setting_line(channel, bitrate, data_bitrate)
+        self._waits = waits
+        self._reports = reports or Reports()
+        check_interface(channel, self._setting)
         if fd:
-            check_fd(channel)
-        self._fd = fd
+            _check_fd(channel, self._setting)
         self.clock = clock
         self.channel = channel
         self.counters = PortCounters()
@@ -88,12 +116,12 @@ class SocketCanPort:
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
-        self._offset_ns = self._calibrated_ns = self._patience_ns = 0
+        self._offset_ns = self._calibrated_ns = self._patience_ns = self._told_ns = 0
 
     stamps_arrival = True
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
-        """Send `frames` in order; a full queue is waited for up to 10 ms.
+        """Send `frames` in order; a full queue is waited for.
 
         Raises:
             InterfaceError: the queue stays full, the interface is down or gone, or a frame is none.
@@ -104,13 +132,14 @@ class SocketCanPort:
             if long or (can_id > 0x7FF and can_id < ERR_FLAG):
                 kind = "CAN or CAN FD" if self._fd else "classic CAN"
                 raise InterfaceError(f"{self.channel}: {can_id:X} with {len(data)} bytes is no {kind} frame")
-        sent = tries = 0
+        sent = 0
+        full_ns: int | None = None
         while sent < len(frames):
             try:
                 sent += self._frames.send(frames[sent:] if sent else frames)
             except OSError as error:
-                self._retry_or_raise(error, tries, len(frames) - sent)
-                tries += 1
+                full_ns = self.clock.now_ns() if full_ns is None else full_ns
+                self._await_room(error, full_ns, len(frames) - sent)
         self.counters.sent += sent
 
     def drain(self) -> list[TimedFrame]:
@@ -133,7 +162,7 @@ class SocketCanPort:
         offset_ns = self._offset_ns
         frames = [(can_id, data, t_ns - offset_ns) for can_id, data, t_ns, _ in rows if not can_id & ERR_FLAG]
         if len(frames) < len(rows):
-            self._note_errors(rows)
+            self._note_errors(rows, offset_ns)
         self.counters.received += len(frames)
         return frames
 
@@ -187,45 +216,90 @@ class SocketCanPort:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Close the socket."""
-        self._socket.close()
-        if self._patient is not None:
-            self._patient.close()
+        """Close the socket once its frames have left, or none leaves any more: then the user hears what to do."""
+        if self._socket.fileno() < 0:
+            return
+        try:
+            if not self._await_empty():
+                self._reports.say(
+                    f"{self.channel}: frames wait in its transmit queue that nobody acknowledges, and are sent when"
+                    f" somebody does; to drop them type: {emptying_line(self.channel)}"
+                )
+        finally:
+            self._socket.close()
+            if self._patient is not None:
+                self._patient.close()
+
+    def _await_empty(self) -> bool:
+        """Wait while the queue empties; whether it is empty."""
+        now_ns = self.clock.now_ns()
+        end_ns, moved_ns, left = now_ns + _LINGER_NS, now_ns, self._queued_bytes()
+        while left and self.clock.now_ns() < min(end_ns, moved_ns + _STUCK_NS):
+            time.sleep(_LATER_RETRY_S)
+            if (still := self._queued_bytes()) != left:
+                left, moved_ns = still, self.clock.now_ns()
+        return not left
+
+    def _queued_bytes(self) -> int:
+        """Memory of this socket's frames that the driver has not taken yet."""
+        numbers = self._socket.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO.size)
+        return int(_MEMINFO.unpack(numbers)[_WMEM_ALLOC])
 
     def _check_open(self) -> None:
         if self._socket.fileno() < 0:
             raise InterfaceError(f"{self.channel}: this port is closed")
 
-    def _retry_or_raise(self, error: OSError, tries: int, left: int) -> None:
+    def _await_room(self, error: OSError, full_ns: int, left: int) -> None:
+        """Sleep a little where the queue is full, since `full_ns`; raise anything else."""
         if error.errno not in (errno.ENOBUFS, errno.EAGAIN):
             raise self._failed(error) from error
         self.counters.transmit_full += 1
-        if tries >= _RETRIES:
-            raise InterfaceError(
-                f"{self.channel}: the transmit queue stays full, {left} frames not sent: nobody acknowledges, the bus "
-                f"is overloaded, or the queue is short; type: {_sudo()}ip link set {self.channel} txqueuelen 1000"
-            ) from error
-        time.sleep(_RETRY_S)
+        full_for_ns = self.clock.now_ns() - full_ns
+        if full_for_ns >= _PATIENCE_NS and not self._waits:
+            why = f"{self._full_queue(error)}, {left} frames not sent{self._longer_queue(error)}"
+            raise InterfaceError(why) from error
+        if full_for_ns >= _TELL_NS and full_ns != self._told_ns:
+            self._told_ns = full_ns
+            self._reports.say(f"{self._full_queue(error)}: waiting for the bus{self._longer_queue(error)}")
+        time.sleep(_RETRY_S if full_for_ns < _PATIENCE_NS else _LATER_RETRY_S)
+
+    def _full_queue(self, error: OSError) -> str:
+        what = "the transmit queue" if error.errno == errno.ENOBUFS else "the socket's send buffer"
+        return f"{self.channel}: {what} stays full, as nobody acknowledges or the bus is overloaded"
+
+    def _longer_queue(self, error: OSError) -> str:
+        """What to type where it is the interface's queue that is full, and short."""
+        if error.errno != errno.ENOBUFS:
+            return ""
+        try:
+            length = struct.unpack("=16si12x", fcntl.ioctl(self._socket, _SIOCGIFTXQLEN, _ifreq(self.channel)))[1]
+        except OSError:  # the interface has gone meanwhile
+            return ""
+        if length >= TX_QUEUE:
+            return ""
+        return f"; it holds {length} frames; type: {ip_line(f'{self.channel} txqueuelen {TX_QUEUE}')}"
 
     def _failed(self, error: OSError) -> InterfaceError:
         if error.errno == errno.ENETDOWN:
-            return _down(self.channel)
+            return _down(self.channel, self._setting)
         return InterfaceError(f"{self.channel}: interface lost: {error.strerror}")
 
     def _count_drops(self, which: int, rows: Sequence[Row]) -> None:
-        self._dropped[which] = max(self._dropped[which], rows[-1][3])
-        self.counters.overruns = sum(self._dropped)
+        dropped = max(0, rows[-1][3] - self._dropped[which])
+        self._dropped[which] += dropped
+        self.counters.overruns += dropped
 
     def _follow_clock(self, stamp_ns: int) -> None:
         if not 0 <= stamp_ns - self._calibrated_ns < _RECALIBRATE_NS:
             self._calibrated_ns = stamp_ns
             self._offset_ns = _realtime_minus_monotonic()
 
-    def _note_errors(self, rows: Sequence[Row]) -> None:
-        for can_id, data, _, _ in rows:
+    def _note_errors(self, rows: Sequence[Row], offset_ns: int) -> None:
+        for can_id, data, t_ns, _ in rows:
             if can_id & ERR_FLAG:
-                self.counters.error_frames += 1
-                self.state = _state_after(self.state, can_id, data)
+                self.counters.note_error(can_id, data)
+                self.state = state_after(self.state, can_id, data)
+                self._reports.error_frame(can_id, data, t_ns - offset_ns)
 
 
 def has_socketcan() -> bool:
@@ -237,8 +311,12 @@ def has_socketcan() -> bool:
     return True
 
 
-def check_interface(channel: str) -> None:
+def check_interface(channel: str, setting: str | None = None) -> None:
     """Return if `channel` is a CAN interface that is up.
+
+    Args:
+        channel: its name.
+        setting: the line that sets it up; None where it needs no setting.
 
     Raises:
         InterfaceError: it is not, with the line to type.
@@ -257,24 +335,18 @@ def check_interface(channel: str) -> None:
         except OSError as error:
             raise InterfaceError(f"{channel}: not a CAN interface: {error.strerror}") from error
         if not flags & _IFF_UP:
-            raise _down(channel)
+            raise _down(channel, setting or ip_line(f"{channel} up"))
 
 
-def check_fd(channel: str) -> None:
-    """Return if the interface carries CAN FD frames.
-
-    Raises:
-        InterfaceError: it does not, with the line to type.
-    """
+def _check_fd(channel: str, setting: str) -> None:
+    """Return if the interface carries CAN FD frames."""
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as probe:
         try:
             mtu = struct.unpack("=16si12x", fcntl.ioctl(probe, _SIOCGIFMTU, _ifreq(channel)))[1]
         except OSError as error:
             raise InterfaceError(f"{channel}: no such interface; {_how_to_make(channel)}") from error
     if mtu < _CANFD_MTU:
-        real = f"{channel} down && {_sudo()}ip link set {channel} up type can bitrate 1000000 dbitrate 5000000 fd on"
-        how = f"{channel} mtu {_CANFD_MTU}" if channel.startswith("v") else real
-        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {_sudo()}ip link set {how}")
+        raise InterfaceError(f"{channel}: not set up for CAN FD; type: {setting}")
 
 
 def _ifreq(channel: str) -> bytes:
@@ -284,20 +356,14 @@ def _ifreq(channel: str) -> bytes:
     return struct.pack("=16sH14x", name, 0)
 
 
-def _down(channel: str) -> InterfaceError:
-    options = "" if channel.startswith("v") else " type can bitrate 1000000"
-    return InterfaceError(f"{channel}: interface is down; type: {_sudo()}ip link set {channel} up{options}")
+def _down(channel: str, setting: str) -> InterfaceError:
+    return InterfaceError(f"{channel}: interface is down; type: {setting}")
 
 
 def _how_to_make(channel: str) -> str:
     if channel.startswith("vcan"):
-        sudo = _sudo()
-        return f"type: {sudo}ip link add dev {channel} type vcan && {sudo}ip link set {channel} up"
+        return f"type: {sudo()}ip link add dev {channel} type vcan && {setting_line(channel, 1_000_000)}"
     return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
-
-
-def _sudo() -> str:
-    return "" if os.geteuid() == 0 else "sudo "
 
 
 def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True, fd: bool = False) -> socket.socket:
@@ -343,23 +409,6 @@ def _realtime_minus_monotonic() -> int:
         after = time.monotonic_ns()
         readings.append((after - before, realtime - (before + after) // 2))
     return min(readings)[1]
-
-
-def _state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerState:
-    """Return the controller's state after an error frame. Source: Linux include/uapi/linux/can/error.h."""
-    if can_id & _CAN_ERR_BUSOFF:
-        return ControllerState.BUS_OFF
-    if can_id & _CAN_ERR_RESTARTED:
-        return ControllerState.ACTIVE
-    if can_id & _CAN_ERR_CRTL and len(data) > 1:
-        for bits, told in (
-            (_CRTL_PASSIVE, ControllerState.PASSIVE),
-            (_CRTL_WARNING, ControllerState.WARNING),
-            (_CRTL_ACTIVE, ControllerState.ACTIVE),
-        ):
-            if data[1] & bits:
-                return told
-    return state
 
 
 class _PollFd(ctypes.Structure):

@@ -28,7 +28,7 @@ from canprobe.bus.lockstep import (
     arbitration_key,
     name_of,
 )
-from canprobe.bus.port import ERR_FLAG, Frame
+from canprobe.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL, Frame
 from canprobe.bus.wire_errors import WireErrors
 from canprobe.protocol.frame_bits import (
     ERROR_DELIMITER_BITS,
@@ -41,8 +41,6 @@ Queue = Literal["priority", "fifo"]
 LINGER_NS = 50_000_000
 """How long a port that closes lets the bus carry what is queued, at most."""
 _NS = 1_000_000_000
-_PROTOCOL_VIOLATION = 0x088
-"""CAN_ERR_PROT and CAN_ERR_BUSERROR, as SocketCAN's error frames say it (linux/can/error.h)."""
 _RECESSIVE_BITS = 11
 _AFTER_ACK_BITS = (
     8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
@@ -363,7 +361,7 @@ class TimedBus(LockstepBus):
         """What was on the wire is lost: its sender tries again, unless that was once too often."""
         self.error_frames += 1
         if self.error_recorder is not None:
-            self.error_recorder(ERR_FLAG | _PROTOCOL_VIOLATION, bytes(CLASSIC_BYTES), t_ns)
+            self.error_recorder(ERR_FLAG | ERR_PROTOCOL | ERR_BUS, bytes(CLASSIC_BYTES), t_ns)
         sender = entry[2]
         self._controllers.fail(sender, t_ns)
         if self._controllers.is_off(sender):

@@ -161,7 +161,7 @@ CONDITIONS: tuple[Condition, ...] = (
     Condition(
         "error_frames",
         "bus error frames",
-        "every frame",
+        "every frame: protocol, acknowledgement, bit errors",
         Reaction.DEGRADE,
         _cycles(2),
         BY_ITSELF,
@@ -170,8 +170,8 @@ CONDITIONS: tuple[Condition, ...] = (
     ),
     Condition(
         "frames_dropped",
-        "frames dropped by the kernel",
-        "SO_RXQ_OVFL",
+        "frames dropped by the kernel or the controller",
+        "SO_RXQ_OVFL; overflow in an error frame",
         Reaction.DEGRADE,
         _cycles(2),
         BY_ITSELF,

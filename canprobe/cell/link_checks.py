@@ -1,22 +1,24 @@
-"""What is wrong with the setting of a SocketCAN interface, and the line that mends it.
-
-Sample points: CiA 301 recommends 87.5 % of the bit (85 to 90 %). Above 500 kbit/s, where 75 to 80 % is usual, 80 %.
-"""
+"""What is wrong with the setting of a SocketCAN interface, or its controller's state, and the line that mends it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from canprobe.bus.link import VIRTUAL, LinkState
+from canprobe.bus.link import (
+    FAST_SAMPLE,
+    SLOW_BIT_S,
+    SLOW_SAMPLE,
+    TX_QUEUE,
+    VIRTUAL,
+    LinkState,
+    emptying_line,
+    ip_line,
+    setting_line,
+)
 from canprobe.planning import Plan
 
-SLOW_BIT_S = 500_000
-SLOW_SAMPLE, FAST_SAMPLE = (0.85, 0.875, 0.90), (0.75, 0.80, 0.90)  # lowest, recommended, highest
 RATE_TOLERANCE = 0.005
-RESTART_MS, TX_QUEUE = 100, 1000
-PASSIVE = 128
-"""Error counter from which a controller is error-passive (ISO 11898-1)."""
 TERMINATION = "with the bus unpowered, 60 ohm between CAN_H and CAN_L are right, 120 is one terminator missing"
 
 
@@ -35,23 +37,30 @@ class Remark:
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """What a cell wants of an interface.
+    """What is wanted of an interface.
 
     Attributes:
         bitrate, data_bitrate: bit/s; the second of CAN FD, None without.
-        frames_at_once: that the master queues at one time, at most.
+        frames_at_once: that are queued at one time, at most; 0: nothing is sent.
+        of_scene: a scene says so; else whoever calls.
     """
 
     bitrate: int
     data_bitrate: int | None = None
     frames_at_once: int = 1
+    of_scene: bool = True
 
 
-def expected_of(plan: Plan, channel: str) -> Expected:
-    """What a plan wants: after a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO."""
+def expected_of(plan: Plan) -> dict[str, Expected]:
+    """What a plan wants of each of its channels.
+
+    After a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO.
+    """
     bus = plan.setup.bus
-    rpdos = {pdo.cob_id for pdo in plan.pdos if pdo.channel == channel and pdo.direction == "rpdo"}
-    return Expected(bus.bitrate, bus.data_bitrate if bus.fd is True else None, 2 * (len(rpdos) + 2))
+    fast = bus.data_bitrate if bus.fd is True else None
+    rpdos = {(pdo.channel, pdo.cob_id) for pdo in plan.pdos if pdo.direction == "rpdo"}
+    numbers = {one.channel: sum(channel == one.channel for channel, _ in rpdos) for one in plan.buses}
+    return {channel: Expected(bus.bitrate, fast, 2 * (number + 2)) for channel, number in numbers.items()}
 
 
 def check_link(link: LinkState, expected: Expected) -> list[Remark]:
@@ -62,15 +71,28 @@ def check_link(link: LinkState, expected: Expected) -> list[Remark]:
     return [remark for check in checks for remark in check(link, expected)]
 
 
-def setting(link: LinkState, expected: Expected) -> str:
-    """The line that sets an interface as a cell wants it."""
-    slow = expected.bitrate <= SLOW_BIT_S
-    sample = (SLOW_SAMPLE if slow else FAST_SAMPLE)[1]
-    fast = f" dbitrate {expected.data_bitrate} fd on" if expected.data_bitrate is not None else ""
-    return (
-        f"ip link set {link.name} down && ip link set {link.name} type can bitrate {expected.bitrate}"
-        f" sample-point {sample:g}{fast} restart-ms {RESTART_MS} && ip link set {link.name} txqueuelen {TX_QUEUE} up"
-    )
+def controller_trouble(link: LinkState, *, typed: bool = True) -> str | None:
+    """Why a controller cannot send, or hear, and what to do; None where its state is no reason.
+
+    Args:
+        link: with its state.
+        typed: `ip` can set it.
+    """
+    known = link.tx_errors is not None or link.rx_errors is not None
+    counters = f" (error counters: {link.tx_errors} transmit, {link.rx_errors} receive)" if known else ""
+    if link.state == "BUS-OFF":
+        look, line = f"check wiring, bit rate and termination ({TERMINATION})", _restart_line(link)
+    elif link.state == "ERROR-PASSIVE":
+        look, line = f"{_symptom(link)}; {TERMINATION}", f"then type: {emptying_line(link.name)}"
+    else:
+        return None
+    return f"{link.state.lower()}{counters}: {look}" + (f"; {line}" if typed else "")
+
+
+def _restart_line(link: LinkState) -> str:
+    if link.restart_ms:
+        return f"it restarts by itself every {link.restart_ms} ms"
+    return f"then type: {ip_line(f'{link.name} type can restart')}"
 
 
 def _rates(link: LinkState, expected: Expected) -> Iterator[Remark]:
@@ -79,37 +101,43 @@ def _rates(link: LinkState, expected: Expected) -> Iterator[Remark]:
         pairs.append(("data bit rate", link.data_bitrate, expected.data_bitrate))
     for what, have, want in pairs:
         if have is not None and abs(have - want) > RATE_TOLERANCE * want:
-            yield Remark(True, f"its {what} is {have} bit/s, the scene's {want}; type: {setting(link, expected)}")
+            whose = "the scene's" if expected.of_scene else "the one asked for"
+            yield Remark(True, f"its {what} is {have} bit/s, {whose} {want}; type: {_line(link, expected)}")
+
+
+def _line(link: LinkState, expected: Expected) -> str:
+    return setting_line(link.name, expected.bitrate, expected.data_bitrate)
 
 
 def _modes(link: LinkState, expected: Expected) -> Iterator[Remark]:
     name = link.name
     for mode, what in (("LISTEN-ONLY", "cannot send"), ("LOOPBACK", "hears only itself")):
-        if mode in link.modes:
-            off = f"ip link set {name} down && ip link set {name} type can {mode.lower()} off && ip link set {name} up"
+        if mode in link.modes and expected.frames_at_once:
+            off = ip_line(f"{name} down", f"{name} type can {mode.lower()} off", f"{name} up")
             yield Remark(True, f"it is in {mode.lower()} mode and {what}; type: {off}")
     if "ONE-SHOT" in link.modes:
         yield Remark(False, "it is in one-shot mode: a frame that loses the arbitration is not sent again")
 
 
 def _state(link: LinkState, _: Expected) -> Iterator[Remark]:
-    counters = f"error counters: {link.tx_errors} transmit, {link.rx_errors} receive"
-    if link.state == "BUS-OFF":
-        yield Remark(
-            True,
-            f"it is bus-off ({counters}): check wiring, bit rate and termination ({TERMINATION}),"
-            f" then type: ip link set {link.name} type can restart",
-        )
-    elif link.state in ("ERROR-PASSIVE", "ERROR-WARNING"):
-        yield Remark(False, f"it is {link.state.lower()} ({counters}): {_symptom(link)}; {TERMINATION}")
+    if (trouble := controller_trouble(link)) is not None:
+        yield Remark(link.state == "BUS-OFF", f"it is {trouble}")
+    elif link.state == "ERROR-WARNING":
+        counters = f"error counters: {link.tx_errors} transmit, {link.rx_errors} receive"
+        yield Remark(False, f"it is error-warning ({counters}): {_symptom(link)}; {TERMINATION}")
     elif link.bus_offs:
-        yield Remark(False, f"it was bus-off {link.bus_offs} times since it was made: look at wiring and termination")
+        times = "once" if link.bus_offs == 1 else f"{link.bus_offs} times"
+        yield Remark(False, f"it was bus-off {times} since it was made: look at wiring and termination")
 
 
 def _symptom(link: LinkState) -> str:
-    if (link.tx_errors or 0) > (link.rx_errors or 0):
-        return "nobody acknowledges what it sends: nodes without power, another bit rate, a broken wire"
-    return "frames arrive broken: another bit rate or sample point somewhere, or the termination"
+    """By its counters; a driver that does not tell them leaves both open."""
+    sent, heard = link.tx_errors or 0, link.rx_errors or 0
+    unheard = "nobody acknowledges what it sends: nodes without power, another bit rate, a broken wire"
+    broken = "frames arrive broken: another bit rate or sample point somewhere, or the termination"
+    if sent == heard:
+        return f"{unheard}; or {broken}"
+    return unheard if sent > heard else broken
 
 
 def _sample_point(link: LinkState, expected: Expected) -> Iterator[Remark]:
@@ -119,16 +147,15 @@ def _sample_point(link: LinkState, expected: Expected) -> Iterator[Remark]:
         yield Remark(
             False,
             f"it samples at {100 * point:.1f} % of the bit, {100 * best:g} % is recommended at"
-            f" {expected.bitrate} bit/s; type: {setting(link, expected)}",
+            f" {expected.bitrate} bit/s; type: {_line(link, expected)}",
         )
 
 
 def _restart(link: LinkState, expected: Expected) -> Iterator[Remark]:
-    if link.restart_ms == 0:
+    if link.restart_ms == 0 and expected.frames_at_once:
         yield Remark(
             False,
-            "restart-ms is 0: after a bus-off it stays off until somebody restarts it;"
-            f" type: {setting(link, expected)}",
+            f"restart-ms is 0: after a bus-off it stays off until somebody restarts it; type: {_line(link, expected)}",
         )
 
 
@@ -137,5 +164,5 @@ def _queue(link: LinkState, expected: Expected) -> Iterator[Remark]:
         yield Remark(
             False,
             f"its queue holds {link.tx_queue} frames, and {expected.frames_at_once} may be sent at once;"
-            f" type: ip link set {link.name} txqueuelen {TX_QUEUE}",
+            f" type: {ip_line(f'{link.name} txqueuelen {TX_QUEUE}')}",
         )

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.logfile import read_log
-from canprobe.bus.port import ERR_FLAG, TimedFrame
+from canprobe.bus.port import TimedFrame, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import SYNC_ID
@@ -33,7 +33,7 @@ class Recording:
         syncs: which of them are SYNCs.
         other: frames of this channel that are none of these.
         malformed: PDOs of a wrong length, left out.
-        error_frames: of all channels.
+        error_frames: bus errors on all channels.
     """
 
     path: Path
@@ -113,7 +113,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
             channel.frames.append((can_id, data, t_ns))
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1
-            error_frames += bool(can_id & ERR_FLAG)
+            error_frames += is_bus_error(can_id)
         elif len(data) != length:
             channel.malformed += 1
         else:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_id, node_ids, number_of_32_bits, whole
-from canprobe.cli.target import add_realtime, real_target, target_of, with_realtime
+from canprobe.cli.target import Target, add_realtime, real_target, target_of, with_realtime
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -105,6 +105,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
     _name_bus(args, scene.bus.channel)
     target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
+    channel = _channel_of(wanted, args, scene, target)
     if absent := sorted(set(args.without_id) - set(wanted)):
         raise UsageError(f"--without-id: {absent} is not among the nodes to serve, {list(wanted)}")
 
@@ -113,7 +114,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
     return lambda: api.emulate(
         scene,
         interface=target.interface,
-        channel=target.channel,
+        channel=channel,
         bitrate=target.bitrate,
         node_ids=wanted,
         seed=args.seed,
@@ -174,6 +175,19 @@ def _name_bus(args: argparse.Namespace, of_scene: str) -> None:
         raise UsageError(_NO_CHANNEL)
     args.bitrate = args.bitrate or bitrate
     args.channel = args.channel or [(of_scene, found)]
+
+
+def _channel_of(node_ids: tuple[int, ...], args: argparse.Namespace, scene: Scene, target: Target) -> str:
+    """The bus of these nodes: one without a name is for all of them, else each is on its own of the scene."""
+    if target.sensor_channel in (None, target.channel) or args.channel[0][0] is None:
+        return target.channel
+    sensors = [node_id for node_id in node_ids if scene.sensor is not None and node_id == scene.sensor.node_id]
+    if len(sensors) in (0, len(node_ids)):
+        return target.sensor_channel if sensors else target.channel
+    raise UsageError(
+        f"emulate: the scene has these nodes on two buses, {target.channel} and {target.sensor_channel}, and emulated"
+        " nodes share one plant: serve all of them on one, by --channel CH without a name, or those of one with --nodes"
+    )
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:

@@ -6,7 +6,7 @@ import argparse
 import sys
 
 from canprobe.bus.interrupts import Terminated
-from canprobe.cli.output import print_json
+from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds
 from canprobe.cli.target import target_of
 
@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
             sensor_channel=target.sensor_channel,
             bitrate=target.bitrate,
             duration_s=duration_s,
+            say=say,
         ):
             if on_terminal:
                 sys.stdout.write(screen(view))

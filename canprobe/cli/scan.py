@@ -10,7 +10,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.output import print_json, print_table
+from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene, channel, number_of_32_bits, whole, word
 from canprobe.cli.target import real_target
 from canprobe.errors import UsageError
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace) -> int:
     interface, name, bitrate = real_target(args.bus, args.channel[1], args.bitrate)
     where, rate = name or "can0", bitrate or 1_000_000
     if not args.lss:
-        nodes = api.scan(interface, where, rate)
+        nodes = api.scan(interface, where, rate, say=say)
         if args.json:
             print_json(nodes)
         else:
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
         from canprobe.scene_loader import load_scene
 
         scene = load_scene(args.scene)
-    done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store)
+    done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store, say=say)
     if args.json:
         print_json(done.as_document())
     else:

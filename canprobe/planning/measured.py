@@ -63,7 +63,7 @@ class MeasuredTraffic:
         classes: by kind.
         unlisted: identifiers that the plan does not list, with their counts; in the whole log.
         missing: planned PDOs that never came.
-        error_frames: in the whole log.
+        error_frames: bus errors in the whole log.
         planned_worst: load of the plan.
     """
 
@@ -84,8 +84,9 @@ class MeasuredTraffic:
 
     @property
     def as_planned(self) -> bool:
-        """Every class is, nothing is missing, and nothing else was on the bus."""
-        return not self.unlisted and not self.missing and all(one.as_planned for one in self.classes)
+        """Every class is, nothing is missing, nothing else was on the bus, and no frame went wrong."""
+        nothing_else = not self.unlisted and not self.missing and not self.error_frames
+        return nothing_else and all(one.as_planned for one in self.classes)
 
     def as_dict(self) -> dict[str, Any]:
         """As JSON types."""

@@ -5,7 +5,7 @@ import pytest
 
 from canprobe.bus.candump import format_line, read_candump
 from canprobe.bus.logfile import FOREIGN, convert_log, read_log
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG
+from canprobe.bus.port import EFF_FLAG, ERR_FLAG, RTR_FLAG, is_bus_error
 from canprobe.cli import main
 from canprobe.errors import UsageError
 
@@ -51,6 +51,16 @@ def test_there_and_back(candump, tmp_path, suffix):
     assert [frame[0] - frames[0][0] for frame in frames] == [frame[0] for frame in FRAMES]
     if suffix == ".blf":
         assert (tmp_path / "back.log").read_bytes() == candump.read_bytes()
+
+
+@pytest.mark.parametrize("suffix", [".blf", ".asc"])
+def test_an_error_frame_stays_one_though_its_class_is_lost(tmp_path, suffix):
+    log = tmp_path / "bus.log"
+    error = (1_000_000, "can0", ERR_FLAG | 0x088, bytes(8))
+    log.write_text("".join(format_line(name, i, data, t_ns) for t_ns, name, i, data in (FRAMES[0], error)))
+    convert_log(log, tmp_path / f"there{suffix}")
+    (_, _, can_id, _) = list(read_log(tmp_path / f"there{suffix}"))[-1]
+    assert is_bus_error(can_id)
 
 
 def test_what_is_no_log_is_refused_and_leaves_nothing(candump, tmp_path):

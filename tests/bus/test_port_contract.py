@@ -5,12 +5,13 @@ from __future__ import annotations
 import uuid
 from collections.abc import Callable, Iterator
 
+import can
 import pytest
 
 from canprobe.bus.clock import MonotonicClock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.open import open_port
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Port, TimedFrame
+from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Port, Reports, TimedFrame
 from canprobe.bus.pythoncan import PythonCanPort
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import BusError, InterfaceError, UsageError
@@ -168,6 +169,23 @@ def test_closing_twice_is_allowed_and_everything_else_is_not(ports: tuple[Port, 
     for use in (lambda: one.send_batch([(1, b"")]), one.drain, lambda: one.wait(0)):
         with pytest.raises(InterfaceError, match=f"{one.channel}: this port is closed"):
             use()
+
+
+def test_error_frames_without_classes_are_bus_errors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """pcan's 1, 2, 4 and 8 are bit, form, stuff and other errors: nothing that Linux means by these bits."""
+    told = []
+    reports = Reports(error_frame=lambda can_id, data, _: told.append((can_id, data)))
+    port = PythonCanPort("virtual", "classless", BITRATE, MonotonicClock(), reports=reports)
+    with can.Bus(interface="virtual", channel="classless") as other:
+        for arbitration_id in (1, 2, 4):
+            other.send(can.Message(arbitration_id=arbitration_id, is_error_frame=True))
+        assert port.drain() == [] and port.state is ControllerState.ACTIVE
+        monkeypatch.setattr(can.BusABC, "state", can.BusState.PASSIVE)
+        other.send(can.Message(arbitration_id=8, is_error_frame=True))
+        assert port.drain() == [] and port.state is ControllerState.PASSIVE
+    assert told == [(0x20000080, b"")] * 4
+    assert (port.counters.error_frames, port.counters.overruns, port.counters.received) == (4, 0, 0)
+    port.close()
 
 
 def test_the_port_names_itself(ports: tuple[Port, Port]) -> None:

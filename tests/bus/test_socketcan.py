@@ -16,7 +16,7 @@ import pytest
 from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.guest_setup import make_link, remove_link, set_link
 from canprobe.bus.mmsg import Row
-from canprobe.bus.port import EFF_FLAG, ERR_FLAG, ControllerState, Frame, TimedFrame
+from canprobe.bus.port import EFF_FLAG, ERR_FLAG, ControllerState, Frame, Reports, TimedFrame
 from canprobe.bus.pythoncan import PythonCanPort
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
@@ -101,37 +101,61 @@ def test_dropped_frames_are_counted(vcan0: str, batched: bool) -> None:
     late.close()
 
 
+ACTIVE, WARNING, PASSIVE, OFF = ControllerState
+
+
 @pytest.mark.parametrize(
-    ("can_id", "data", "state"),
-    [
-        (0x040, bytes(8), ControllerState.BUS_OFF),
-        (0x004, bytes([0, 0x20, 0, 0, 0, 0, 0, 0]), ControllerState.PASSIVE),
-        (0x004, bytes([0, 0x08, 0, 0, 0, 0, 0, 0]), ControllerState.WARNING),
-        (0x002, bytes(8), ControllerState.ACTIVE),
+    ("can_id", "data", "expected"),
+    [  # linux/can/error.h: class bits, the second byte of CAN_ERR_CRTL → bus errors, lost frames, state
+        pytest.param(0x008, b"", (1, 0, ACTIVE), id="PROT"),
+        pytest.param(0x020, b"", (1, 0, ACTIVE), id="ACK"),
+        pytest.param(0x080, b"", (1, 0, ACTIVE), id="BUSERROR"),
+        pytest.param(0x0A8, b"", (1, 0, ACTIVE), id="PROT+ACK+BUSERROR"),
+        pytest.param(0x08C, b"\0\x20", (1, 0, PASSIVE), id="BUSERROR+TX_PASSIVE"),
+        pytest.param(0x001, b"", (0, 0, ACTIVE), id="TX_TIMEOUT"),
+        pytest.param(0x002, b"", (0, 0, ACTIVE), id="LOSTARB"),
+        pytest.param(0x010, b"", (0, 0, ACTIVE), id="TRX"),
+        pytest.param(0x004, b"\0\x01", (0, 1, ACTIVE), id="RX_OVERFLOW"),
+        pytest.param(0x004, b"\0\x02", (0, 1, ACTIVE), id="TX_OVERFLOW"),
+        pytest.param(0x004, b"\0\x04", (0, 0, WARNING), id="RX_WARNING"),
+        pytest.param(0x004, b"\0\x08", (0, 0, WARNING), id="TX_WARNING"),
+        pytest.param(0x204, b"\0\x10\0\0\0\0\0\x80", (0, 0, PASSIVE), id="RX_PASSIVE+CNT"),
+        pytest.param(0x004, b"\0\x20", (0, 0, PASSIVE), id="TX_PASSIVE"),
+        pytest.param(0x040, b"", (0, 0, OFF), id="BUSOFF"),
     ],
 )
-def test_error_frames_are_counted_not_passed_on(
-    vcan0: str, batched: bool, can_id: int, data: bytes, state: ControllerState
+def test_error_frames_are_read_by_their_classes(
+    vcan0: str, can_id: int, data: bytes, expected: tuple[int, int, ControllerState]
 ) -> None:
-    port = SocketCanPort(vcan0, MonotonicClock(), batched=batched)
-    portable = PythonCanPort("socketcan", vcan0, 1_000_000, MonotonicClock())
+    told: list[tuple[int, bytes]] = []
+    clock, reports = MonotonicClock(), Reports(error_frame=lambda i, d, _: told.append((i, d)))
+    ports = [SocketCanPort(vcan0, clock, batched=batched, reports=reports) for batched in (True, False)]
+    ports.append(PythonCanPort("socketcan", vcan0, 1_000_000, clock, reports=reports))
     with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as raw:
         raw.bind((vcan0,))
-        raw.send(struct.pack("=IB3x8s", can_id | ERR_FLAG, 8, data))
-        raw.send(struct.pack("=IB3x8s", 0x123, 0, b""))
-    assert [i for i, _, _ in receive(port, 1)] == [0x123]
-    assert [i for i, _, _ in receive(portable, 1)] == [0x123]
-    assert (port.counters.error_frames, port.state) == (1, state)
-    assert portable.counters.error_frames == 1
-    port.close()
-    portable.close()
+
+        def send(*frames: Frame) -> None:
+            for i, d in (*frames, (0x123, b"")):
+                raw.send(struct.pack("=IB3x8s", i, 8, d))
+            for port in ports:
+                assert [i for i, _, _ in receive(port, 1)] == [0x123], "error frames are no frames"
+
+        send((can_id | ERR_FLAG, data))
+        assert told == [(can_id | ERR_FLAG, data.ljust(8, b"\0"))] * 3
+        assert [(p.counters.error_frames, p.counters.overruns, p.state) for p in ports] == [expected] * 3
+        send((0x004 | ERR_FLAG, b"\0\x40"))
+        assert [p.state for p in ports] == [ACTIVE] * 3
+        send((0x040 | ERR_FLAG, b""), (0x100 | ERR_FLAG, b""))
+        assert [p.state for p in ports] == [ACTIVE] * 3, "bus-off, then restarted"
+    for port in ports:
+        port.close()
 
 
 class FullQueue:
-    """Says ENOBUFS a number of times, then takes two frames a call."""
+    """Refuses frames a number of times, then takes two frames a call."""
 
-    def __init__(self, full: int) -> None:
-        self.full, self.taken = full, list[Frame]()
+    def __init__(self, full: int, number: int = errno.ENOBUFS) -> None:
+        self.full, self.taken, self.number = full, list[Frame](), number
 
     def receive(self) -> list[Row]:
         return []
@@ -139,7 +163,7 @@ class FullQueue:
     def send(self, frames: Sequence[Frame]) -> int:
         if self.full:
             self.full -= 1
-            raise OSError(errno.ENOBUFS, os.strerror(errno.ENOBUFS))
+            raise OSError(self.number, os.strerror(self.number))
         self.taken += frames[:2]
         return len(frames[:2])
 
@@ -150,9 +174,25 @@ def test_a_full_queue_is_waited_for_then_an_error(vcan0: str) -> None:
     port._frames = queue = FullQueue(3)
     port.send_batch(batch)
     assert (queue.taken, port.counters.transmit_full, port.counters.sent) == (batch, 3, 5)
-    port._frames = FullQueue(10**6)
-    with pytest.raises(InterfaceError, match=r"vcan0: the transmit queue stays full, 5 frames.*txqueuelen 1000"):
-        port.send_batch(batch)
+    port.close()
+
+
+def test_what_stays_full_is_named_and_a_longer_queue_advised_where_it_is_short(link: str) -> None:
+    port = SocketCanPort(link, MonotonicClock())
+    why = "stays full, as nobody acknowledges or the bus is overloaded, 5 frames not sent"
+    queue, buffer = f"vcan7: the transmit queue {why}", f"vcan7: the socket's send buffer {why}"
+    short = f"{queue}; it holds 10 frames; type: ip link set vcan7 txqueuelen 1000"
+    for length, number, told in (
+        (10, errno.ENOBUFS, short),
+        (1000, errno.ENOBUFS, queue),
+        (10, errno.EAGAIN, buffer),
+        (1000, errno.EAGAIN, buffer),
+    ):
+        subprocess.run(["ip", "link", "set", link, "txqueuelen", str(length)], check=True)
+        port._frames = FullQueue(10**6, number)
+        with pytest.raises(InterfaceError) as caught:
+            port.send_batch([(0x100 + k, b"") for k in range(5)])
+        assert str(caught.value) == told
     port.close()
 
 

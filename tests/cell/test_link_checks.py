@@ -10,8 +10,11 @@ import pytest
 
 import canprobe
 import canprobe.cli
-from canprobe.bus.link import LinkState, parse_link, read_link
-from canprobe.cell.link_checks import Expected, check_link, expected_of, setting
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.link import LinkState, parse_link, read_link, setting_line
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import ControllerState
+from canprobe.cell.link_checks import Expected, check_link, expected_of
 from canprobe.errors import InterfaceError
 from canprobe.link_report import check_links
 
@@ -89,7 +92,8 @@ def test_a_good_link_and_a_virtual_one_have_no_remarks():
         ({"state": "ERROR-PASSIVE", "tx_errors": 128}, False, ("error-passive", "nobody acknowledges", "60 ohm")),
         ({"state": "ERROR-PASSIVE", "rx_errors": 135}, False, ("error-passive", "frames arrive broken", "60 ohm")),
         ({"state": "ERROR-WARNING", "rx_errors": 97}, False, ("error-warning", "97 receive")),
-        ({"bus_offs": 3}, False, ("bus-off 3 times",)),
+        ({"bus_offs": 3}, False, ("it was bus-off 3 times since",)),
+        ({"bus_offs": 1}, False, ("it was bus-off once since",)),
         ({"modes": ("LISTEN-ONLY",)}, True, ("listen-only mode and cannot send", "listen-only off")),
         ({"modes": ("LOOPBACK",)}, True, ("hears only itself", "loopback off")),
         ({"modes": ("ONE-SHOT",)}, False, ("one-shot",)),
@@ -106,7 +110,7 @@ def test_each_wrong_setting_is_told_with_what_mends_it(change, is_error, words):
 def test_the_sample_point_of_slow_buses_is_that_of_cia_301(bitrate, point, good):
     link = replace(GOOD, bitrate=bitrate, sample_point=point)
     assert bool(texts(link, Expected(bitrate))) is not good
-    assert "sample-point 0.875 " in setting(link, Expected(bitrate))
+    assert "sample-point 0.875 " in setting_line("can0", bitrate)
 
 
 @pytest.mark.parametrize(("point", "good"), [(0.74, False), (0.75, True), (0.8, True), (0.875, True)])
@@ -125,10 +129,10 @@ def test_all_that_is_wrong_with_a_fd_link_is_told():
 def test_a_plan_says_how_many_frames_go_at_once():
     """Twice SYNC, heartbeat and the RPDOs: six, or with grouped targets six controlwords and three targets."""
     plan = canprobe.plan(canprobe.load_scene("free"))
-    assert expected_of(plan, "can0") == Expected(1_000_000, None, 16)
+    assert expected_of(plan) == {"can0": Expected(1_000_000, None, 16)}
     grouped = replace(plan.scene, arm=replace(plan.scene.arm, grouped_rpdo=True))
-    assert expected_of(canprobe.plan(grouped), "can0").frames_at_once == 22
-    assert expected_of(canprobe.plan(canprobe.load_scene("listen")), "can0").frames_at_once == 4
+    assert expected_of(canprobe.plan(grouped))["can0"].frames_at_once == 22
+    assert expected_of(canprobe.plan(canprobe.load_scene("listen")))["can0"].frames_at_once == 4
 
 
 @pytest.fixture
@@ -146,9 +150,10 @@ def ip(monkeypatch):
     return answers
 
 
-def on_socketcan(name="free", channel="can0", **bus):
-    scene = canprobe.load_scene(name)
-    return canprobe.plan(replace(scene, bus=replace(scene.bus, interface="socketcan", channel=channel, **bus)))
+def check(channel="can0", **how):
+    said = []
+    check_links("socketcan", {channel: EXPECTED}, said.append, **how)
+    return said
 
 
 def test_a_wrong_bit_rate_ends_it_and_the_rest_is_said(ip):
@@ -157,43 +162,168 @@ def test_a_wrong_bit_rate_ends_it_and_the_rest_is_said(ip):
     with pytest.raises(
         InterfaceError, match=r"^can0: its bit rate is 250000 bit/s, the scene's 1000000; type: ip link"
     ):
-        check_links(on_socketcan(), said.append)
+        check_links("socketcan", {"can0": EXPECTED}, said.append)
     assert len(said) == 1 and said[0].startswith("warning: can0: it is error-passive")
+    said = check(must=False)
+    assert [line.partition(" is ")[0] for line in said] == ["warning: can0: its bit rate", "warning: can0: it"]
 
 
-def test_a_virtual_interface_says_that_it_has_no_bit_rate_and_no_more(ip):
+def test_who_sends_nothing_needs_no_queue_no_restart_and_no_mode_to_send_in():
+    link = replace(GOOD, tx_queue=1, restart_ms=0, modes=("LISTEN-ONLY",))
+    assert len(texts(link)) == 3 and texts(link, replace(EXPECTED, frames_at_once=0)) == []
+
+
+def test_of_a_virtual_interface_nothing_is_said(ip):
     ip["vcan0"] = (VCAN, "")
-    said = []
-    check_links(on_socketcan(channel="vcan0"), said.append)
-    assert said == ["vcan0: virtual, without a bit rate"]
+    assert check("vcan0") == []
 
 
 def test_without_ip_it_says_so(ip):
-    said = []
     ip["can0"] = (None, "")
-    check_links(on_socketcan(), said.append)
+    said = check()
     ip["can0"] = ("not JSON", "")
-    check_links(on_socketcan(), said.append)
-    assert said == ["can0: its setting is not checked: `ip` of iproute2 does not tell it"] * 2
+    assert said == check() == ["can0: its setting is not checked: `ip` of iproute2 does not tell it"]
     assert read_link("can0") is None
 
 
 def test_other_buses_and_interfaces_that_are_down_or_missing_are_left_to_who_opens_them(ip):
-    said = []
-    check_links(canprobe.plan(canprobe.load_scene("free")), said.append)
+    check_links("pcan", {"PCAN_USBBUS1": EXPECTED}, pytest.fail)
     ip["can0"] = (PASSIVE.replace('"NOARP","UP"', '"NOARP"'), "")
-    check_links(on_socketcan(), said.append)
+    assert check() == []
     del ip["can0"]
-    check_links(on_socketcan(), said.append)
-    assert said == []
+    assert check() == []
 
 
-def test_up_stops_at_a_wrong_bit_rate_before_anything_is_sent(ip, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("name", "rates", "line"),
+    [
+        (
+            "can0",
+            (500_000,),
+            "ip link set can0 down && ip link set can0 type can bitrate 500000 sample-point 0.875 restart-ms 100"
+            " && ip link set can0 txqueuelen 1000 up",
+        ),
+        (
+            "can1",
+            (1_000_000, 5_000_000),
+            "ip link set can1 down && ip link set can1 type can bitrate 1000000 sample-point 0.8 dbitrate 5000000 fd on"
+            " restart-ms 100 && ip link set can1 txqueuelen 1000 up",
+        ),
+        ("vcan0", (500_000,), "ip link set vcan0 up"),
+        ("vcan0", (500_000, 2_000_000), "ip link set vcan0 down && ip link set vcan0 mtu 72 up"),
+    ],
+)
+def test_the_line_that_sets_an_interface_is_whole(name, rates, line, monkeypatch):
+    monkeypatch.setattr("os.geteuid", lambda: 0)
+    assert setting_line(name, *rates) == line
+    monkeypatch.setattr("os.geteuid", lambda: 1000)
+    assert setting_line(name, *rates) == line.replace("ip link", "sudo ip link")
+
+
+WAYS_ONTO_A_BUS = {
+    "run": ("run", "free", "--bus", "socketcan", "--channel", "can0"),
+    "up": ("up", "free", "--bus", "socketcan", "--channel", "can0"),
+    "first motion": ("up", "free", "--check-joints", "--yes", "--bus", "socketcan", "--channel", "can0"),
+    "emulate": ("emulate", "free", "--channel", "can0"),
+    "emulate --eds": ("emulate", "--eds", "puma260_joint", "--node-id", "1", "--channel", "can0"),
+}
+
+
+@pytest.mark.parametrize("words", WAYS_ONTO_A_BUS.values(), ids=WAYS_ONTO_A_BUS)
+def test_whatever_sends_stops_at_a_wrong_bit_rate_before_it_opens_the_bus(ip, words, monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
     opened = []
     monkeypatch.setattr("canprobe.bus.open.open_port", lambda *args, **_: opened.append(args))
     ip["can0"] = (PASSIVE, "")
-    assert canprobe.cli.main(["up", "free", "--bus", "socketcan", "--channel", "can0"]) == 3
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("warning: can0: it is error-passive")
-    assert lines[1].startswith("canprobe: can0: its bit rate is 250000 bit/s") and len(lines) == 2
-    assert opened == []
+    assert canprobe.cli.main(words) == 3
+    *_, line = capsys.readouterr().err.splitlines()
+    whose = "the one asked for" if "--eds" in words else "the scene's"
+    setting = setting_line("can0", 1_000_000)
+    assert line == f"canprobe: can0: its bit rate is 250000 bit/s, {whose} 1000000; type: {setting}"
+    assert opened == [] and list(tmp_path.iterdir()) == []
+
+
+def state(name, transmit=0, receive=0):
+    """What `ip` prints of an interface with the right bit rate and this state."""
+    counters = f'"berr_counter":{{"tx":{transmit},"rx":{receive}}}'
+    return (
+        PASSIVE.replace('"berr_counter":{"tx":0,"rx":135}', counters)
+        .replace("ERROR-PASSIVE", name)
+        .replace('"bitrate":250000', '"bitrate":1000000')
+    )
+
+
+@pytest.fixture
+def silent_bus(ip, monkeypatch):
+    """can0 in the time of its own clock, with nobody on it."""
+    bus = LockstepBus(VirtualClock())
+    monkeypatch.setattr("canprobe.bus.open.open_port", lambda *_, **__: bus.port())
+    monkeypatch.setattr("canprobe.bus.clock.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.session.MonotonicClock", lambda: bus.clock)
+    return bus
+
+
+LOOKS = {
+    "scan": (("scan", "--channel", "can0"), "no node answers on can0"),
+    "scan --lss": (("scan", "--lss", "--channel", "can0"), "no node answers on can0"),
+    "monitor": (("monitor", "free", "--bus", "socketcan", "--channel", "can0", "--duration", "2"), "not heard"),
+}
+
+
+@pytest.mark.parametrize(("words", "told"), LOOKS.values(), ids=LOOKS)
+def test_whoever_only_looks_is_warned_of_a_wrong_bit_rate_and_goes_on(ip, silent_bus, words, told, capsys):
+    ip["can0"] = (state("ERROR-ACTIVE").replace('"bitrate":1000000', '"bitrate":250000'), "")
+    assert canprobe.cli.main(words) == 0
+    captured = capsys.readouterr()
+    assert captured.err.startswith("warning: can0: its bit rate is 250000 bit/s, ") and told in captured.out
+
+
+RESTART, EMPTY = (
+    "then type: ip link set can0 type can restart",
+    "then type: ip link set can0 down && ip link set can0 up",
+)
+UNHEARD, BROKEN = "nobody acknowledges what it sends", "frames arrive broken"
+TROUBLES = [
+    (state("ERROR-PASSIVE", 128), ("error-passive (error counters: 128 transmit, 0 receive)", UNHEARD, EMPTY)),
+    (state("ERROR-PASSIVE", 0, 135), ("error-passive (error counters: 0 transmit, 135 receive)", BROKEN, EMPTY)),
+    (state("BUS-OFF", 256).replace('"restart_ms":100', '"restart_ms":0'), ("bus-off (error", "check wiring", RESTART)),
+    (state("BUS-OFF", 256), ("bus-off (error", "check wiring", "restarts by itself every 100 ms")),
+]
+
+
+@pytest.mark.parametrize("trouble", TROUBLES)
+@pytest.mark.parametrize("words", [words for words, _ in LOOKS.values()], ids=LOOKS)
+def test_a_silent_bus_whose_controller_is_in_trouble_is_no_empty_bus(ip, silent_bus, words, trouble, capsys):
+    printed, told = trouble
+    ip["can0"] = (printed, "")
+    assert canprobe.cli.main(words) == 3
+    *_, line = capsys.readouterr().err.splitlines()
+    assert line.startswith("canprobe: can0: its CAN controller is ") and all(part in line for part in told), line
+
+
+@pytest.mark.parametrize(("printed", "told"), [TROUBLES[0], TROUBLES[2]])
+def test_a_bring_up_that_fails_names_the_controllers_state(ip, silent_bus, printed, told, monkeypatch):
+    """It was well when it was looked at; nobody answered the resets."""
+    ip["can0"] = (state("ERROR-ACTIVE"), "")
+    monkeypatch.setattr("canprobe.rehearsal.rehearse", lambda plan: ip.update(can0=(printed, "")))
+    scene = canprobe.load_scene("free")
+    scene = replace(scene, arm=replace(scene.arm, emulated=False))
+    with pytest.raises(InterfaceError, match=r"^can0: its CAN controller is ") as caught:
+        canprobe.run(scene, interface="socketcan", files=False)
+    assert all(part in str(caught.value) for part in (*told, "; node 1: (joint 1) sent no boot-up"))
+    assert caught.value.summary["stop_reason"] == str(caught.value)
+
+
+def test_where_ip_tells_no_state_the_last_error_frame_does(ip, silent_bus, monkeypatch, capsys):
+    ip["can0"] = (None, "")
+    port = silent_bus.port()
+    port.state = ControllerState.PASSIVE
+    monkeypatch.setattr("canprobe.bus.open.open_port", lambda *_, **__: port)
+    assert canprobe.cli.main(["scan", "--channel", "can0"]) == 3
+    *_, line = capsys.readouterr().err.splitlines()
+    assert "can0: its CAN controller is error-passive: nobody acknowledges what it sends" in line and EMPTY in line
+    port = silent_bus.port()
+    port.state = ControllerState.BUS_OFF
+    assert canprobe.cli.main(["scan", "--bus", "pcan", "--channel", "PCAN_USBBUS1"]) == 3
+    *_, line = capsys.readouterr().err.splitlines()
+    assert "PCAN_USBBUS1: its CAN controller is bus-off: check wiring" in line and "type" not in line

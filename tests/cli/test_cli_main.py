@@ -289,6 +289,49 @@ def test_emulate_serves_what_the_scene_marks(scene, nodes, calls):
     assert calls[0][2]["node_ids"] == nodes
 
 
+ON_TWO_BUSES = """\
+[scene]
+name = "two"
+[bus]
+channel = "arm"
+[arm]
+[sensor]
+channel = "touch"
+[object]
+kind = "plane"
+[task]
+kind = "press"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "channel", "nodes"),
+    [
+        ("--channel vcan0", "vcan0", (1, 2, 3, 4, 5, 6, 16)),
+        ("--channel vcan0 --nodes 16", "vcan0", (16,)),
+        ("--channel arm=x --channel touch=y --nodes 1-6", "x", (1, 2, 3, 4, 5, 6)),
+        ("--channel arm=x --channel touch=y --nodes 16", "y", (16,)),
+        ("--channel touch=y --nodes 16", "y", (16,)),
+        ("--channel arm=x --nodes 2", "x", (2,)),
+        ("--channel arm=x --channel touch=x", "x", (1, 2, 3, 4, 5, 6, 16)),
+    ],
+)
+def test_emulate_serves_each_node_on_its_own_bus(words, channel, nodes, calls, tmp_path):
+    (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
+    assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 0
+    assert (calls[0][2]["channel"], calls[0][2]["node_ids"]) == (channel, nodes)
+
+
+@pytest.mark.parametrize(
+    "words", ["--channel arm=x --channel touch=y", "--channel touch=y", "--channel arm=x --nodes 1,16"]
+)
+def test_emulate_drops_no_bus_without_a_word(words, calls, tmp_path, capsys):
+    (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
+    assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "on two buses" in line and "share one plant" in line and "--nodes" in line and calls == []
+
+
 def test_scan_prints_a_table_or_json(calls, capsys):
     assert main(["scan", "--channel", "vcan0", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)[0]["vendor_id"] == 0xCA5E
@@ -296,7 +339,7 @@ def test_scan_prints_a_table_or_json(calls, capsys):
     header, row = capsys.readouterr().out.splitlines()
     assert header.split() == ["node_id", "state", "vendor_id", "product_code"]
     assert row.split() == ["1", "pre-operational", "0xca5e", "-"]
-    assert calls[0] == ("scan", ("socketcan", "vcan0", 1_000_000), {})
+    assert calls[0][:2] == ("scan", ("socketcan", "vcan0", 1_000_000))
 
 
 def test_scenes(capsys):

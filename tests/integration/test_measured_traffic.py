@@ -9,9 +9,12 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.bus.clock import VirtualClock
+from canprobe.bus.lockstep import LockstepBus
 from canprobe.cell.build import make_task
 from canprobe.cell.recording import read_recording
 from canprobe.cli import main
+from canprobe.emulator.build import make_world
 from canprobe.errors import UsageError
 from canprobe.session import Session, resolve_scene
 
@@ -105,15 +108,69 @@ def test_a_bus_with_errors_carries_every_frame_and_the_same_seed_the_same_errors
     buses = [session.lockstep for session in (first, second)]
     assert buses[0].error_frames / buses[0].frames == pytest.approx(110 * 1e-4, rel=0.3)
     assert (buses[0].frames, buses[0].error_frames) == (buses[1].frames, buses[1].error_frames)
-    assert first.meters["can0"].report().as_planned
+    assert all(one.as_planned for one in first.meters["can0"].report().classes)
     assert first.cell.drives.missed == 0
     measured = canprobe.measure_traffic(tmp_path, first.plan)
     assert measured.error_frames == first.meters["can0"].report().error_frames == buses[0].error_frames > 0
-    assert measured.as_planned and f"error frames: {measured.error_frames}" in measured.text()
+    assert not measured.as_planned and f"error frames: {measured.error_frames}" in measured.text()
     lines = [line for line in (tmp_path / "bus.log").read_text().splitlines() if " 20000088#" in line]
     assert len(lines) == measured.error_frames
     recording = read_recording(tmp_path / "bus.log", first.plan, as_taken=False)
     assert recording.error_frames == measured.error_frames
+
+
+@pytest.fixture
+def real_bus(monkeypatch):
+    """can0 as a cell opens a real one, in virtual time and with the nodes of `free` on it; yields (scene, reports)."""
+    scene = canprobe.load_scene("free")
+    arm = dataclasses.replace(scene.arm, emulated=False)
+    scene = resolve_scene(dataclasses.replace(scene, arm=arm), interface="socketcan", duration_s=0.3)
+    bus, reports = LockstepBus(VirtualClock()), []
+    for node in make_world(canprobe.plan(scene), scene.arm.node_ids).nodes:
+        bus.attach(node)
+
+    def open_port(*_, **options):
+        reports.append(options["reports"])
+        return bus.port()
+
+    monkeypatch.setattr("canprobe.bus.open.open_port", open_port)
+    monkeypatch.setattr("canprobe.session.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.session.check_links", lambda *_: None)
+    return scene, reports
+
+
+LOST_ARBITRATION, NO_ACKNOWLEDGEMENT, STUFF_ERROR = 0x20000002, 0x200000A8, 0x20000088
+
+
+def errors_once(reports):
+    """To be called as progress: two errors and a lost arbitration, in the first cycle."""
+    told = []
+
+    def progress(done_s, _):
+        if not told:
+            for can_id in (LOST_ARBITRATION, NO_ACKNOWLEDGEMENT, STUFF_ERROR):
+                reports[0].error_frame(can_id, bytes(8), round(done_s * 1e9))
+                told.append(can_id)
+
+    return progress
+
+
+def test_error_frames_of_a_real_bus_are_in_the_log_and_beside_the_plan(real_bus, tmp_path):
+    scene, reports = real_bus
+    result = canprobe.run(scene, out=tmp_path, progress=errors_once(reports))
+    traffic = result.summary["traffic"]["can0"]
+    assert (traffic["error_frames"], traffic["as_planned"]) == (2, False)
+    assert all(one["as_planned"] for one in traffic["classes"].values())
+    logged = [line.split()[2] for line in (tmp_path / "bus.log").read_text().splitlines() if " 2000" in line]
+    assert logged == [f"{can_id:08X}#{'00' * 8}" for can_id in (LOST_ARBITRATION, NO_ACKNOWLEDGEMENT, STUFF_ERROR)]
+    assert read_recording(tmp_path / "bus.log", result.plan, as_taken=True).error_frames == 2
+
+
+@pytest.mark.parametrize(("errors", "as_planned"), [(2, False), (0, None)])
+def test_without_a_log_the_errors_of_a_real_bus_are_counted_all_the_same(real_bus, errors, as_planned):
+    scene, reports = real_bus
+    result = canprobe.run(scene, files=False, progress=errors_once(reports) if errors else None)
+    assert result.summary["traffic"] == {"can0": {"as_planned": as_planned, "error_frames": errors}}
 
 
 def test_a_run_on_a_bus_with_errors_says_so():

@@ -15,6 +15,7 @@ from canprobe.errors import InterfaceError
 
 pytestmark = pytest.mark.vcan
 CHANNEL = "vcanfd0"
+FAST = 5_000_000
 LONG = bytes(range(64))
 
 
@@ -46,7 +47,9 @@ def heard(port: SocketCanPort, count: int) -> list[tuple[int, bytes]]:
 @pytest.mark.parametrize("batched", [True, False])
 def test_long_frames_pass_and_a_classical_socket_is_spared_them(fd_channel: str, batched: bool) -> None:
     clock = MonotonicClock()
-    one, two, classic = (SocketCanPort(fd_channel, clock, batched=batched, fd=fd) for fd in (True, True, False))
+    one, two, classic = (
+        SocketCanPort(fd_channel, clock, batched=batched, data_bitrate=fast) for fast in (FAST, FAST, None)
+    )
     frames = [(0x181, b"\x01"), (0x512, LONG), (0x513, LONG[:12]), (0x80, b"")]
     try:
         one.send_batch(frames)
@@ -61,7 +64,7 @@ def test_long_frames_pass_and_a_classical_socket_is_spared_them(fd_channel: str,
 
 def test_deferred_frames_may_be_long_too(fd_channel: str) -> None:
     clock = MonotonicClock()
-    one, two = (SocketCanPort(fd_channel, clock, fd=True) for _ in range(2))
+    one, two = (SocketCanPort(fd_channel, clock, data_bitrate=FAST) for _ in range(2))
     try:
         two.defer([0x512])
         one.send_batch([(0x512, LONG), (0x80, b"\x01")])
@@ -76,7 +79,7 @@ def test_an_interface_without_fd_says_what_to_type(vcan0: str) -> None:
     if mtu >= 72:
         pytest.skip(f"{vcan0} carries CAN FD here")
     with pytest.raises(InterfaceError, match=f"ip link set {vcan0} mtu 72"):
-        SocketCanPort(vcan0, MonotonicClock(), fd=True)
+        SocketCanPort(vcan0, MonotonicClock(), data_bitrate=FAST)
 
 
 def test_the_full_image_beside_the_arm_in_two_processes(bench: Any, fd_channel: str) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 from typing import Any
 
 import pytest
 
 import canprobe
 from canprobe.bus.candump import CandumpWriter
+from canprobe.bus.port import ERR_FLAG
 
 pytestmark = pytest.mark.vcan
 SECONDS = 4
+ERROR_FRAMES = (0x20000002, 0x20000088, 0x200000A8)  # a lost arbitration, a protocol error, no acknowledgement
 
 
 def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
@@ -21,6 +25,11 @@ def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
     )
     heard = []
     bench.bus.until_booted(1, 2, 3, 4, 5, 6, 16, by=command)
+    bench.bus.until_enabled(6, by=command, cycles=1)
+    with socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW) as controller:
+        controller.bind(("vcan0",))
+        for can_id in ERROR_FRAMES:
+            controller.send(struct.pack("=IB3x8s", can_id, 8, b""))
     while command.running:
         heard += bench.bus.hear()
     command.end(0)
@@ -43,4 +52,8 @@ def test_a_run_counts_what_its_plan_lists(bench: Any) -> None:
             allowed = max(0.02 * one.planned_frames, one.messages) + lost * one.messages
             assert one.frames == pytest.approx(one.planned_frames, abs=allowed), (log, kind)
             assert one.bits <= one.planned_bits, (log, kind)
-    assert results.summary["traffic"]["vcan0"]["unlisted"] == []
+    traffic = results.summary["traffic"]["vcan0"]
+    assert traffic["unlisted"] == []
+    assert (traffic["error_frames"], traffic["as_planned"]) == (2, False)
+    assert [can_id for _, _, can_id, _ in results.frames if can_id & ERR_FLAG] == list(ERROR_FRAMES)
+    assert any(fault.startswith("bus error frames: 2,") for fault in results.summary["faults"])
