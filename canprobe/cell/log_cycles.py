@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from canprobe.bus.port import TimedFrame
 from canprobe.cell.build import make_drives, make_tactile
 from canprobe.cell.deadlines import find_deadlines
-from canprobe.cell.drives import CommandFrame, command_frames
+from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames
 from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
 from canprobe.cell.measurement import Measurement
 from canprobe.cell.recording import STAMP_JITTER_NS, Recording
+from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
+from canprobe.protocol.cia402 import known_state
 
 DRIFT_BLOCK = 400
 """SYNCs over which another logger's clock does not drift by a noticeable share of a period."""
@@ -98,6 +100,8 @@ class LogCycles:
             counter_before = counter
             seen = self._collect_taken(first, last) if self._as_taken else self._collect(k, position)
             measurement = intake.measure(counter)
+            if self.drives is not None and not measurement.enabled:
+                _check_states(self.drives)
             if self._as_taken:
                 intake.route(frames[seen:last])
             position = seen
@@ -154,6 +158,13 @@ class LogCycles:
 
     def _enabled_by_master(self) -> bool:
         return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
+
+
+def _check_states(drives: DriveGroup) -> None:
+    """A log in which a statusword tells no state was made with another mapping, or by a drive out of order."""
+    for axis, word in zip(drives.axes, drives.statuswords, strict=True):
+        if known_state(word) is None:
+            raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
 
 
 def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:

@@ -35,7 +35,7 @@ def test_pdos_of_another_mapping_are_told(lockstep_run, copy_of):
         (lambda lines: lines[: len(lines) // 4], "nothing was touched"),
         (
             lambda lines: [x.replace("183#37", "183#FF") for x in lines],
-            r"bus\.log: on can0: statusword 0x..ff is no CiA 402 state",
+            r"bus\.log: on can0: node 3: statusword 0x..ff is no CiA 402 state",
         ),
     ],
     ids=["no sync", "torn line", "empty", "other rate", "doubled", "no contact", "no state"],
