@@ -196,7 +196,7 @@ def test_another_controllers_log(other_run, tmp_path):
         if can_id_of(line) == "080":
             lines.append(restamped(f"() can_right {can_id_of(line)}#", stamp_us(line)))
         if can_id_of(line) == "181" and len(lines) % 40 == 0:
-            lines += [restamped(f"() can_left {frame}", stamp_us(line)) for frame in ("20000004#00", "701#R", "3A0#01")]
+            lines += [restamped(f"() can_left {frame}", stamp_us(line)) for frame in ("20000088#00", "701#R", "3A0#01")]
     log = tmp_path / "other.log"
     log.write_text("\n".join(lines) + "\n")
     result = canprobe.replay(log, scene="cylinder", method=("recursive", "ml"))
