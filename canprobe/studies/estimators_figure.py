@@ -55,7 +55,7 @@ def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
     axes.axvspan(BUDGET_MS, 1e3, color=SHADE, linewidth=0, zorder=0)
     axes.axvline(BUDGET_MS, color=INK, label="budget of a tactile frame, 5 ms")
     log_scale(axes, "xy")
-    axes.set_xlim(0.2, 100.0)
+    axes.set_xlim(0.2, 200.0)
 
 
 def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
@@ -76,6 +76,6 @@ def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
 def _draw_bound(axes: Axes, percent: float, text: str) -> None:
     axes.axhline(percent, color=INK, linewidth=0.8, linestyle=":", label="Cramér–Rao bound")
     axes.annotate(
-        text, (1.0, percent), xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(-2, 2),
-        ha="right", fontsize="small",
+        text, (0.0, percent), xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(3, 2),
+        fontsize="small",
     )  # fmt: skip

@@ -65,7 +65,7 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
         figure.suptitle("\n".join(lines), x=0.01, ha="left")
         yield figure
         with whole_file(path) as part:
-            figure.savefig(part, format=path.suffix[1:])
+            figure.savefig(part, format=path.suffix[1:] or "png")
 
 
 def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
@@ -124,14 +124,14 @@ def box(part: Part, axes: Any, title: str, labels: Sequence[str], *, elev: float
     sides = {axes.xaxis: axes.get_xlim(), axes.yaxis: axes.get_ylim(), axes.zaxis: axes.get_zlim()}
     corners = np.array(list(product(*sides.values(), (1.0,)))) @ axes.get_proj().T
     seen = np.ptp(axes.transData.transform(corners[:, :2] / corners[:, 3:]), axis=0) / axes.bbox.size
-    room = (part.bbox.size - DPI * np.array([1.5, 0.9])) / min(part.bbox.size)  # beside the labels
+    room = (part.bbox.size - DPI * np.array([1.6, 0.9])) / min(part.bbox.size)  # beside the labels
     axes.set_box_aspect(axes.get_box_aspect(), zoom=float(min(room / seen)))
     longest = max(high - low for low, high in sides.values())
     for (axis, (low, high)), label in zip(sides.items(), labels, strict=True):
         axis.set_label_text(label)
         axis.labelpad = 5
         axis.set_tick_params(pad=0)
-        count, inset = round(6 * (high - low) / longest), 0.25 * (high - low)
+        count, inset = round(5 * (high - low) / longest), 0.25 * (high - low)
         two = FixedLocator([round(low + inset), round(high - inset)])
         axis.set_major_locator(MaxNLocator(count, steps=(1, 2, 5, 10), integer=True) if count > 2 else two)
         axis.pane.set_facecolor("white")

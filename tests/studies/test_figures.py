@@ -185,24 +185,17 @@ def bridge_bars(path):
     bridges._draw(rows, path)
 
 
-def plan_of(scene):
-    return lambda path: draw_plan(canprobe.plan(canprobe.load_scene(scene)), path)
-
-
 FOUND = {"tool_centre_mm": [0.394, None, 80.478], "sigma_mm": [0.05, None, 0.08], "believed_mm": [0.0, 0.0, 80.0],
          "true_mm": [0.4, -0.3, 80.5], "touches": 13}  # fmt: skip
 REASON = "node 3 lost: no heartbeat for 250 ms; " + "quick stop of every drive, the probe was lifted off; " * 3
 PICTURES = {
-    "plane": draw_scene("plane", 1.5),
     "plane, stopped": draw_scene("plane", 1.5, completed=False, stop_reason=REASON),
-    "plane, surface": draw_scene("plane", 1.5, draw=draw_surface),
     "axial, surface": draw_scene("axial", 1.5, draw=draw_surface),
     "free": draw_scene("free", 1.0),
     "press": draw_scene("press", 0.5),
     "listen": draw_scene("listen", 1.0),
     "calibrate": draw_scene("press", 0.5, calibration=FOUND),
-    "plan": plan_of("cylinder"),
-    "plan, arm alone": plan_of("free"),
+    "plan": lambda path: draw_plan(make_plan(canprobe.load_scene("cylinder")), path),
     "bound": bound,
     "region": region,
     "estimators": every_estimator,
