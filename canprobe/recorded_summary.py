@@ -206,6 +206,6 @@ def _estimate_lines(summary: dict[str, Any]) -> list[str]:
     if summary["shape"]["kappa_true_per_m"] is not None:
         return shape_lines(summary["shape"])
     return [
-        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])} 1/m, the last of {last['count']} estimates"
+        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])}, the last of {last['count']} estimates"
         for name, last in summary["estimates"].items()
     ]

@@ -403,16 +403,23 @@ def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def curvature_text(values: Sequence[float | None] | None) -> str:
-    """Principal curvatures as people read them."""
-    return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
+    """Principal curvatures as people read them, with their unit."""
+    if values is None:
+        return "–"
+    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
+    if not observed:
+        return "not observed"
+    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
 
 
 def shape_lines(shape: dict[str, Any]) -> list[str]:
     """The section ``shape`` of a summary as lines for people."""
-
     estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
-    lines = [f"  curvature  {estimated} 1/m, true {true} 1/m"]
+    lines = [f"  curvature  {estimated}; true {true}"]
     for name, score in shape.get("methods", {}).items():
+        if score["estimates"] == 0:
+            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
+            continue
         percent = score["kappa_rms_error_percent"]
         lines.append(
             f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
