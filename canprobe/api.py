@@ -14,7 +14,7 @@ from canprobe.bus.interrupts import interrupts_held
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
@@ -155,7 +155,8 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
 def _finish(session: Session, controller: object, failure: BaseException | None, bridges: Bridges) -> RunResult:
     estimates = _estimates(session.scene, controller)
     reason = None if failure is None else (str(failure) or "interrupted")
-    surface_map, consistency, map_summary = _mapped(session.scene, controller)
+    start_s = session.cell.start_ns * 1e-9
+    surface_map, consistency, map_summary = _mapped(session.scene, controller, start_s)
     summary = summarise(session, controller, estimates, reason, map_summary=map_summary, bridges=bridges.status())
     summary["bridges"] = bridges.end(summary)
     result = RunResult(
@@ -163,7 +164,7 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
         summary,
         log_columns(session.cell),
         session.truth,
-        estimates,
+        {name: on_run_clock(records, start_s) for name, records in estimates.items()},
         getattr(controller, "taxels", None),
         surface_map,
         consistency,
@@ -193,7 +194,9 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     return estimates_of(scene, tracker, (scene.shape.method, *scene.shape.also))
 
 
-def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
+def _mapped(
+    scene: Scene, controller: object, start_s: float
+) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
     """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
@@ -201,7 +204,7 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
     from canprobe.cell.mapping import map_of_scan, summarise_map
     from canprobe.touch.consistency import check_consistency
 
-    surface_map = map_of_scan(tracker, scene.shape.method)
+    surface_map = map_of_scan(tracker, scene.shape.method, start_s)
     consistency = check_consistency(surface_map)
     return surface_map, consistency, summarise_map(surface_map, consistency)
 

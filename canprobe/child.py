@@ -53,13 +53,15 @@ class EmulatorChild:
         out: folder for ``truth.npz``; None uses a temporary one.
         channel: the bus of its nodes.
         truth: whether what is true is recorded, which grows with time.
+        origin_ns: time that is 0 in ``truth.npz``, on the clock that all processes of a machine share.
     """
 
-    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True) -> None:
+    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True, origin_ns: int = 0) -> None:
         self._scene = scene
         self._channel = channel
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._wants_truth = truth
+        self._origin_ns = origin_ns
         self._truth = (out or self._folder) / "truth.npz"
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
@@ -78,7 +80,7 @@ class EmulatorChild:
             *("--nodes", ",".join(str(n) for n in nodes), "--parent", str(os.getpid())),
         ]
         if self._wants_truth:
-            command += ["--truth", str(self._truth)]
+            command += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
         self._errors = (self._folder / "stderr").open("w+b")
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,

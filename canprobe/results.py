@@ -42,7 +42,8 @@ class RunResult:
     Attributes:
         plan: what was planned.
         summary: the content of ``summary.json``.
-        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit.
+        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+            and in the estimates counts from the instant that is 0 in ``bus.log``.
         truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
         estimates: what each estimator said, by name; the online one first.
         taxels: (16, 16) counts of the task's last tactile frame, or None.
@@ -117,7 +118,7 @@ def summarise(
     cycle = cell.cycle
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = log_columns(cell)
+    log = cell.log.arrays()
     summary = {
         "schema": SCHEMA,
         "scene": scene.name,
@@ -130,7 +131,12 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, _truth(session), log["t_s"], map_summary=map_summary
+            scene,
+            getattr(controller, "shape", None),
+            estimates,
+            _truth(session),
+            log.get("t_s", np.empty(0)),
+            map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
@@ -149,8 +155,22 @@ def summarise(
 
 
 def log_columns(cell: Cell) -> dict[str, Array]:
-    """The columns of ``log.npz``; a run that was stopped before its first cycle has the time's, without a row."""
-    return {"t_s": np.empty(0), **cell.log.arrays()}
+    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
+    log = {"t_s": np.empty(0), **cell.log.arrays()}
+    return {**log, "t_s": log["t_s"] + cell.start_ns * 1e-9}
+
+
+def check_clock(file: Path, log: Mapping[str, Array]) -> None:
+    """Refuse the log of an earlier canprobe, whose times counted from the first SYNC: no cycle is due at 0.
+
+    Raises:
+        UsageError: it is such a log.
+    """
+    if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
+        raise UsageError(
+            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
+            " wrote them; run the scene again"
+        )
 
 
 def _without_nan(value: Any) -> Any:
@@ -224,7 +244,7 @@ def summarise_shape(
         tracker: its contacts; None without a shape.
         estimates: what each estimator said, by name.
         truth: columns of the plant's truth, one row a SYNC; empty where there is none.
-        sync_times: time of each SYNC on the master's clock (n,), s.
+        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
         map_summary: of the scan's surface map.
     """
     names = (

@@ -108,6 +108,7 @@ class Session:
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
+        origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
         joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
@@ -125,6 +126,7 @@ class Session:
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
+        self.origin_ns = 0
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
@@ -180,6 +182,7 @@ class Session:
                 log_failure=self._log_failure,
                 observers=self.observers,
                 rows_kept=self._rows_kept,
+                origin_ns=self.origin_ns,
             )
             if self.scene.bus.interface != LOCKSTEP:
                 self._get_ready(port)
@@ -230,17 +233,17 @@ class Session:
     def _open(self) -> Port:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _writer(self, channel: str, t0_ns: int) -> Write:
+    def _writer(self, channel: str) -> Write:
         write: Write = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
-                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
                 with contextlib.suppress(OSError):  # it is written again at the end, and a failure told
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
-            self.observers.origin_ns = t0_ns
+            self.observers.origin_ns = self.origin_ns
             write = self.observers.tap(write)
         if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
             return self._metered(channel, write if self.out is not None or self.observers is not None else None)
@@ -290,7 +293,7 @@ class Session:
         clock = VirtualClock()
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
-            bus.recorder = self._writer(channel, 0)
+            bus.recorder = self._writer(channel)
             bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
         self.world = make_world(self.plan, self.scene.emulated_node_ids)
@@ -322,9 +325,9 @@ class Session:
         if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         clock = MonotonicClock()
-        t0_ns = clock.now_ns()
+        self.origin_ns = clock.now_ns()
         real = self._stack.enter_context(open_ports(self.plan, clock))
-        return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
@@ -335,7 +338,9 @@ class Session:
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
             emulated = next(node.channel for node in self.plan.nodes if node.emulated)
-            child = EmulatorChild(self.scene, self.out, emulated, truth=self._rows_kept is None)
+            child = EmulatorChild(
+                self.scene, self.out, emulated, truth=self._rows_kept is None, origin_ns=self.origin_ns
+            )
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

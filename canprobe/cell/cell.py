@@ -65,9 +65,11 @@ class Cell:
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
+        origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
 
     Attributes:
-        log: one row a cycle.
+        log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
+            how long bring-up took; `start_ns` brings them onto the run's clock.
         notes: what went wrong and was lived with.
         supervisor: the checks, from bring-up on.
     """
@@ -88,8 +90,10 @@ class Cell:
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
         rows_kept: int | None = None,
+        origin_ns: int = 0,
     ) -> None:
         self.log = RunLog(rows_kept)
+        self._origin_ns = origin_ns
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
@@ -111,6 +115,11 @@ class Cell:
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
+
+    @property
+    def start_ns(self) -> int:
+        """When the first cycle was due, on the run's clock; 0 where it came to none."""
+        return self.cycle.t_first_ns - self._origin_ns if self.cycle is not None else 0
 
     @property
     def faults(self) -> list[str]:
@@ -338,7 +347,7 @@ class Cell:
                 self._react(finding, retreat)
         elif not self._holding:
             self._holding = True
-            self.notes.add_error(finding.error, "hold", measurement.t_ns * 1e-9)
+            self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
         return self._holding
 
     def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
@@ -363,7 +372,7 @@ class Cell:
         if self._lift_from is None or supervisor.felt() < TOUCH_FORCE or supervisor.must_stop():
             return
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
-        t_s = supervisor.seen.measurement.t_ns * 1e-9
+        t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:
             self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
             return
@@ -383,9 +392,8 @@ class Cell:
             self._look(self.cycle.begin())
 
     def _note_alarms(self) -> None:
-        first_ns = self.cycle.t_first_ns if self.cycle is not None else 0
         for event in self.watch.news():
-            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - first_ns) * 1e-9)
+            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - self._origin_ns) * 1e-9)
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
@@ -398,8 +406,8 @@ class Cell:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
         self.log.add(row)
-        if self._observers is not None and self.cycle is not None:
-            self._observers.cycle(self.cycle.t_first_ns, measurement, command)
+        if self._observers is not None:
+            self._observers.cycle(self.start_ns, measurement, command)
 
     # the way out
 

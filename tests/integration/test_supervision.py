@@ -69,7 +69,8 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {FREE_CYCLE * 0.0025:.2f} s"
+    at_s = run.session.cell.start_ns * 1e-9 + FREE_CYCLE * 0.0025
+    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {at_s:.2f} s"
     assert run.session.cell.faults == [told]
 
 
