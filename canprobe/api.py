@@ -25,6 +25,7 @@ from canprobe.results import RunResult, log_columns, summarise, write_files
 from canprobe.scene import Scene
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 from canprobe.session_bus import open_ports
+from canprobe.whole_file import whole_file
 
 if TYPE_CHECKING:
     from canprobe.cell.commission import Commissioned
@@ -90,6 +91,7 @@ def run(
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
+        ResultsError: a file could not be written, for want of room say. The drives are disabled.
     """
     resolved = resolve_scene(
         scene,
@@ -175,11 +177,13 @@ def _finish(session: Session, controller: object, failure: BaseException | None,
             with interrupts_held():
                 write_files(result, session.out)
             _draw(result, session.out)
-        except OSError as error:  # a full disk: what stopped the run counts for more, and the cell is safe
-            told = f"{session.out}: not all results could be written: {error.strerror or error}"
-            summary["faults"].append(told)
-            if failure is None:
-                raise ResultsError(told) from error
+        except ResultsError as error:
+            summary["faults"].append(str(error))
+            session.unwritten.append(str(error))
+    if session.unwritten and failure is None:
+        raise ResultsError("\n".join(session.unwritten))
+    for told in session.unwritten:  # what stopped the run counts for more
+        if failure is not None and told != str(failure):
             failure.add_note(told)
     return result
 
@@ -221,8 +225,10 @@ def _draw(result: RunResult, out: Path) -> None:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface
 
-        draw_run(result, out / "report.png")
-        draw_surface(result, out / "surface.png")
+        with whole_file(out / "report.png") as part:
+            draw_run(result, part)
+        with whole_file(out / "surface.png") as part:
+            draw_surface(result, part)
 
 
 @contextlib.contextmanager

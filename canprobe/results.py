@@ -358,7 +358,7 @@ def write_files(result: RunResult, out: Path) -> None:
     """Write what a run leaves in ``out``, besides the files that are there already and the figures.
 
     Raises:
-        OSError: one cannot be written; no part of it is left, nor the one of an earlier run.
+        ResultsError: one cannot be written; no part of it is left.
     """
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     write_text(out / "scene.toml", dump_scene(result.plan.scene))

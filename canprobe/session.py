@@ -28,7 +28,7 @@ from canprobe.cell.build import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
-from canprobe.errors import UsageError
+from canprobe.errors import CanprobeError, UsageError
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import check_bridges
@@ -109,6 +109,7 @@ class Session:
 
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
+        unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
         joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
@@ -133,6 +134,7 @@ class Session:
         self.meters: dict[str, TrafficMeter] = {}
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
+        self.unwritten: list[str] = []
         self._candump: CandumpWriter | None = None
         self.world: World | None = None
         self.joins: Callable[[Any], Any] = lambda participant: participant
@@ -215,12 +217,12 @@ class Session:
             self._stack.close()
         finally:
             self.wall_ns = elapsed_ns() - self.started_ns
-            if (failure := self._log_failure()) is not None:
-                self._note(f"the log is not whole: {failure}")
+            self._note_unwritten(self._log_failure())
 
-    def _note(self, fault: str) -> None:
-        if self._cell is not None:
-            self._cell.notes.add(fault)
+    def _note_unwritten(self, told: str | None) -> None:
+        if told is not None and self._cell is not None:
+            self.unwritten.append(told)
+            self._cell.notes.add(told)
 
     def _log_failure(self) -> str | None:
         return self._candump.failure if self._candump is not None else None
@@ -239,7 +241,7 @@ class Session:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
-                with contextlib.suppress(OSError):  # it is written again at the end, and a failure told
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
@@ -312,8 +314,8 @@ class Session:
             if self.out is not None:
                 try:
                     write_npz(self.out / "truth.npz", self.truth)
-                except OSError as error:
-                    self._note(f"truth.npz could not be written: {error.strerror or error}")
+                except CanprobeError as error:
+                    self._note_unwritten(str(error))
 
     def _open_real(self) -> Port:
         bus = self.scene.bus
@@ -353,3 +355,4 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+        self._note_unwritten(child.unwritten)

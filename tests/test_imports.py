@@ -54,7 +54,6 @@ COMPOSITION = {
     "recorded_bridges",
     "recorded_summary",
     "npz_file",
-    "whole_file",
     "surface_file",
     "tables",
     "traffic_log",
@@ -95,6 +94,8 @@ def layer_of(parts):
         return "plant"
     if top in COMPOSITION:
         return "api"
+    if top == "whole_file":  # of the standard library alone, for everybody who writes a file
+        return "errors"
     if top.startswith("scene"):
         return "scene"
     return "package" if top in ("__init__", "__main__") else top

@@ -111,6 +111,7 @@ class Cell:
         self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
         self._holding = False
         self._running = False
+        self._retreats_for: CanprobeError | None = None
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
@@ -195,6 +196,7 @@ class Cell:
         Raises:
             UsageError: this is no controller, it returned no `Command`, or another one is running.
             SafetyStop: the controller or the supervision stopped the cell.
+            ResultsError: frames can no longer be written down.
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
         """
@@ -215,6 +217,7 @@ class Cell:
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
         update: Callable[[], None] | None = getattr(controller, "update", None)
         self._tracker = getattr(controller, "shape", None)
+        self._retreats_for = None
         self._enable(getattr(controller, "inspect", None))
         assert self.cycle is not None
         with Interrupts(self._stuck) as interrupts:
@@ -230,7 +233,8 @@ class Cell:
                 self._record(measurement, command)
                 progress(measurement)
                 if command.stop_reason is not None:
-                    raise SafetyStop(command.stop_reason)
+                    found = self._retreats_for
+                    raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
                 if command.done:
                     return
 
@@ -360,6 +364,7 @@ class Cell:
     def _react(self, finding: Finding, retreat: Callable[[str], None] | None) -> None:
         reaction = finding.condition.reaction
         if reaction is Reaction.RETREAT and retreat is not None:
+            self._retreats_for = self._retreats_for or finding.error
             retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):

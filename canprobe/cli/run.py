@@ -71,18 +71,27 @@ def run(args: argparse.Namespace) -> int:
     except CanprobeError as error:
         if args.json and error.summary is not None:
             print_json(error.summary)
+        try:
+            _write_blf(folder, wanted=args.blf and error.summary is not None)
+        except CanprobeError as unwritten:  # what stopped the run counts for more
+            error.add_note(str(unwritten))
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
+        _write_blf(folder, wanted=args.blf)
         raise
-    finally:
-        if args.blf and (folder / "bus.log").is_file():
-            from canprobe.bus.logfile import convert_log
-
-            convert_log(folder / "bus.log", folder / "bus.blf")
+    _write_blf(folder, wanted=args.blf)
     if args.json:
         print_json(result.summary)
     else:
         print(result.text())
     return 0
+
+
+def _write_blf(folder: Path, *, wanted: bool) -> None:
+    """The bus in the other form, where it was recorded."""
+    if wanted and (folder / "bus.log").is_file():
+        from canprobe.bus.logfile import convert_log
+
+        convert_log(folder / "bus.log", folder / "bus.blf")

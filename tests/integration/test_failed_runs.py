@@ -74,8 +74,6 @@ def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "log.npz").write_text("of an earlier run")
-
     def full(file: Any, **_: Any) -> None:  # a path, or an open file
         (file.write_bytes if isinstance(file, Path) else file.write)(b"PK, and no more")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -86,7 +84,8 @@ def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
     told = capsys.readouterr().err.splitlines()
     assert told == [
         "canprobe: stopped",
-        f"canprobe: {tmp_path}: not all results could be written: No space left on device",
+        f"canprobe: {tmp_path}/truth.npz: cannot be written: No space left on device",
+        f"canprobe: {tmp_path}/log.npz: cannot be written: No space left on device",
     ]
     assert read_json(tmp_path / "summary.json")["stop_reason"] == "stopped"
-    assert not (tmp_path / "log.npz").exists()
+    assert not [path.name for path in tmp_path.iterdir() if path.name not in ("bus.log", "scene.toml", "summary.json")]

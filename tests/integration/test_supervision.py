@@ -20,7 +20,7 @@ from canprobe.cell.measurement import Command
 from canprobe.cell.supervision import Reaction
 from canprobe.cell.tasks.touch_settings import Phase
 from canprobe.emulator.faults import FaultKind
-from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.emcy import Emcy
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
@@ -545,7 +545,8 @@ def test_a_full_disk(tmp_path):
         run.session.lockstep.recorder = flushed_each_time()
 
     run = OnDisk("press", HOLD_CYCLE, fill)
-    assert "the log cannot be written" in str(run.error) and "No space left" in str(run.error)
+    assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
+    assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
     assert run.session.truth["force"][-1] == 0.0
     text = (tmp_path / "bus.log").read_text()
