@@ -75,7 +75,6 @@ class EmulatorChild:
 
     def start(self) -> None:
         """Start the process."""
-        self._truth.unlink(missing_ok=True)  # of an earlier run into the same folder
         scene_file = self._folder / "scene.toml"
         write_text(scene_file, dump_scene(self._scene))
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids

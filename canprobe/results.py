@@ -39,6 +39,9 @@ SCHEMA = 1
 class RunResult:
     """One finished run.
 
+    That of :func:`canprobe.open_cell` is there when a controller has ended, and complete when the block is left: until
+    then the drives are not disabled, the bus is not closed, and nothing may be asked of it.
+
     Attributes:
         plan: what was planned.
         summary: the content of ``summary.json``.
@@ -61,6 +64,16 @@ class RunResult:
     surface_map: SurfaceMap | None = None
     consistency: Consistency | None = None
     out: Path | None = None
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Only what is not there is asked for here: before the run is finished, everything."""
+            if name not in RunResult.__slots__:
+                raise AttributeError(f"RunResult has no attribute {name!r}")
+            raise UsageError(
+                f"result.{name}: complete when the block of open_cell is left; ask for it behind the block"
+            )
 
     def text(self) -> str:
         """The summary for people."""
@@ -204,7 +217,7 @@ def _scan(controller: object) -> tuple[int, int] | None:
 
 
 def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
-    task, scan = session.scene.task, _scan(controller)
+    task, scan = session.scene.task, _scan(controller) if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
@@ -363,8 +376,6 @@ def write_files(result: RunResult, out: Path) -> None:
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     write_text(out / "scene.toml", dump_scene(result.plan.scene))
     write_npz(out / "log.npz", result.log)
-    for name in ("surface.npz", FILE):
-        (out / name).unlink(missing_ok=True)  # of an earlier run
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
         write_text(out / FILE, text)
     if result.surface_map is not None:

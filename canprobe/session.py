@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +44,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
+LEFT_BY_RUNS = (
+    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("surface.png", "tool.toml", "truth.npz"),
+)
+"""Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
 """Is told each step, in words."""
@@ -141,14 +146,14 @@ class Session:
         self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
-        self._entered = False
+        self._entered = self._left = False
         self._cell: Cell | None = None
 
     @property
     def cell(self) -> Cell:
         """The cell, while the session is open or afterwards."""
         if self._cell is None:
-            raise UsageError("the cell is not open: use `with open_cell(scene) as cell:`")
+            raise UsageError("the cell is not open: use `with canprobe.open_cell(scene) as cell:`")
         return self._cell
 
     @property
@@ -161,13 +166,18 @@ class Session:
         """The nodes were brought up."""
         return self._cell is not None and self._cell.cycle is not None
 
+    @property
+    def keeps_all(self) -> bool:
+        """Every cycle has its row in the log, and every SYNC one in the truth."""
+        return self._rows_kept is None
+
     def bus_load(self, channel: str) -> float | None:
         """Measured share of a bus's bit rate, from the first frame to the last."""
         if channel not in self.traffic or self._bus_time_ns <= 0:
             return None
         return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Self:
         if self._entered:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
         self._entered = True
@@ -210,12 +220,15 @@ class Session:
         progress: Callable[[Measurement], None] = lambda _: None,
     ) -> None:
         """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`."""
+        if self._left:
+            raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
         self.cell.run(controller, progress)
 
     def _close(self) -> None:
         try:
             self._stack.close()
         finally:
+            self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
             self._note_unwritten(self._log_failure())
 
@@ -241,6 +254,8 @@ class Session:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                for name in LEFT_BY_RUNS:
+                    (self.out / name).unlink(missing_ok=True)  # of an earlier run
                 with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
@@ -298,7 +313,7 @@ class Session:
             bus.recorder = self._writer(channel)
             bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
-        self.world = make_world(self.plan, self.scene.emulated_node_ids)
+        self.world = make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
         self._stack.callback(self._keep_truth)
         channel_of = {node.node_id: node.channel for node in self.plan.nodes}
         for node in self.world.nodes:
@@ -340,9 +355,7 @@ class Session:
         if self.scene.emulated_node_ids:
             self._say("start the emulated nodes")
             emulated = next(node.channel for node in self.plan.nodes if node.emulated)
-            child = EmulatorChild(
-                self.scene, self.out, emulated, truth=self._rows_kept is None, origin_ns=self.origin_ns
-            )
+            child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

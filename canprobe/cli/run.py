@@ -7,7 +7,18 @@ from pathlib import Path
 
 from canprobe.cli.interrupts import termination_interrupts
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_json, add_scene, folder_path, seconds, whole
+from canprobe.cli.parser import (
+    Commands,
+    Parser,
+    add_bridge,
+    add_bus,
+    add_force,
+    add_json,
+    add_scene,
+    folder_path,
+    seconds,
+    whole,
+)
 from canprobe.cli.target import add_realtime, target_of, with_realtime
 from canprobe.errors import CanprobeError
 
@@ -29,6 +40,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_realtime(parser)
     add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder for the results [runs/<scene>-<time>]")
+    add_force(parser)
     parser.add_argument("--tool", metavar="FILE", type=Path, help="tool.toml of a calibration, for the probe's centre")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
@@ -64,6 +76,7 @@ def run(args: argparse.Namespace) -> int:
             out=folder,
             seed=args.seed,
             duration_s=args.duration,
+            force=args.force,
             progress=progress_bar(),
             say=say_on_terminal,
             bridge=args.bridge or (),

@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.api import OpenCell
 from canprobe.bus.candump import read_candump
 from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import NodeError, SafetyStop
-from canprobe.session import Session
 
 MS = 1_000_000
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
 
 
 def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    class Faulty(Session):
+    class Faulty(OpenCell):
         def __init__(self, *words: Any, **options: Any) -> None:
             super().__init__(*words, **options)
             self.joins = lambda node: FaultyNode(node, faults) if hasattr(node, "node_id") else node
 
-    monkeypatch.setattr("canprobe.api.Session", Faulty)
-    canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds)
+    monkeypatch.setattr("canprobe.api.OpenCell", Faulty)
+    canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds, force=True)
 
 
 def read_json(path: Path) -> Any:
@@ -74,13 +74,15 @@ def test_a_scan_that_held_has_its_figures(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    (tmp_path / "log.npz").write_text("of an earlier run")
+
     def full(file: Any, **_: Any) -> None:  # a path, or an open file
         (file.write_bytes if isinstance(file, Path) else file.write)(b"PK, and no more")
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(np, "savez_compressed", full)
     monkeypatch.setattr("canprobe.cell.cell.Cell.run", lambda *_: (_ for _ in ()).throw(SafetyStop("stopped")))
-    assert main(["run", "free", "--out", str(tmp_path)]) == 1
+    assert main(["run", "free", "--out", str(tmp_path), "--force"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert told == [
         "canprobe: stopped",
