@@ -9,7 +9,6 @@ file"; lely-core's dcfgen.
 from __future__ import annotations
 
 import operator
-import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ from canprobe.errors import UsageError
 from canprobe.planning import Plan, PlannedNode, PlannedPdo
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Direction
 from canprobe.planning.wire_bits import CLASSIC_BYTES
+from canprobe.whole_file import whole_file, write_text
 
 _PURPOSE = "a bus.yml"
 _DRIVERS = {
@@ -81,13 +81,14 @@ def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
     files = {node.eds: folder / eds_file(node.eds).name for node in plan.nodes}
     for eds, path in files.items():
         if not path.exists() or not path.samefile(eds_file(eds)):
-            shutil.copyfile(eds_file(eds), path)
+            with whole_file(path) as part:
+                part.write_bytes(eds_file(eds).read_bytes())
     setups = {setup.node_id: setup for setup in make_setups(plan)}
     document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
     for node in plan.nodes:
         document[node.role.replace(" ", "_")] = _slave(plan, node, setups[node.node_id], files[node.eds].name)
     path = folder / "bus.yml"
-    path.write_text(_dump(yaml, document), encoding="utf-8")
+    write_text(path, _dump(yaml, document))
     return [path, *files.values()]
 
 

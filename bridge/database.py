@@ -8,6 +8,7 @@ from typing import Any
 from canprobe.bridge.extras import need
 from canprobe.bridge.signals import FrameDescription, FrameSignal, describe_frames, identifier, node_names
 from canprobe.planning import Plan
+from canprobe.whole_file import write_text
 
 FORMATS = ("dbc", "kcd")
 _PURPOSE = "a DBC or KCD file"
@@ -58,7 +59,7 @@ def write_database(plan: Plan, folder: Path, form: str) -> Path:
     database = plan_database(plan)
     text = database.as_dbc_string() if form == "dbc" else database.as_kcd_string()
     path = folder / f"{plan.scene.name}.{form}"
-    path.write_text(text, encoding="cp1252" if form == "dbc" else "utf-8", newline="")
+    write_text(path, text, encoding="cp1252" if form == "dbc" else "utf-8", newline="")
     return path
 
 

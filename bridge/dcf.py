@@ -15,6 +15,7 @@ from canprobe.eds import eds_file
 from canprobe.eds.faults import Faults
 from canprobe.eds.lines import LINE_END, Section, Sections, decode, split_sections
 from canprobe.planning import Plan
+from canprobe.whole_file import write_text
 
 Values = Mapping[tuple[int, int], int]
 """By (index, sub-index)."""
@@ -33,7 +34,7 @@ def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
     paths = []
     for setup in make_setups(plan):
         path = folder / f"node{setup.node_id:03}.dcf"
-        path.write_text(_dcf_of(plan, setup, path.name), encoding="utf-8", newline="")
+        write_text(path, _dcf_of(plan, setup, path.name), newline="")
         paths.append(path)
     return paths
 

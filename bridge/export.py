@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
-from canprobe.errors import UsageError
 from canprobe.planning import Plan
 
 
@@ -21,12 +20,11 @@ def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
         The files.
 
     Raises:
-        UsageError: an extra is missing, or the folder cannot be made.
+        UsageError: an extra is missing.
+        ResultsError: a file cannot be written.
+        OSError: the folder cannot be made.
     """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(f"{folder}: {error.strerror}") from error
+    folder.mkdir(parents=True, exist_ok=True)
     return [path for form in dict.fromkeys(formats) for path in _export(plan, folder, form)]
 
 

@@ -6,7 +6,9 @@ metadata as rosbag2_storage_mcap writes it.
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 
 from mcap.writer import Writer
 
@@ -17,7 +19,7 @@ from canprobe.bridge.messages import Messages
 from canprobe.bridge.sample import Sample
 from canprobe.bridge.sink import Context
 from canprobe.bridge.topics import TOPICS, Topic
-from canprobe.errors import UsageError
+from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.bridges import BRIDGES
 
 
@@ -58,18 +60,32 @@ class McapSink:
 
     def write(self, sample: Sample) -> None:
         """Write the messages of a sample."""
-        for topic, t_ns, data in self._messages.of(sample):
-            count = self._counts[topic.name] = self._counts.get(topic.name, 0) + 1
-            self._writer.add_message(self._channels[topic.name], t_ns, data, t_ns, count)
-            self._last_ns = max(self._last_ns, t_ns)
+        with self._or_none():
+            for topic, t_ns, data in self._messages.of(sample):
+                count = self._counts[topic.name] = self._counts.get(topic.name, 0) + 1
+                self._writer.add_message(self._channels[topic.name], t_ns, data, t_ns, count)
+                self._last_ns = max(self._last_ns, t_ns)
 
     def close(self, summary: str | None) -> None:
         """Attach what the run was, write the index, and give the file its name."""
-        for name, media_type, content in attachments_of(self._context.plan, self._context.out, summary):
-            self._writer.add_attachment(self._last_ns, self._last_ns, name, media_type, content)
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
-        os.replace(self._part, self._path)
+        attachments = attachments_of(self._context.plan, self._context.out, summary)
+        with self._or_none():
+            for name, media_type, content in attachments:
+                self._writer.add_attachment(self._last_ns, self._last_ns, name, media_type, content)
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.close()
+            os.replace(self._part, self._path)
+
+    @contextlib.contextmanager
+    def _or_none(self) -> Iterator[None]:
+        """Where the file cannot be written (full disk) no part of it is left."""
+        try:
+            yield
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.close()  # what it still holds cannot be written either
+            self._part.unlink(missing_ok=True)
+            raise ResultsError(f"{self._path}: cannot be written: {error.strerror or error}") from error
 
     def _register(self, topic: Topic) -> int:
         schema = self._schemas.get(topic.type_name)

@@ -8,14 +8,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.bridging import Bridges
 from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
 from canprobe.cell.build import make_task
 from canprobe.cell.measurement import Command, Controller, Measurement
-from canprobe.cell.observe import Observation, Observer
-from canprobe.cell.tasks.shape import ShapeRecord
+from canprobe.cell.observe import Observation, Observer, Observers
+from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
 from canprobe.emulation import emulate, emulate_eds
 from canprobe.errors import BusError, CanprobeError, ResultsError, UsageError
 from canprobe.joint_report import check_joints
@@ -27,6 +28,7 @@ from canprobe.scene import Scene
 from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
 from canprobe.session_bus import open_ports
+from canprobe.whole_file import whole_file
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
@@ -74,6 +76,7 @@ def run(
     progress: Progress | None = None,
     say: Say = quiet,
     files: bool = True,
+    force: bool = False,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
 ) -> RunResult:
@@ -88,6 +91,7 @@ def run(
         progress: called with (seconds done, seconds in all).
         say: called with each step of bring-up and stop.
         files: False writes nothing.
+        force: let the files replace those of an earlier run in ``out``; without, a folder that is not empty is refused.
         observers: called after each cycle with what it saw, said and had on the bus (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
@@ -95,6 +99,7 @@ def run(
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
+        ResultsError: a file could not be written, for want of room say. The drives are disabled.
     """
     resolved = resolve_scene(
         scene,
@@ -107,24 +112,11 @@ def run(
         bridge=bridge,
     )
     folder = results_folder(resolved, out) if files else None
+    check_free(folder, force=force)
     plan = make_plan(resolve(resolved))
-    controller = make_task(plan)
-    failure: BaseException | None = None
-    with Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges:
-        session = Session(plan, folder, say, (*observers, *bridges.observers))
-        try:
-            with session:
-                session.run(_requested(plan, controller, None, bridges), _report(progress, resolved.task.duration_s))
-        except (CanprobeError, KeyboardInterrupt) as error:
-            failure = error
-            if not session.started:
-                raise
-        result = _finish(session, controller, failure, bridges)
-    if failure is not None:
-        if isinstance(failure, CanprobeError):
-            failure.summary = result.summary
-        raise failure
-    return result
+    task = make_task(plan)
+    with OpenCell(plan, folder, say, observers, task=task) as cell:
+        return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
 
 
 def _requested(
@@ -161,42 +153,23 @@ def plan(scene: Scene) -> Plan:
     return make_plan(resolve(scene))
 
 
+def check_free(folder: Path | None, *, force: bool) -> None:
+    """Refuse a folder that holds anything: results never replace others unless that is wanted.
+
+    Raises:
+        UsageError: it is not empty, and nobody said that this is well.
+    """
+    if folder is not None and not force and folder.is_dir() and any(folder.iterdir()):
+        raise UsageError(
+            f"{folder}: not empty: name another folder for the results, or let them replace those of an earlier run"
+            " there with --force (force=True)"
+        )
+
+
 def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement], None]:
     if progress is None:
         return lambda _: None
     return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
-
-
-def _finish(session: Session, controller: object, failure: BaseException | None, bridges: Bridges) -> RunResult:
-    estimates = _estimates(session.scene, controller)
-    reason = None if failure is None else (str(failure) or "interrupted")
-    surface_map, consistency, map_summary = _mapped(session.scene, controller)
-    summary = summarise(session, controller, estimates, reason, map_summary=map_summary, bridges=bridges.status())
-    summary["bridges"] = bridges.end(summary)
-    result = RunResult(
-        session.plan,
-        summary,
-        log_columns(session.cell),
-        session.truth,
-        estimates,
-        getattr(controller, "taxels", None),
-        surface_map,
-        consistency,
-        session.out,
-    )
-    if session.out is not None:
-        try:
-            with interrupts_held():
-                write_files(result, session.out)
-            with interrupts_repeated():
-                _draw(result, session.out)
-        except OSError as error:  # a full disk: what stopped the run counts for more, and the cell is safe
-            told = f"{session.out}: not all results could be written: {error.strerror or error}"
-            summary["faults"].append(told)
-            if failure is None:
-                raise ResultsError(told) from error
-            failure.add_note(told)
-    return result
 
 
 def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]:
@@ -209,7 +182,9 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     return estimates_of(resolve(scene), tracker, (scene.shape.method, *scene.shape.also))
 
 
-def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
+def _mapped(
+    scene: Scene, controller: object, start_s: float
+) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
     """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
@@ -217,28 +192,168 @@ def _mapped(scene: Scene, controller: object) -> tuple[SurfaceMap | None, Consis
     from canprobe.cell.mapping import map_of_scan, summarise_map
     from canprobe.touch.consistency import check_consistency
 
-    surface_map = map_of_scan(tracker, scene.shape.method)
+    surface_map = map_of_scan(tracker, scene.shape.method, start_s)
     consistency = check_consistency(surface_map)
     return surface_map, consistency, summarise_map(surface_map, consistency)
 
 
-def _draw(result: RunResult, out: Path) -> None:
-    for name in ("report.html", "report.png", "surface.png"):
-        (out / name).unlink(missing_ok=True)  # of an earlier run
+def _draw(result: RunResult, out: Path, say: Say) -> None:
     if not len(result.log["t_s"]):
         return
     if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
-        page.write_page(recorded.read_run(out), out / "report.html")
+        try:
+            shown = recorded.read_run(out)
+        except UsageError as error:  # a controller's column that is called like one of ours and is something else
+            say(f"report.html is left out: {error}")
+        else:
+            page.write_page(shown, out / "report.html")
     if "report.png" in result.plan.outputs:
         from canprobe.studies.run_figure import draw_run
         from canprobe.studies.surface_figure import draw_surface
 
-        draw_run(result, out / "report.png")
-        draw_surface(result, out / "surface.png")
+        with whole_file(out / "report.png") as part:
+            draw_run(result, part)
+        with whole_file(out / "surface.png") as part:
+            draw_surface(result, part)
 
 
-@contextlib.contextmanager
+class OpenCell(Session):
+    """A cell for controllers: brought up where its block is entered, stopped where it is left, with its results then.
+
+    One block is one run, however many controllers it runs one after the other: one log, one summary, one folder. The
+    summary's contact and shape are those of the controller that ran last.
+
+    Args:
+        plan: of the scene.
+        out: folder of the results; None writes nothing.
+        say: called with each step.
+        observers: called after each cycle.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        task: whose contact and shape stand in the summary, whatever is run.
+    """
+
+    def __init__(
+        self,
+        plan: Plan,
+        out: Path | None,
+        say: Say,
+        observers: Sequence[AnyObserver] = (),
+        rows_kept: int | None = None,
+        *,
+        task: Controller | None = None,
+    ) -> None:
+        super().__init__(plan, out, say, (), rows_kept)
+        self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface == LOCKSTEP, say=say)
+        self._watchers = tuple(observers)
+        self._task = task
+        self._last: object = task
+        self._result = RunResult.__new__(RunResult)
+
+    def __enter__(self) -> Self:
+        if self._entered:
+            return super().__enter__()  # which refuses it
+        self._bridges.__enter__()
+        try:
+            if watchers := (*self._watchers, *self._bridges.observers):
+                self.observers = Observers(watchers)
+            super().__enter__()
+        except BaseException as error:
+            self._finish(error)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        failure = error
+        try:
+            super().__exit__(kind, error, trace)
+        except BaseException as late:
+            failure = late
+            raise
+        finally:
+            self._finish(failure)
+
+    def run(  # type: ignore[override]
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> RunResult:
+        """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`.
+
+        Returns:
+            The result of the whole block, the same from every call; it is complete when the block is left.
+        """
+        if self._task is None:
+            self._last = controller
+        super().run(controller, progress)
+        return self._result
+
+    def open_to_requests(self, task: Controller) -> Controller:
+        """The task, which other tools may start, stop and set where the scene allows that."""
+        return _requested(self.plan, task, None, self._bridges)
+
+    def _finish(self, failure: BaseException | None) -> None:
+        """What the run was, once the bus is closed; nothing where none was opened."""
+        try:
+            if self.started:
+                self._conclude(failure)
+        finally:
+            self._bridges.end(None)
+
+    def _conclude(self, failure: BaseException | None) -> None:
+        controller, start_s = self._last, self.cell.start_ns * 1e-9
+        estimates = _estimates(self.scene, controller)
+        surface_map, consistency, map_summary = _mapped(self.scene, controller, start_s)
+        summary = summarise(
+            self,
+            controller,
+            estimates,
+            None if failure is None else _reason(failure),
+            map_summary=map_summary,
+            bridges=self._bridges.status(),
+        )
+        summary["bridges"] = self._bridges.end(summary)
+        RunResult.__init__(
+            self._result,
+            self.plan,
+            summary,
+            log_columns(self.cell),
+            self.truth,
+            {name: on_run_clock(records, start_s) for name, records in estimates.items()},
+            getattr(controller, "taxels", None),
+            surface_map,
+            consistency,
+            self.out,
+        )
+        if isinstance(failure, CanprobeError):
+            failure.summary = summary
+        if self.out is not None:
+            try:
+                with interrupts_held():
+                    write_files(self._result, self.out)
+                with interrupts_repeated():
+                    _draw(self._result, self.out, self._say)
+            except (CanprobeError, OSError) as error:
+                summary["faults"].append(str(error))
+                self.unwritten.append(str(error))
+        if self.unwritten and failure is None:
+            unwritten = ResultsError("\n".join(self.unwritten))
+            unwritten.summary = summary
+            raise unwritten
+        for told in self.unwritten:  # what stopped the run counts for more
+            if failure is not None and told != str(failure):
+                failure.add_note(told)
+
+
+def _reason(failure: BaseException) -> str:
+    """Why a run ended, in words."""
+    if isinstance(failure, KeyboardInterrupt):
+        return "interrupted"
+    return str(failure) if isinstance(failure, CanprobeError) else f"{type(failure).__name__}: {failure}"
+
+
 def open_cell(
     scene: Scene,
     *,
@@ -249,28 +364,39 @@ def open_cell(
     out: Path | str | None = None,
     seed: int | None = None,
     say: Say = quiet,
+    force: bool = False,
     observers: Sequence[AnyObserver] = (),
     bridge: Sequence[str] = (),
     rows_kept: int | None = None,
-) -> Iterator[Session]:
-    """Bring a cell up for a controller of your own; leaving always disables the drives and closes the bus.
+) -> OpenCell:
+    """A cell for controllers of your own; leaving its block always disables the drives and closes the bus.
 
     Example::
 
-        with canprobe.open_cell(canprobe.load_scene("free")) as cell:
-            cell.run(my_controller)
+        with canprobe.open_cell(canprobe.load_scene("free"), out="runs/mine") as cell:
+            result = cell.run(my_controller)
+        print(result.text())
+
+    The block is the run: its result is complete, and its files are written, when it is left, however it is left.
 
     Args:
         scene: from :func:`canprobe.load_scene`.
         interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
-        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None writes nothing.
+        out: folder for the same files as those of :func:`run`; None writes nothing.
         say: called with each step.
-        observers, bridge: as for :func:`run`.
-        rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle.
+        force, observers, bridge: as for :func:`run`.
+        rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle. With a
+            number nothing is kept of the truth, and the scan is not scored.
 
     Raises:
-        UsageError: the scene does not fit; nothing was started.
+        UsageError: the scene does not fit, or ``out`` is not empty; nothing was started.
+
+    Entering the block raises:
         BusError: an interface or a node failed.
+        SafetyStop: the probe is pressed on.
+
+    Leaving it raises:
+        ResultsError: a file could not be written.
     """
     resolved = resolve_scene(
         scene,
@@ -282,12 +408,8 @@ def open_cell(
         bridge=bridge,
     )
     folder = Path(out) if out is not None else None
-    plan = make_plan(resolve(resolved))
-    with (
-        Bridges(plan, folder, virtual=resolved.bus.interface == LOCKSTEP, say=say) as bridges,
-        Session(plan, folder, say, (*observers, *bridges.observers), rows_kept) as session,
-    ):
-        yield session
+    check_free(folder, force=force)
+    return OpenCell(make_plan(resolve(resolved)), folder, say, observers, rows_kept)
 
 
 def up(

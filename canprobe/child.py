@@ -23,6 +23,7 @@ from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import HEARTBEAT_BASE
 from canprobe.scene import Scene
 from canprobe.scene_writer import dump_scene
+from canprobe.whole_file import write_text
 
 TOLD_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
@@ -53,14 +54,20 @@ class EmulatorChild:
         out: folder for ``truth.npz``; None uses a temporary one.
         channel: the bus of its nodes.
         truth: whether what is true is recorded, which grows with time.
+        origin_ns: time that is 0 in ``truth.npz``, on the clock that all processes of a machine share.
+
+    Attributes:
+        unwritten: why there is no ``truth.npz`` at the end; None where nothing was wrong with it.
     """
 
-    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True) -> None:
+    def __init__(self, scene: Scene, out: Path | None, channel: str, *, truth: bool = True, origin_ns: int = 0) -> None:
         self._scene = scene
         self._channel = channel
         self._folder = Path(tempfile.mkdtemp(prefix="canprobe-"))
         self._wants_truth = truth
+        self._origin_ns = origin_ns
         self._truth = (out or self._folder) / "truth.npz"
+        self.unwritten: str | None = None
         self._errors: IO[bytes] | None = None
         self._process: subprocess.Popen[bytes] | None = None
         self._clock = MonotonicClock()
@@ -68,9 +75,8 @@ class EmulatorChild:
 
     def start(self) -> None:
         """Start the process."""
-        self._truth.unlink(missing_ok=True)  # of an earlier run into the same folder
         scene_file = self._folder / "scene.toml"
-        scene_file.write_text(dump_scene(self._scene), encoding="utf-8")
+        write_text(scene_file, dump_scene(self._scene))
         bus, nodes = self._scene.bus, self._scene.emulated_node_ids
         command = [
             *(sys.executable, "-m", "canprobe", "emulate", str(scene_file)),
@@ -78,7 +84,7 @@ class EmulatorChild:
             *("--nodes", ",".join(str(n) for n in nodes), "--parent", str(os.getpid())),
         ]
         if self._wants_truth:
-            command += ["--truth", str(self._truth)]
+            command += ["--truth", str(self._truth), "--origin", str(self._origin_ns)]
         self._errors = (self._folder / "stderr").open("w+b")
         self._process = subprocess.Popen(  # no preexec_fn: fork would make the master's first cycles copy its pages
             command,
@@ -164,6 +170,8 @@ class EmulatorChild:
             ):
                 truth = {name: np.asarray(data[name]) for name in data.files}
         if self._errors is not None:
+            words = self._last_words()
+            self.unwritten = words if words.startswith(str(self._truth)) else None
             self._errors.close()
         for leftover in (*self._folder.iterdir(), self._folder):
             leftover.rmdir() if leftover.is_dir() else leftover.unlink()

@@ -35,6 +35,7 @@ def emulate(
     node_ids: tuple[int, ...],
     seed: int | None = None,
     truth_path: Path | None = None,
+    origin_ns: int | None = None,
     store_folder: Path | None = None,
     without_id: tuple[int, ...] = (),
     say: Say = quiet,
@@ -47,6 +48,7 @@ def emulate(
         node_ids: which nodes.
         seed: in the place of the scene's.
         truth_path: file for the plant's true values, written at the end.
+        origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
         store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
         without_id: which of the nodes start without a node id, for LSS to give them one.
         say: called when the nodes are about to be served.
@@ -74,6 +76,8 @@ def emulate(
     with _free_port(interface, channel, wanted, busy, way_out=way_out, say=say) as port:
         rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
+        if world.recorder is not None:
+            world.recorder.origin_ns = port.clock.now_ns() if origin_ns is None else origin_ns
         _keep(world.nodes, store_folder)
         try:
             _serve(

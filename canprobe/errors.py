@@ -9,7 +9,7 @@ CanprobeError
 │   ├── InterfaceError   3  the CAN interface itself
 │   └── NodeError        3  one node: absent, wrong identity, refused an access, failed
 ├── StudyError           3  a study's worker, cell or files failed
-├── ResultsError         3  results that cannot be written
+├── ResultsError         3  a file that cannot be written: no room on the disk, say
 ├── SafetyStop           1  the cell was stopped for safety; the drives are disabled
 └── ProtocolError        3  bytes on the bus that mean nothing where they stand
 """
@@ -99,7 +99,7 @@ class ProtocolError(BusError):
 
 
 class ResultsError(CanprobeError):
-    """What a run measured cannot be written; the drives are disabled."""
+    """A file cannot be written, for want of room say; where a cell was running, its drives are disabled."""
 
 
 class SafetyStop(CanprobeError):  # noqa: N818 - it is a stop, not a mistake

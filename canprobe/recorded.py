@@ -14,7 +14,7 @@ from canprobe.cell.log_cycles import LogCycles
 from canprobe.cell.recording import read_recording
 from canprobe.cell.replay import replay_contacts, replay_task
 from canprobe.cell.tasks.build import estimates_of
-from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.errors import ProtocolError, UsageError
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
@@ -38,8 +38,9 @@ class ReplayResult:
             and was stepped again; ``other``: every contact was fed) with the comparison of ``targets``; ``cycle`` (what
             was missed); ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``;
             ``online`` (the difference to what the run logged, None where there is nothing to compare).
-        estimates: what each estimator said, by name.
-        tracker: the contacts that they were fed.
+        estimates: what each estimator said, by name; its times, as all those of the summary, are on the log's clock.
+        tracker: the contacts that they were fed, and what the scene's estimator said of them, with times since the
+            first SYNC.
     """
 
     plan: Plan
@@ -96,7 +97,9 @@ def replay(
     summary = summarise_replay(
         plan, recording, cycles, task, tracker=tracker, unplaced=unplaced, estimates=estimates, folder=folder
     )
-    return ReplayResult(plan, summary, estimates, tracker)
+    start_s = cycles.start_ns * 1e-9
+    on_clock = {name: on_run_clock(records, start_s) for name, records in estimates.items()}
+    return ReplayResult(plan, summary, on_clock, tracker)
 
 
 # what to read

@@ -14,17 +14,16 @@ from canprobe.bridging import Bridges
 from canprobe.bus.candump import read_candump
 from canprobe.bus.clock import MonotonicClock
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.deadlines import find_deadlines
 from canprobe.cell.log_cycles import LogCycles
-from canprobe.cell.measurement import Command, Measurement
+from canprobe.cell.measurement import Command
 from canprobe.cell.observe import Observation
 from canprobe.cell.recording import Recording, read_recording
 from canprobe.npz_file import read_npz
 from canprobe.planning import Plan, make_plan
 from canprobe.planning.bridges import BRIDGES, check_bridges
-from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.recorded import ReplayResult, find_log, replay, scene_of
+from canprobe.results import check_clock
 from canprobe.scene import BridgeSettings, Scene
 from canprobe.scene_resolve import resolve
 from canprobe.session import LOCKSTEP, Say
@@ -118,58 +117,41 @@ class _Observations:
         self._recording = read_recording(path, plan, as_taken=self._as_taken)
         self._drifts = folder is None
         self._estimates = _estimates(result)
-        self._columns = _columns(folder) if self._ours else {}
+        self._folder = folder
 
     def __iter__(self) -> Iterator[Observation]:
         groups = _frames_by_sync(self._path, self._recording)
-        first_ns = self._first_ns()
         before = next(groups)
         if before:
             yield Observation(before[-1][2], None, None, before)
         cycles = LogCycles(
             self._plan, self._recording, as_taken=self._as_taken, on_deadlines=self._ours, drifts=self._drifts
         )
+        columns = _columns(self._folder, cycles.start_ns, self._plan.sync.period_ns) if self._ours else {}
         for cycle, frames in zip(cycles, groups, strict=True):
             m = cycle.measurement
-            yield Observation(first_ns + m.t_ns, m, self._command(m), frames)
-
-    def _first_ns(self) -> int:
-        stamps = self._recording.sync_stamps
-        if not self._ours:
-            return int(stamps[0])
-        numbers, _ = find_deadlines(stamps, self._plan.sync.period_ns, None)
-        return int(np.min(stamps - self._wire_times() - numbers * self._plan.sync.period_ns))
-
-    def _wire_times(self) -> NDArray[np.int64]:
-        """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate has the ends of frames."""
-        bus, recording = self._plan.scene.bus, self._recording
-        if bus.interface != LOCKSTEP or not bus.timed or bus.fd is True:
-            return np.zeros(len(recording.syncs), np.int64)
-        syncs = (recording.frames[i] for i in recording.syncs.tolist())
-        bits = np.array([exact_bits(can_id, data) - INTERMISSION_BITS for can_id, data, _ in syncs])
-        return bits * 1_000_000_000 // bus.bitrate
-
-    def _command(self, m: Measurement) -> Command | None:
-        columns = self._columns.get(m.t_ns, {})
-        estimate = self._estimates.get(m.t_ns)
-        return Command(columns=columns, estimate=estimate) if columns or estimate is not None else None
+            logged, estimate = columns.get(m.t_ns, {}), self._estimates.get(m.t_ns)
+            command = Command(columns=logged, estimate=estimate) if logged or estimate is not None else None
+            yield Observation(cycles.start_ns + m.t_ns, m, command, frames)
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
-    """What the scene's estimator said, by the time of the cycle, ns."""
-    if result is None:
-        return {}
-    records = next(iter(result.estimates.values()))
-    return {round(record.told_s * 1e9): record.estimate for record in records}
+    """What the scene's estimator said, by the cycle's time since the first, ns."""
+    return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
 
 
-def _columns(folder: Path | None) -> dict[int, dict[str, float | NDArray[np.float64]]]:
-    """What the bridges use of the task's columns, by the time of the cycle, ns, where the run logged it."""
+def _columns(folder: Path | None, start_ns: int, period_ns: int) -> dict[int, dict[str, float | NDArray[np.float64]]]:
+    """What the bridges use of the task's columns, where the run logged it, by the cycle's time since the first, ns.
+
+    ``start_ns`` comes from the stamps of SYNCs, which are late by less than half a period at the best of times.
+    """
     if folder is None or not (folder / "log.npz").is_file():
         return {}
     log = read_npz(folder / "log.npz")
+    check_clock(folder / "log.npz", log)
     names = [name for name in LOGGED if name in log]
-    times = np.round(log["t_s"] * 1e9).astype(np.int64).tolist() if names else []
+    cycles = np.round((log["t_s"] * 1e9 - start_ns) / period_ns) if names else np.empty(0)
+    times = (cycles.astype(np.int64) * period_ns).tolist()
     rows = zip(*(log[name].tolist() for name in names), strict=True)
     return {
         t_ns: {name: value for name, value in zip(names, row, strict=True) if np.isfinite(value)}

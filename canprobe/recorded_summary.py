@@ -50,16 +50,17 @@ def summarise_replay(
         folder: of the run, for ``truth.npz`` and ``log.npz``; None for a log alone.
     """
     truth = _truth(folder / "truth.npz") if folder is not None else {}
+    start_s = cycles.start_ns * 1e-9
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
         "log": str(recording.path),
         "channel": recording.channel,
         "driven_by": "task" if task.drove else "other",
-        "targets": _targets(task),
+        "targets": _targets(task, start_s),
         "cycle": _cycle(cycles, recording, unplaced),
         "contacts": len(tracker.samples),
-        "estimates": {name: _last(records) for name, records in estimates.items()},
+        "estimates": {name: _last(records, start_s) for name, records in estimates.items()},
         "shape": summarise_shape(
             plan.scene,
             tracker,
@@ -95,13 +96,13 @@ def _truth(path: Path) -> dict[str, Array]:
     return columns
 
 
-def _targets(task: TaskReplay) -> dict[str, float | None]:
+def _targets(task: TaskReplay, start_s: float) -> dict[str, float | None]:
     return {
         "compared": task.compared,
         "differing": task.differing,
         "worst_counts": task.worst_counts,
-        "lifted_s": task.lifted_s,
-        "parted_s": task.parted_s,
+        "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
+        "parted_s": None if task.parted_s is None else start_s + task.parted_s,
     }
 
 
@@ -122,14 +123,14 @@ def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, 
     }
 
 
-def _last(records: Sequence[ShapeRecord]) -> dict[str, Any]:
+def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
     """How many answers an estimator gave, and its last one."""
     if not records:
         return {"count": 0, "t_s": None, "kappa_per_m": None, "observed": None}
     record = records[-1]
     return {
         "count": len(records),
-        "t_s": record.t_s,
+        "t_s": start_s + record.t_s,
         "kappa_per_m": finite_or_none(record.estimate.kappa),
         "observed": [bool(o) for o in record.estimate.observed],
     }
@@ -206,6 +207,6 @@ def _estimate_lines(summary: dict[str, Any]) -> list[str]:
     if summary["shape"]["kappa_true_per_m"] is not None:
         return shape_lines(summary["shape"])
     return [
-        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])} 1/m, the last of {last['count']} estimates"
+        f"  curvature  {name}: {curvature_text(last['kappa_per_m'])}, the last of {last['count']} estimates"
         for name, last in summary["estimates"].items()
     ]

@@ -41,10 +41,14 @@ SCHEMA = 1
 class RunResult:
     """One finished run.
 
+    That of :func:`canprobe.open_cell` is there when a controller has ended, and complete when the block is left: until
+    then the drives are not disabled, the bus is not closed, and nothing may be asked of it.
+
     Attributes:
         plan: what was planned.
         summary: the content of ``summary.json``.
-        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit.
+        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+            and in the estimates counts from the instant that is 0 in ``bus.log``.
         truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
         estimates: what each estimator said, by name; the online one first.
         taxels: (16, 16) counts of the task's last tactile frame, or None.
@@ -62,6 +66,16 @@ class RunResult:
     surface_map: SurfaceMap | None = None
     consistency: Consistency | None = None
     out: Path | None = None
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Only what is not there is asked for here: before the run is finished, everything."""
+            if name not in RunResult.__slots__:
+                raise AttributeError(f"RunResult has no attribute {name!r}")
+            raise UsageError(
+                f"result.{name}: complete when the block of open_cell is left; ask for it behind the block"
+            )
 
     def text(self) -> str:
         """The summary for people."""
@@ -119,7 +133,7 @@ def summarise(
     cycle = cell.cycle
     sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
     wall = session.wall_ns * 1e-9
-    log = log_columns(cell)
+    log = cell.log.arrays()
     summary = {
         "schema": SCHEMA,
         "scene": scene.name,
@@ -132,7 +146,12 @@ def summarise(
         "realtime_factor": sim_time / wall if wall > 0 else None,
         "contact": _contact(session, controller, log),
         "shape": summarise_shape(
-            scene, getattr(controller, "shape", None), estimates, _truth(session), log["t_s"], map_summary=map_summary
+            scene,
+            getattr(controller, "shape", None),
+            estimates,
+            _truth(session),
+            log.get("t_s", np.empty(0)),
+            map_summary=map_summary,
         ),
         "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
@@ -151,8 +170,22 @@ def summarise(
 
 
 def log_columns(cell: Cell) -> dict[str, Array]:
-    """The columns of ``log.npz``; a run that was stopped before its first cycle has the time's, without a row."""
-    return {"t_s": np.empty(0), **cell.log.arrays()}
+    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
+    log = {"t_s": np.empty(0), **cell.log.arrays()}
+    return {**log, "t_s": log["t_s"] + cell.start_ns * 1e-9}
+
+
+def check_clock(file: Path, log: Mapping[str, Array]) -> None:
+    """Refuse the log of an earlier canprobe, whose times counted from the first SYNC: no cycle is due at 0.
+
+    Raises:
+        UsageError: it is such a log.
+    """
+    if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
+        raise UsageError(
+            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
+            " wrote them; run the scene again"
+        )
 
 
 def _without_nan(value: Any) -> Any:
@@ -191,7 +224,7 @@ def _scan(controller: object) -> tuple[int, int] | None:
 
 
 def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
-    task, scan = session.scene.task, _scan(controller)
+    task, scan = session.scene.task, _scan(controller) if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
@@ -231,7 +264,7 @@ def summarise_shape(
         tracker: its contacts; None without a shape.
         estimates: what each estimator said, by name.
         truth: columns of the plant's truth, one row a SYNC; empty where there is none.
-        sync_times: time of each SYNC on the master's clock (n,), s.
+        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
         map_summary: of the scan's surface map.
     """
     names = (
@@ -345,13 +378,11 @@ def write_files(result: RunResult, out: Path) -> None:
     """Write what a run leaves in ``out``, besides the files that are there already and the figures.
 
     Raises:
-        OSError: one cannot be written; no part of it is left, nor the one of an earlier run.
+        ResultsError: one cannot be written; no part of it is left.
     """
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     write_text(out / "scene.toml", dump_scene(result.plan.scene))
     write_npz(out / "log.npz", result.log)
-    for name in ("surface.npz", FILE):
-        (out / name).unlink(missing_ok=True)  # of an earlier run
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
         write_text(out / FILE, text)
     if result.surface_map is not None:
@@ -410,16 +441,23 @@ def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def curvature_text(values: Sequence[float | None] | None) -> str:
-    """Principal curvatures as people read them."""
-    return "–" if values is None else ", ".join("not observed" if v is None else f"{v:.2f}" for v in values)
+    """Principal curvatures as people read them, with their unit."""
+    if values is None:
+        return "–"
+    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
+    if not observed:
+        return "not observed"
+    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
 
 
 def shape_lines(shape: dict[str, Any]) -> list[str]:
     """The section ``shape`` of a summary as lines for people."""
-
     estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
-    lines = [f"  curvature  {estimated} 1/m, true {true} 1/m"]
+    lines = [f"  curvature  {estimated}; true {true}"]
     for name, score in shape.get("methods", {}).items():
+        if score["estimates"] == 0:
+            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
+            continue
         percent = score["kappa_rms_error_percent"]
         lines.append(
             f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"

@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,7 +29,7 @@ from canprobe.cell.cell import Cell
 from canprobe.cell.link_checks import expected_of
 from canprobe.cell.measurement import Command, Controller, Measurement
 from canprobe.cell.observe import Observation, Observer, Observers
-from canprobe.errors import UsageError
+from canprobe.errors import CanprobeError, UsageError
 from canprobe.link_report import check_links, need_controllers
 from canprobe.npz_file import write_npz
 from canprobe.planning import Plan, make_plan
@@ -47,6 +47,11 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
+LEFT_BY_RUNS = (
+    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("surface.png", "tool.toml", "truth.npz"),
+)
+"""Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
 """Is told each step, in words."""
@@ -111,6 +116,8 @@ class Session:
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
+        origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
+        unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
         joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
@@ -128,6 +135,7 @@ class Session:
         self.out = out
         self.started_ns = 0
         self.wall_ns = 0
+        self.origin_ns = 0
         self._bus_start_ns = 0
         self._bus_time_ns = 0
         self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
@@ -135,20 +143,21 @@ class Session:
         self.truth: dict[str, Array] = {}
         self.lockstep: LockstepBus | None = None
         self._ports: dict[str, Port] = {}
+        self.unwritten: list[str] = []
         self._candump: CandumpWriter | None = None
         self.world: World | None = None
         self.joins: Callable[[Any], Any] = lambda participant: participant
         self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
-        self._entered = False
+        self._entered = self._left = False
         self._cell: Cell | None = None
 
     @property
     def cell(self) -> Cell:
         """The cell, while the session is open or afterwards."""
         if self._cell is None:
-            raise UsageError("the cell is not open: use `with open_cell(scene) as cell:`")
+            raise UsageError("the cell is not open: use `with canprobe.open_cell(scene) as cell:`")
         return self._cell
 
     @property
@@ -161,13 +170,18 @@ class Session:
         """The nodes were brought up."""
         return self._cell is not None and self._cell.cycle is not None
 
+    @property
+    def keeps_all(self) -> bool:
+        """Every cycle has its row in the log, and every SYNC one in the truth."""
+        return self._rows_kept is None
+
     def bus_load(self, channel: str) -> float | None:
         """Measured share of a bus's bit rate, from the first frame to the last."""
         if channel not in self.traffic or self._bus_time_ns <= 0:
             return None
         return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> Self:
         if self._entered:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
         self._entered = True
@@ -184,6 +198,7 @@ class Session:
                 log_failure=self._log_failure,
                 observers=self.observers,
                 rows_kept=self._rows_kept,
+                origin_ns=self.origin_ns,
             )
             if self.scene.bus.interface != LOCKSTEP:
                 self._get_ready(port)
@@ -210,15 +225,22 @@ class Session:
         progress: Callable[[Measurement], None] = lambda _: None,
     ) -> None:
         """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`."""
+        if self._left:
+            raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
         self.cell.run(controller, progress)
 
     def _close(self) -> None:
         try:
             self._stack.close()
         finally:
+            self._left = True
             self.wall_ns = elapsed_ns() - self.started_ns
-            if (failure := self._log_failure()) is not None:
-                self._note(f"the log is not whole: {failure}")
+            self._note_unwritten(self._log_failure())
+
+    def _note_unwritten(self, told: str | None) -> None:
+        if told is not None and self._cell is not None:
+            self.unwritten.append(told)
+            self._note(told)
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
@@ -235,17 +257,19 @@ class Session:
     def _open(self) -> Port:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
-    def _writer(self, channel: str, t0_ns: int) -> Write:
+    def _writer(self, channel: str) -> Write:
         write: Write = lambda _id, _data, _t: None  # noqa: E731
         if self.out is not None:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
-                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, t0_ns=t0_ns))
-                with contextlib.suppress(OSError):  # it is written again at the end, and a failure told
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                for name in LEFT_BY_RUNS:
+                    (self.out / name).unlink(missing_ok=True)  # of an earlier run
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
-            self.observers.origin_ns = t0_ns
+            self.observers.origin_ns = self.origin_ns
             write = self.observers.tap(write)
         if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
             return self._metered(channel, write if self.out is not None or self.observers is not None else None)
@@ -293,10 +317,10 @@ class Session:
         clock = VirtualClock()
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
-            bus.recorder = self._writer(channel, 0)
+            bus.recorder = self._writer(channel)
             bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
-        self.world = make_world(self.plan, self.scene.emulated_node_ids)
+        self.world = make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
         self._stack.callback(self._keep_truth)
         channel_of = {node.node_id: node.channel for node in self.plan.nodes}
         for node in self.world.nodes:
@@ -312,8 +336,8 @@ class Session:
             if self.out is not None:
                 try:
                     write_npz(self.out / "truth.npz", self.truth)
-                except OSError as error:
-                    self._note(f"truth.npz could not be written: {error.strerror or error}")
+                except CanprobeError as error:
+                    self._note_unwritten(str(error))
 
     def _open_real(self) -> Port:
         bus = self.scene.bus
@@ -326,11 +350,11 @@ class Session:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
-        t0_ns = clock.now_ns()
+        self.origin_ns = clock.now_ns()
         real = self._ports = self._stack.enter_context(
             open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
         )
-        return self._join({name: RecordingPort(port, Sink(self._writer(name, t0_ns))) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
@@ -342,7 +366,7 @@ class Session:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
             emulated = next(node.channel for node in self.plan.nodes if node.emulated)
-            child = EmulatorChild(self.scene, self.out, emulated, truth=self._rows_kept is None)
+            child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")
@@ -355,3 +379,4 @@ class Session:
 
     def _end_child(self, child: Any) -> None:
         self.truth = child.end()
+        self._note_unwritten(child.unwritten)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.npz_file import read_npz, write_npz
+from canprobe.whole_file import whole_file
 
 if TYPE_CHECKING:
     import pandas
@@ -132,6 +133,7 @@ def write_parquet(
 
     Raises:
         UsageError: the extra is missing, or columns differ in length.
+        ResultsError: the file cannot be written.
     """
     arrow = _need("pyarrow", "Parquet")
     cells = _cells(columns)
@@ -148,7 +150,9 @@ def write_parquet(
         arrays.append(array)
     units = {cell.name: unit_of(cell.of) for cell in cells}
     schema = arrow.schema(fields, metadata={_ATTRS: json.dumps({**(attrs or {}), "units": units})})
-    _need("pyarrow.parquet", "Parquet").write_table(arrow.Table.from_arrays(arrays, schema=schema), path)
+    parquet = _need("pyarrow.parquet", "Parquet")
+    with whole_file(Path(path)) as part:
+        parquet.write_table(arrow.Table.from_arrays(arrays, schema=schema), part)
 
 
 def _cells(columns: Mapping[str, NDArray[Any]]) -> list[_Cell]:

@@ -6,22 +6,36 @@ import os
 
 import pytest
 
+from canprobe.errors import ResultsError, UsageError
 from canprobe.whole_file import whole_file, write_text
 
 WHOLE = b"what was there before"
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device", "x")])
-def test_a_file_is_written_whole_or_not_at_all(error, tmp_path):
+@pytest.mark.parametrize("older", [True, False])
+@pytest.mark.parametrize("error", [KeyboardInterrupt, OSError(28, "No space left on device")])
+def test_a_file_is_written_whole_or_not_at_all(error, older, tmp_path):
     path = tmp_path / "log.npz"
-    path.write_bytes(WHOLE)
-    with pytest.raises(BaseException) as raised, whole_file(path) as part:
+    if older:
+        path.write_bytes(WHOLE)
+    with pytest.raises((KeyboardInterrupt, ResultsError)) as raised, whole_file(path) as part:
+        assert part.suffix == ".npz"  # by which libraries choose what they write
         part.write_bytes(b"PK")
         raise error
-    if isinstance(error, OSError):  # an old file beside new ones would be taken for one of them
-        assert list(tmp_path.iterdir()) == [] and raised.value.filename == str(path)
-    else:
-        assert list(tmp_path.iterdir()) == [path] and path.read_bytes() == WHOLE
+    if isinstance(error, OSError):
+        assert str(raised.value) == f"{path}: cannot be written: No space left on device"
+    assert [(file, file.read_bytes()) for file in tmp_path.iterdir()] == [(path, WHOLE)] * older
+
+
+def test_where_no_file_can_be_is_wrong_usage(tmp_path):
+    with pytest.raises(UsageError, match=r"none/a\.txt: cannot be written: No such file or directory"):
+        write_text(tmp_path / "none" / "a.txt", "")
+
+
+def test_a_block_that_writes_nothing_changes_nothing(tmp_path):
+    with whole_file(tmp_path / "surface.png"):
+        pass
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_link_stays_a_link_and_a_device_a_device(tmp_path):

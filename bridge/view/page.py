@@ -22,6 +22,7 @@ from canprobe.bridge.view.replay import shape_of, trail_of
 from canprobe.bridge.view.server import open_server
 from canprobe.bridge.view.stage import Stage
 from canprobe.bridge.view.trail import error_scale
+from canprobe.whole_file import write_text
 
 FRAME_S = 0.04
 MOST_FRAMES = 900
@@ -37,6 +38,7 @@ def write_page(run: RecordedRun, file: Path) -> None:
 
     Raises:
         UsageError: viser is not installed.
+        ResultsError: the file cannot be written.
     """
     times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
     page = _record(run, times)
@@ -45,7 +47,7 @@ def write_page(run: RecordedRun, file: Path) -> None:
     data = json.dumps(_panel_data(run, times), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     title = _escaped(f"canprobe: {run.title}")
     head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
-    file.write_text(f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}", encoding="utf-8")
+    write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
 
 
 def _record(run: RecordedRun, times: Any) -> str:

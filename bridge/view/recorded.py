@@ -18,7 +18,7 @@ from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigm
 from canprobe.bridge.view.recorded_taxels import read_taxels
 from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import UsageError
-from canprobe.results import SCHEMA
+from canprobe.results import SCHEMA, check_clock
 from canprobe.scene import Scene
 from canprobe.scene_geometry import true_object
 from canprobe.scene_loader import load_scene
@@ -161,6 +161,7 @@ def _read_log(file: Path) -> dict[str, Array]:
     rows = len(log["t_s"]) if "t_s" in log and log["t_s"].ndim else 0
     if rows == 0:
         raise UsageError(f"{file}: expected a column 't_s' with a row for each cycle, got none")
+    check_clock(file, log)
     for name, values in log.items():
         if values.shape != (rows, *_SHAPES[name]) or values.dtype.kind != "f":
             raise UsageError(

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from canprobe.bus.candump import read_candump
 from canprobe.cell.build import make_tactile
 from canprobe.planning import make_plan
-from canprobe.protocol.frames import SYNC_ID
 from canprobe.scene import Scene
 from canprobe.scene_resolve import resolve
 
@@ -18,7 +17,7 @@ TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
 
 
 def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
-    """Tactile frames with the time of their arrival after the first SYNC.
+    """Tactile frames with the time of their arrival, on the clock of the log.
 
     Args:
         file: a candump log; nothing comes from one that does not exist.
@@ -35,12 +34,9 @@ def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
         return ()
     receiver = make_tactile(make_plan(resolve(scene)))
     assert receiver is not None
-    start: int | None = None
     frames = []
-    for t_ns, _, can_id, data in read_candump(file, only={SYNC_ID, *receiver.cob_ids}):
-        if start is None and can_id == SYNC_ID:
-            start = t_ns
+    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
         frame = receiver.assembler.push(can_id, data, t_ns)
-        if frame is not None and start is not None:
-            frames.append(((t_ns - start) * 1e-9, frame.taxels))
+        if frame is not None:
+            frames.append((t_ns * 1e-9, frame.taxels))
     return tuple(frames)

@@ -95,7 +95,7 @@ class CandumpWriter:
             while written < len(data):
                 written += self._file.write(data[written:])
         except OSError as error:
-            self.failure = f"{self._path}: {error.strerror}"
+            self.failure = f"{self._path}: cannot be written: {error.strerror or error}"
             with contextlib.suppress(OSError):
                 self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
         self._size += written

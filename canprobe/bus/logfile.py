@@ -6,26 +6,28 @@ any other name is read too.
 
 from __future__ import annotations
 
-import itertools
 import struct
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import can
 
 from canprobe.bus.candump import format_line, read_candump
 from canprobe.bus.port import EFF_FLAG, ERR_BUS, ERR_FLAG, RTR_FLAG
 from canprobe.errors import UsageError
+from canprobe.whole_file import whole_file
 
 _READERS: dict[str, Any] = {".asc": can.ASCReader, ".blf": can.BLFReader, ".trc": can.TRCReader}
+_WRITERS: dict[str, Any] = {".asc": can.ASCWriter, ".blf": can.BLFWriter, ".trc": can.TRCWriter}
+_Logged = tuple[int, str, int, bytes]
 FOREIGN = tuple(_READERS)
 """Suffixes of the forms that python-can writes and reads for us."""
 _CANDUMP = (".log", ".txt", "")
 _STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFFFFFF
 
 
-def read_log(path: str | Path) -> Iterator[tuple[int, str, int, bytes]]:
+def read_log(path: str | Path) -> Iterator[_Logged]:
     """Read a log in the form that its suffix names.
 
     Yields:
@@ -64,32 +66,34 @@ def convert_log(source: str | Path, target: Path) -> int:
     Raises:
         UsageError: source and target are one file, one of them cannot be opened, the source is no log, or the target's
             suffix names no form.
+        ResultsError: the target cannot be written; an older one is as it was.
     """
-    if target.suffix.lower() not in (*FOREIGN, *_CANDUMP):
+    form = target.suffix.lower()
+    if form not in (*FOREIGN, *_CANDUMP):
         raise UsageError(f"{target}: expected .log (candump), {', '.join(FOREIGN)}, got {target.suffix}")
     if target.exists() and target.samefile(source):
         raise UsageError(f"{target}: a log cannot be converted into itself")
-    frames = read_log(source)
-    first = next(frames, None)  # a source that cannot be read leaves no target
-    every = itertools.chain(() if first is None else (first,), frames)
-    try:
-        return _write_foreign(every, target) if target.suffix.lower() in FOREIGN else _write_candump(every, target)
-    except OSError as error:
-        raise UsageError(f"{target}: {error.strerror or error}") from error
+    write = _write_candump if form in _CANDUMP else _write_foreign
+    with (
+        whole_file(target) as part,
+        part.open("wb") if form == ".blf" else part.open("w", encoding="utf-8", newline="\n") as file,
+    ):
+        return write(read_log(source), file, target)
 
 
-def _write_candump(frames: Iterable[tuple[int, str, int, bytes]], target: Path) -> int:
+def _write_candump(frames: Iterable[_Logged], file: IO[Any], _: Path) -> int:
     count = 0
-    with target.open("w", encoding="ascii", newline="\n") as file:
-        for t_ns, channel, can_id, data in frames:
-            file.write(format_line(channel, can_id, data, t_ns))
-            count += 1
+    for t_ns, channel, can_id, data in frames:
+        file.write(format_line(channel, can_id, data, t_ns))
+        count += 1
     return count
 
 
-def _write_foreign(frames: Iterable[tuple[int, str, int, bytes]], target: Path) -> int:
+def _write_foreign(frames: Iterable[_Logged], file: IO[Any], target: Path) -> int:
     count = 0
-    with can.Logger(target) as writer:
+    with _WRITERS[target.suffix.lower()](file) as writer:
+        if isinstance(writer, can.TRCWriter):
+            writer.filepath = str(target.absolute())  # stands in its header
         for frame in frames:
             writer.on_message_received(_message(*frame))
             count += 1

@@ -40,6 +40,7 @@ def make_cell(
     log_failure: Callable[[], str | None] = lambda: None,
     observers: Observers | None = None,
     rows_kept: int | None = None,
+    origin_ns: int = 0,
 ) -> Cell:
     """The cell of a plan on a port; nothing is sent before it is entered.
 
@@ -51,6 +52,7 @@ def make_cell(
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
+        origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
     """
     settings = CycleSettings(
         period_ns=plan.sync.period_ns,
@@ -75,6 +77,7 @@ def make_cell(
         log_failure=log_failure,
         observers=observers,
         rows_kept=rows_kept,
+        origin_ns=origin_ns,
     )
 
 

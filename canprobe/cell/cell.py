@@ -65,9 +65,11 @@ class Cell:
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
+        origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
 
     Attributes:
-        log: one row a cycle.
+        log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
+            how long bring-up took; `start_ns` brings them onto the run's clock.
         notes: what went wrong and was lived with.
         supervisor: the checks, from bring-up on.
     """
@@ -88,8 +90,10 @@ class Cell:
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
         rows_kept: int | None = None,
+        origin_ns: int = 0,
     ) -> None:
         self.log = RunLog(rows_kept)
+        self._origin_ns = origin_ns
         self._rows_kept = rows_kept
         self.drives = drives
         self.tactile = tactile
@@ -107,10 +111,16 @@ class Cell:
         self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
         self._holding = False
         self._running = False
+        self._retreats_for: CanprobeError | None = None
         self._tracker: object = None
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
+
+    @property
+    def start_ns(self) -> int:
+        """When the first cycle was due, on the run's clock; 0 where it came to none."""
+        return self.cycle.t_first_ns - self._origin_ns if self.cycle is not None else 0
 
     @property
     def faults(self) -> list[str]:
@@ -199,6 +209,7 @@ class Cell:
         Raises:
             UsageError: this is no controller, it returned no `Command`, or another one is running.
             SafetyStop: the controller or the supervision stopped the cell.
+            ResultsError: frames can no longer be written down.
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
         """
@@ -219,6 +230,7 @@ class Cell:
         retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
         update: Callable[[], None] | None = getattr(controller, "update", None)
         self._tracker = getattr(controller, "shape", None)
+        self._retreats_for = None
         self._enable(getattr(controller, "inspect", None))
         assert self.cycle is not None
         with Interrupts(self._stuck) as interrupts:
@@ -234,7 +246,8 @@ class Cell:
                 self._record(measurement, command)
                 progress(measurement)
                 if command.stop_reason is not None:
-                    raise SafetyStop(command.stop_reason)
+                    found = self._retreats_for
+                    raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
                 if command.done:
                     return
 
@@ -353,7 +366,7 @@ class Cell:
                 self._react(finding, retreat)
         elif not self._holding:
             self._holding = True
-            self.notes.add_error(finding.error, "hold", measurement.t_ns * 1e-9)
+            self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
         return self._holding
 
     def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
@@ -366,6 +379,7 @@ class Cell:
     def _react(self, finding: Finding, retreat: Callable[[str], None] | None) -> None:
         reaction = finding.condition.reaction
         if reaction is Reaction.RETREAT and retreat is not None:
+            self._retreats_for = self._retreats_for or finding.error
             retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
@@ -378,7 +392,7 @@ class Cell:
         if self._lift_from is None or not supervisor.pressing() or supervisor.must_stop():
             return
         lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
-        t_s = supervisor.seen.measurement.t_ns * 1e-9
+        t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:
             self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
             return
@@ -398,9 +412,8 @@ class Cell:
             self._look(self.cycle.begin())
 
     def _note_alarms(self) -> None:
-        first_ns = self.cycle.t_first_ns if self.cycle is not None else 0
         for event in self.watch.news():
-            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - first_ns) * 1e-9)
+            self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - self._origin_ns) * 1e-9)
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
@@ -414,8 +427,8 @@ class Cell:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
         self.log.add(row)
-        if self._observers is not None and self.cycle is not None:
-            self._observers.cycle(self.cycle.t_first_ns, measurement, command)
+        if self._observers is not None:
+            self._observers.cycle(self.start_ns, measurement, command)
 
     # the way out
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from canprobe.bus.port import ControllerState
 from canprobe.cell.supervision import Contact, Seen
-from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState
 
@@ -175,9 +175,9 @@ def estimator_restarts(seen: Seen) -> int:
     return seen.restarts
 
 
-def log_failed(seen: Seen) -> SafetyStop | None:
+def log_failed(seen: Seen) -> ResultsError | None:
     """Frames are no longer written down."""
-    return SafetyStop(f"the log cannot be written: {seen.log_failure}") if seen.log_failure is not None else None
+    return ResultsError(seen.log_failure) if seen.log_failure is not None else None
 
 
 # the touch

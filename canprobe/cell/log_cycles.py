@@ -19,6 +19,7 @@ from canprobe.cell.recording import STAMP_JITTER_NS, Recording
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
+from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 
 DRIFT_BLOCK = 400
 """SYNCs over which another logger's clock does not drift by a noticeable share of a period."""
@@ -59,6 +60,11 @@ class LogCycles:
             whom neither deadlines nor looks are known: it is the stamp of its SYNC, and what came before the next SYNC
             belongs to it.
         drifts: the stamps are another clock's than the master's.
+
+    Attributes:
+        start_ns: when the first cycle was due, on the clock of the log. A measurement's time counts from there.
+        sync_times_s: time of each SYNC, from there.
+        lost_syncs: SYNCs that the log lacks.
     """
 
     def __init__(
@@ -77,6 +83,9 @@ class LogCycles:
         stamps = recording.sync_stamps
         numbers, deadlines = find_deadlines(stamps, plan.sync.period_ns, DRIFT_BLOCK if drifts else None)
         self._times = (numbers * plan.sync.period_ns if on_deadlines else stamps - stamps[0]).tolist()
+        self.start_ns = int(stamps[0])
+        if on_deadlines:
+            self.start_ns = int(np.min(stamps - _wire_times(plan, recording) - numbers * plan.sync.period_ns))
         looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
         waited = (plan.traffic.budget.sync_ns or 0) + STAMP_JITTER_NS  # for the bus, or so its stamp says
         on_time = stamps - deadlines <= waited
@@ -165,6 +174,16 @@ def _check_states(drives: DriveGroup) -> None:
     for axis, word in zip(drives.axes, drives.statuswords, strict=True):
         if known_state(word) is None:
             raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
+
+
+def _wire_times(plan: Plan, recording: Recording) -> NDArray[np.int64]:
+    """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate has the ends of frames."""
+    bus = plan.setup.bus
+    if bus.interface != "lockstep" or not bus.timed or bus.fd is True:
+        return np.zeros(len(recording.syncs), np.int64)
+    syncs = (recording.frames[i] for i in recording.syncs.tolist())
+    bits = np.array([exact_bits(can_id, data) - INTERMISSION_BITS for can_id, data, _ in syncs])
+    return bits * 1_000_000_000 // bus.bitrate
 
 
 def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:

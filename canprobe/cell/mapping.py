@@ -16,14 +16,15 @@ SAME_DIRECTION_RAD = math.radians(30.0)
 """Passes that differ by less than this felt the place alike, hysteresis included."""
 
 
-def map_of_scan(tracker: ShapeTracker, method: str) -> SurfaceMap:
+def map_of_scan(tracker: ShapeTracker, method: str, start_s: float = 0.0) -> SurfaceMap:
     """Merge what the estimator in the loop said along a scan.
 
     Args:
         tracker: with the answers and the contacts of the scan.
         method: name of the estimator.
+        start_s: when the first SYNC was due, on the run's clock.
     """
-    patches = [LocalPatch.of(r.estimate, t_s=r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
+    patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
     path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
     return merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
 

@@ -34,8 +34,8 @@ class _Kind:
         if self.first_s is None or self.last_s is None:
             return ""
         if self.times == 1:
-            return f", {_time_text(self.first_s)}"
-        return f", first {_time_text(self.first_s)}, last {_time_text(self.last_s)}"
+            return f", at {self.first_s:.2f} s"
+        return f", first at {self.first_s:.2f} s, last at {self.last_s:.2f} s"
 
 
 class Notes:
@@ -55,7 +55,7 @@ class Notes:
         Args:
             what: names the kind; nothing in it may change from one time to the next.
             node_id: the node that it happened to.
-            t_s: seconds since the first SYNC.
+            t_s: on the run's clock.
         """
         if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
             what = OTHERS
@@ -84,7 +84,3 @@ def nodes_text(node_ids: Iterable[int]) -> str:
     runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]
     parts = [part for run in runs for part in ([f"{run[0]}-{run[-1]}"] if len(run) > 2 else map(str, run))]
     return f"node{'s' * (len(ids) > 1)} {', '.join(parts)}"
-
-
-def _time_text(t_s: float) -> str:
-    return f"at {t_s:.2f} s" if t_s >= 0 else "before the first SYNC"

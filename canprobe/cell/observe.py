@@ -25,7 +25,7 @@ class Observation:
     """One cycle as an observer sees it, once its commands are on the bus.
 
     Attributes:
-        t_ns: deadline of its SYNC since the bus was opened, ns, as in `bus.log`. A time of the cycle's own, such as
+        t_ns: deadline of its SYNC on the run's clock, ns, as in `bus.log`. A time of the cycle's own, such as
             `measurement.t_ns` or a tactile sample's, is on this clock with `t_ns - measurement.t_ns` added.
         measurement: what the cell saw; None in an observation of frames alone, at bring-up and after the last cycle.
         command: what the controller said; None while the drives are enabled and stopped.
@@ -52,7 +52,7 @@ class Observers:
         observers: whom to call.
 
     Attributes:
-        origin_ns: when the bus was opened, on the clock of its frames.
+        origin_ns: where the run's clock is 0, on the clock of the frames.
         cost_ns: what all of them took together, every ``TIMED_CYCLES`` cycles.
         faults: those that failed, one line each.
     """
@@ -75,19 +75,18 @@ class Observers:
 
         return both
 
-    def cycle(self, first_ns: int, measurement: Measurement, command: Command | None) -> None:
+    def cycle(self, start_ns: int, measurement: Measurement, command: Command | None) -> None:
         """A cycle is over.
 
         Args:
-            first_ns: deadline of the first SYNC, on the clock of the frames.
+            start_ns: deadline of the first SYNC, on the run's clock.
             measurement: of the cycle.
             command: of the cycle; None without a controller.
         """
         timed = measurement.cycle % TIMED_CYCLES == 0
         started_ns = elapsed_ns() if timed else 0
         frames, self._frames = self._frames, []
-        t_ns = first_ns - self.origin_ns + measurement.t_ns
-        self._call(Observation(t_ns, measurement, command, frames))
+        self._call(Observation(start_ns + measurement.t_ns, measurement, command, frames))
         if timed:
             self.cost_ns.append(elapsed_ns() - started_ns)
 

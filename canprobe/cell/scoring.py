@@ -51,7 +51,8 @@ class ShapeScore:
     """Errors of one estimator over a run; None where nothing could be scored.
 
     Attributes:
-        kappa_true: mean true principal curvatures over the scored estimates (1/m).
+        kappa_true: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as part
+            of the curvature was not observed, over all after the run-in, or else over all.
         kappa_est: mean estimated ones (1/m).
         kappa_rms: RMS Frobenius norm of K_est − K_true (1/m).
         kappa_rms_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
@@ -82,13 +83,14 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
     """
     late = [r for r in records if r.travelled_m >= RUN_IN_M]
     seen = [r for r in late if bool(np.all(r.estimate.observed))]
-    if not seen:
-        return ShapeScore(None, None, None, None, None, None, 0, 0.0 if late else None)
-    rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen])
-    if rows.max() >= len(truth["kappa"]):
+    rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen or late or records])
+    if rows.max(initial=0) >= len(truth["kappa"]):
         raise UsageError(
             f"truth: expected a row a SYNC, {rows.max() + 1} at least, got {len(truth['kappa'])}: another run's?"
         )
+    kappa_true = _pair(truth["kappa"][rows].mean(axis=0)) if len(rows) else None
+    if not seen:
+        return ShapeScore(kappa_true, None, None, None, None, None, 0, 0.0 if late else None)
     errors, norms, tilts, offsets = [], [], [], []
     for record, row in zip(seen, rows, strict=True):
         T = record.estimate.T_frame_contact
@@ -102,7 +104,7 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
         offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
     rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
     return ShapeScore(
-        kappa_true=_pair(truth["kappa"][rows].mean(axis=0)),
+        kappa_true=kappa_true,
         kappa_est=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
         kappa_rms=rms,
         kappa_rms_percent=100 * rms / scale if scale > 1e-9 else None,

@@ -6,6 +6,7 @@ needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
 
 from __future__ import annotations
 
+import errno
 import importlib
 import io
 import os
@@ -36,9 +37,10 @@ COMMANDS = (
 )
 
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _EXAMPLE = """\
-exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure,
-70 an error that nobody foresaw, 130 and 143 interrupted
+exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure or a file that cannot be
+written (full disk), 70 an error that nobody foresaw, 130 and 143 interrupted
 
 example:
   canprobe run cylinder
@@ -68,9 +70,12 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     except CanprobeError as error:
         return _complain("\n".join([str(error), *getattr(error, "__notes__", ())]), error.exit_status)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter's last flush goes nowhere
+        _forget_output()
         return 141
     except OSError as error:
+        if error.filename is None and error.errno in _NO_ROOM:  # whatever writes a file names it
+            _forget_output()
+            return _complain(f"standard output: cannot be written: {error.strerror}", 3)
         where = f"{error.filename}: " if error.filename is not None else ""
         return _complain(f"{where}{error.strerror or error}", 2 if where and isinstance(error, _WRONG_PATH) else 3)
     except KeyboardInterrupt as interrupt:
@@ -88,6 +93,11 @@ def _prepare_streams() -> None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115 - as long as the process
         elif mode == "w" and isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
             stream.reconfigure(errors="replace")
+
+
+def _forget_output() -> None:
+    """Let the interpreter's last flush of stdout go nowhere."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser(arguments: Sequence[str]) -> Parser:

@@ -76,6 +76,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="keep there what a master stores by 1010h or LSS [forgotten at the end]",
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
+    parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
     parser.set_defaults(run=run)
 
 
@@ -119,6 +120,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         node_ids=wanted,
         seed=args.seed,
         truth_path=args.truth,
+        origin_ns=args.origin,
         store_folder=args.store,
         without_id=args.without_id,
         say=say,

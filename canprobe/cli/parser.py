@@ -70,6 +70,11 @@ def add_bridge(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_force(parser: argparse.ArgumentParser) -> None:
+    """--force, of what writes results into a folder."""
+    parser.add_argument("--force", action="store_true", help="replace the results of an earlier run in DIR")
+
+
 def add_json(parser: argparse.ArgumentParser) -> None:
     """--json: one document on stdout."""
     parser.add_argument("--json", action="store_true", help="print one JSON document")

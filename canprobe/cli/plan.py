@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
+from canprobe.whole_file import whole_file
 
 if TYPE_CHECKING:
     from canprobe.planning import Plan
@@ -58,7 +59,8 @@ def _draw(plan: Plan, path: Path) -> Path:
     if not path.suffix:
         path = path.with_suffix(".png")  # as matplotlib would do by itself, and tell nobody
     try:
-        draw_plan(plan, path)
+        with whole_file(path) as part:
+            draw_plan(plan, part)
     except ValueError as error:  # matplotlib knows no such form
         raise UsageError(f"--figure {path}: {error}") from error
     return path

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
+from canprobe.errors import ResultsError
 
 _EXAMPLE = """\
 The log of a run gives its online result once more. In any other candump of the same nodes every contact is used.
@@ -64,8 +65,11 @@ def _run_into(args: argparse.Namespace) -> int:
     if args.json:
         summary = replayed.result.summary if replayed.result is not None else {}
         print_json({**summary, "bridges": replayed.bridges})
-        return 0
-    if replayed.result is not None:
-        print(replayed.result.text())
-    print("\n".join(bridge_lines(replayed.bridges)))
+    else:
+        if replayed.result is not None:
+            print(replayed.result.text())
+        print("\n".join(bridge_lines(replayed.bridges)))
+    for name, status in replayed.bridges.items():
+        if status["error"] is not None:
+            raise ResultsError(f"bridge {name}: {status['error']}")
     return 0

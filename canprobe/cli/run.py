@@ -6,7 +6,18 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_json, add_scene, folder_path, seconds, whole
+from canprobe.cli.parser import (
+    Commands,
+    Parser,
+    add_bridge,
+    add_bus,
+    add_force,
+    add_json,
+    add_scene,
+    folder_path,
+    seconds,
+    whole,
+)
 from canprobe.cli.target import add_realtime, target_of, with_realtime
 from canprobe.errors import CanprobeError
 
@@ -28,6 +39,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_realtime(parser)
     add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder for the results [runs/<scene>-<time>]")
+    add_force(parser)
     parser.add_argument("--tool", metavar="FILE", type=Path, help="tool.toml of a calibration, for the probe's centre")
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
@@ -62,6 +74,7 @@ def run(args: argparse.Namespace) -> int:
             out=folder,
             seed=args.seed,
             duration_s=args.duration,
+            force=args.force,
             progress=progress_bar(),
             say=say_on_terminal,
             bridge=args.bridge or (),
@@ -69,18 +82,27 @@ def run(args: argparse.Namespace) -> int:
     except CanprobeError as error:
         if args.json and error.summary is not None:
             print_json(error.summary)
+        try:
+            _write_blf(folder, wanted=args.blf and error.summary is not None)
+        except CanprobeError as unwritten:  # what stopped the run counts for more
+            error.add_note(str(unwritten))
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
+        _write_blf(folder, wanted=args.blf)
         raise
-    finally:
-        if args.blf and (folder / "bus.log").is_file():
-            from canprobe.bus.logfile import convert_log
-
-            convert_log(folder / "bus.log", folder / "bus.blf")
+    _write_blf(folder, wanted=args.blf)
     if args.json:
         print_json(result.summary)
     else:
         print(result.text())
     return 0
+
+
+def _write_blf(folder: Path, *, wanted: bool) -> None:
+    """The bus in the other form, where it was recorded."""
+    if wanted and (folder / "bus.log").is_file():
+        from canprobe.bus.logfile import convert_log
+
+        convert_log(folder / "bus.log", folder / "bus.blf")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bus, seconds, whole
+from canprobe.cli.parser import Commands, Parser, add_bus, add_force, seconds, whole
 from canprobe.cli.target import target_of
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--no-open", action="store_true", help="only say where it is to be seen")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay into one file, and leave")
     parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder for the results")
+    add_force(parser)
     parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: of everything random")
     parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase, seconds")
     parser.set_defaults(run=run)
@@ -95,6 +96,7 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
         out=folder,
         seed=args.seed,
         duration_s=args.duration,
+        force=args.force,
         bridge=("view",) if live else (),
         observers=[_paced()] if live and target.interface == "lockstep" else [],
         say=browser.say,

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import json
-import os
 from pathlib import Path
 from typing import Any
 
 from canprobe.emulator.aborts import Abort, SdoAbort
 from canprobe.emulator.entries import Value
 from canprobe.emulator.node import SlaveNode
-from canprobe.errors import UsageError
+from canprobe.errors import CanprobeError, UsageError
 from canprobe.protocol.lss import UNCONFIGURED
+from canprobe.whole_file import write_text
 
 _SCHEMA = 1
 
@@ -35,7 +35,7 @@ def keep_in_file(node: SlaveNode, path: Path) -> None:
     def write() -> None:
         try:
             _write(node, path)
-        except OSError as error:
+        except (OSError, CanprobeError) as error:
             raise SdoAbort(Abort.HARDWARE) from error
 
     node.store.changed = write
@@ -56,9 +56,7 @@ def _write(node: SlaveNode, path: Path) -> None:
         },
     }
     path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text(json.dumps(content, indent=1), encoding="utf-8")
-    os.replace(fresh, path)  # the old file stays whole until the new one is
+    write_text(path, json.dumps(content, indent=1))
 
 
 def _plain(value: Value) -> Any:

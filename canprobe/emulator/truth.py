@@ -28,6 +28,12 @@ class TruthRecorder:
     """A silent participant of the bus that writes down the plant's state at every SYNC.
 
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
+
+    Args:
+        plant: whose truth.
+
+    Attributes:
+        origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
     """
 
     name = "truth recorder"
@@ -36,6 +42,7 @@ class TruthRecorder:
 
     def __init__(self, plant: TruePlant) -> None:
         self._plant = plant
+        self.origin_ns = 0
         self._rows: list[tuple[int, int, Any]] = []
 
     @property
@@ -61,7 +68,7 @@ class TruthRecorder:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
         columns: dict[str, NDArray[Any]] = {
-            "t_s": np.array([t_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
+            "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
             "sync_count": np.arange(len(self._rows), dtype=np.int64),
             "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
         }

@@ -3,7 +3,7 @@
 # %% Run the emulated cell, or load a run that is there already: canprobe.load_table("runs/…/log.npz")
 import canprobe
 
-result = canprobe.run(canprobe.load_scene("cylinder"), out="runs/first-look", duration_s=2.0)
+result = canprobe.run(canprobe.load_scene("cylinder"), out="runs/first-look", force=True, duration_s=2.0)
 print(result.text())
 
 # %% One row a cycle, by time; every column's unit is in attrs["units"]
@@ -11,11 +11,14 @@ log = result.to_pandas()
 print(log[["phase", "force_n", "contact_mm_2"]].describe())
 print({name: log.attrs["units"][name] for name in ("force_n", "contact_mm_2", "q_rad_0")})
 
-# %% How well the force was held during the scan (phase 3), by what the array measured and by what was true in the plant
+# %% How well the force was held during the scan (phase 3), as the array measured it and as it was in the plant; the
+# times of all tables count from one instant, which is 0 in bus.log
 scan = log[log.phase == 3]
 truth = result.to_pandas("truth").reindex(scan.index, method="nearest")
+target = result.summary["contact"]["force_target_n"]
+rms = ((truth.force - target) ** 2).mean() ** 0.5
 print(f"force in the scan: measured {scan.force_n.mean():.3f} ± {scan.force_n.std():.3f} N")
-print(f"                   true     {truth.force.mean():.3f} ± {truth.force.std():.3f} N")
+print(f"                   true     {truth.force.mean():.3f} ± {truth.force.std():.3f} N, RMS error {rms:.3f} N")
 
 # %% How the curvature estimate comes in along the path
 estimates = result.to_pandas("estimates")

@@ -17,6 +17,7 @@ import numpy as np
 import canprobe
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.sweep_store import model_digest
+from canprobe.whole_file import whole_file, write_text
 
 SIGMA_COLUMNS = (
     Column("sigma_point_um", "σp µm", ".0f"),
@@ -82,17 +83,21 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
 
     Returns:
         The files of each table, its picture last where there is one.
+
+    Raises:
+        ResultsError: one cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
-    with paths[0].open("w", newline="", encoding="utf-8") as file:
+    with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
         _write_csv(csv.writer(file), result)
-    paths[1].write_text(text_of(result), encoding="utf-8")
+    write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
-    paths[2].write_text(document + "\n", encoding="utf-8")
+    write_text(paths[2], document + "\n")
     if importlib.util.find_spec("matplotlib") is not None:
         paths.append(out / f"{result.name}.png")
-        result.draw(paths[-1])
+        with whole_file(paths[-1]) as part:
+            result.draw(part)
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 

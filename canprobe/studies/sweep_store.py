@@ -8,6 +8,7 @@ is never taken for one of this code.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import fcntl
 import functools
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import IO, Any
 
 import canprobe
-from canprobe.errors import StudyError
+from canprobe.errors import ResultsError, StudyError
 
 PACKAGE = Path(canprobe.__file__).parent
 _SOURCES = (".py", ".toml", ".eds")
@@ -102,7 +103,8 @@ class CellStore:
 
     def close(self) -> None:
         """Let others open it."""
-        self._file.close()
+        with contextlib.suppress(OSError):  # `put` has told of it
+            self._file.close()
 
     def keys(self) -> Set[str]:
         """Of all answers."""
@@ -113,10 +115,17 @@ class CellStore:
         return self._answers.get(key)
 
     def put(self, key: str, what: object, answer: str) -> None:
-        """Keep an answer (JSON text) together with what it is an answer to."""
+        """Keep an answer (JSON text) together with what it is an answer to.
+
+        Raises:
+            ResultsError: it cannot be written; what was kept before is whole.
+        """
         document = as_json({"key": key, "what": what, "answer": json.loads(answer)})
-        self._file.write(f"{_checksum(document)} {document}\n")
-        self._file.flush()
+        try:
+            self._file.write(f"{_checksum(document)} {document}\n")
+            self._file.flush()
+        except OSError as error:
+            raise ResultsError(f"{self.path}: cannot be written: {error.strerror or error}") from error
         self._answers[key] = answer
 
     def _read(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cantools
 import numpy as np
 import pytest
+from full_disk import room_for
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -19,6 +20,7 @@ from canprobe.bridge.cdr import Encoder
 from canprobe.bridge.messages import Messages
 from canprobe.bridge.sample import CanFrame, Sample
 from canprobe.bus.candump import read_candump
+from canprobe.cli import main
 from canprobe.eds import eds_path
 from canprobe.recorded_bridges import replay_into
 
@@ -79,7 +81,7 @@ def test_joint_states_are_the_logged_joints(recorded, decoded):
     q, t = recorded.log("q_rad"), recorded.log("t_s")
     known = np.isfinite(q).all(axis=1)
     rows = decoded["/joint_states"]
-    assert [time for time, _ in rows] == [recorded.first_ns + round(s * 1e9) for s in t[known]]
+    assert [time for time, _ in rows] == [round(s * 1e9) for s in t[known]]
     np.testing.assert_array_equal([ros.position for _, ros in rows], q[known])
     time, ros = rows[-1]
     assert ros.header.stamp.sec * 10**9 + ros.header.stamp.nanosec == time
@@ -172,6 +174,18 @@ def test_a_recorded_run_gives_the_same_messages_again(recorded, tmp_path):
     )
     assert len(live) > 10_000
     assert again == live
+
+
+def test_a_full_disk_leaves_no_part_of_the_file(recorded, tmp_path, capsys):
+    folder = tmp_path / "full"
+    folder.mkdir()
+    for name in ("bus.log", "scene.toml", "log.npz"):
+        (folder / name).write_bytes((recorded.folder / name).read_bytes())
+    with room_for(100_000):
+        assert main(["replay", str(folder), "--bridge", "mcap"]) == 3
+    told = f"bridge mcap: {folder}/run.mcap: cannot be written: File too large"
+    assert capsys.readouterr().err.splitlines()[-1] == f"canprobe: {told}"
+    assert {path.name for path in folder.iterdir()} == {"bus.log", "scene.toml", "log.npz"}
 
 
 def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):

@@ -107,7 +107,9 @@ def test_the_example_runs_as_it_stands(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     example = resources.files("canprobe") / "examples" / "first_look.py"
     names = runpy.run_path(str(example))
-    assert names["scan"].force_n.mean() == pytest.approx(2.0, abs=0.05)
-    assert names["truth"].force.mean() == pytest.approx(2.0, abs=0.1)
+    contact = names["result"].summary["contact"]
+    off = names["scan"].force_n - 2.0
+    assert np.sqrt(np.nanmean(off**2)) == pytest.approx(contact["force_measured_rms_error_n"], abs=1e-3)
+    assert names["rms"] == pytest.approx(contact["force_rms_error_n"], abs=1e-3)
     assert names["estimates"]["kappa_per_m_0"].iloc[-1] == pytest.approx(1 / 0.036, rel=0.05)
     assert "'force_n': 'N', 'contact_mm_2': 'mm', 'q_rad_0': 'rad'" in capsys.readouterr().out

@@ -21,13 +21,6 @@ def test_the_same_of_several_nodes_is_one_line():
     ]
 
 
-def test_what_came_in_bring_up_has_no_time_of_the_run():
-    notes = Notes()
-    notes.add("EMCY 8130h", node_id=5, t_s=-0.4)
-    notes.add("EMCY 8130h", node_id=5, t_s=1.0)
-    assert notes.lines() == ["node 5: EMCY 8130h, 2 times, first before the first SYNC, last at 1.00 s"]
-
-
 @pytest.mark.parametrize(
     ("ids", "text"), [([7], "node 7"), ([2, 1], "nodes 1, 2"), ([16, 1, 3, 2, 5], "nodes 1-3, 5, 16")]
 )

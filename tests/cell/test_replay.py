@@ -13,18 +13,20 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.bus.candump import read_candump
 from canprobe.cell.tasks.probing import Phase
 from canprobe.cli import main
+from canprobe.npz_file import read_npz
 
 DRIVES = tuple(f"{0x180 + node:03X}" for node in range(1, 7))
 TRUE_KAPPA = np.array([1 / 0.036, 0.0])
 
 
-def assert_same(records, online):
-    """Number by number, to the last bit."""
+def assert_same(records, online, shift_ns=0):
+    """Number by number, to the last bit; the times to the nanosecond."""
     assert len(records) == len(online) >= 20
     for a, b in zip(records, online, strict=True):
-        assert (a.t_s, a.travelled_m) == (b.t_s, b.travelled_m)
+        assert (round((a.t_s - b.t_s) * 1e9), a.travelled_m) == (shift_ns, b.travelled_m)
         np.testing.assert_array_equal(a.estimate.K, b.estimate.K)
         np.testing.assert_array_equal(a.estimate.covariance, b.estimate.covariance)
         np.testing.assert_array_equal(a.estimate.T_frame_contact, b.estimate.T_frame_contact)
@@ -91,6 +93,26 @@ def test_a_run_of_drives_that_send_no_torque_is_replayed_and_shown(lockstep_run,
     assert result.summary["online"]["replayed"] == result.summary["online"]["estimates"] >= 20
 
 
+def test_all_files_of_a_run_count_from_the_instant_that_is_0_in_its_bus_log(lockstep_run):
+    folder = lockstep_run.out
+    frames = [(t_ns * 1e-9, can_id) for t_ns, _, can_id, _ in read_candump(folder / "bus.log")]
+    syncs = np.array([t_s for t_s, can_id in frames if can_id == 0x080])
+    log, truth = read_npz(folder / "log.npz"), read_npz(folder / "truth.npz")
+    assert frames[0][0] < 0.01 and syncs[0] > 0.3  # bring-up is before the first cycle
+    np.testing.assert_allclose(truth["t_s"], syncs, rtol=0, atol=1e-6)  # candump cuts off below the microsecond
+    wire = syncs[: len(log["t_s"])] - log["t_s"]
+    assert wire.min() > 0 and wire.max() < 200e-6  # the frame, and one that was under way at the deadline
+    answers = lockstep_run.estimates["recursive"]
+    told = np.array([record.told_s for record in answers])
+    rows = [int(np.abs(log["t_s"] - t_s).argmin()) for t_s in told]
+    np.testing.assert_allclose(log["t_s"][rows], told, rtol=0, atol=1e-9)
+    np.testing.assert_array_equal(log["K_per_m"][rows], [record.estimate.K for record in answers])
+    taken = np.array([record.t_s for record in answers])
+    assert ((told - 0.1 < taken) & (taken < told)).all()
+    patches = canprobe.load_surface_map(folder / "surface.npz").patches
+    assert {patch.t_s for patch in patches} <= set(taken.tolist())
+
+
 def test_a_log_whose_lines_are_in_another_order_is_sorted_by_its_stamps(lockstep_run, copy_of):
     def later(lines):
         rng = random.Random(1)
@@ -106,7 +128,10 @@ def test_a_real_bus_with_overruns_is_replayed_to_the_last_bit(delayed_run):
     assert cell.cycle.statistics.overruns > 3 and cell.drives.missed > 0 and cell.drives.late > 0
     result = canprobe.replay(folder)
     assert result.summary["targets"]["worst_counts"] == 0
-    assert_same(result.estimates["recursive"], task.shape.records)
+    assert_same(result.tracker.records, task.shape.records)
+    shift_ns = round((result.estimates["recursive"][0].t_s - task.shape.records[0].t_s) * 1e9)
+    assert 0 <= shift_ns - cell.start_ns < 100_000  # by the SYNC that was the least late
+    assert_same(result.estimates["recursive"], task.shape.records, shift_ns)
 
 
 def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path):
@@ -121,7 +146,7 @@ def test_another_tools_log_of_that_bus_is_within_a_percent(delayed_run, tmp_path
     log.write_text("\n".join(lines) + "\n")
     result = canprobe.replay(log, scene=folder / "scene.toml")
     assert result.summary["driven_by"] == "task"
-    assert largest_deviation(result.estimates["recursive"], task.shape.records, same_method=True) < 0.01
+    assert largest_deviation(result.tracker.records, task.shape.records, same_method=True) < 0.01
     assert result.summary["shape"]["kappa_true_per_m"] is None
 
 
@@ -170,15 +195,17 @@ def test_a_sync_without_a_counter_places_the_frames_by_their_arrival(lockstep_ru
         return [re.sub(r" 080#..$", " 080#", line) for line in lines]
 
     result = canprobe.replay(copy_of(lockstep_run.out, bare))
-    assert_same(result.estimates["recursive"], lockstep_run.estimates["recursive"])
+    replayed, online = result.estimates["recursive"], lockstep_run.estimates["recursive"]
+    shift_ns = round((replayed[0].t_s - online[0].t_s) * 1e9)
+    assert 0 < shift_ns < 12_000  # without its byte the SYNC would have ended so much earlier
+    assert_same(replayed, online, shift_ns)
 
 
 def test_a_run_that_ended_before_its_scan_is_still_ours(lockstep_run, copy_of):
     scan_s = lockstep_run.log["t_s"][np.argmax(lockstep_run.log["phase"] == Phase.SCAN)]
 
     def until_the_scan(lines):
-        end_us = 1e6 * scan_s + next(stamp_us(line) for line in lines if can_id_of(line) == "080")
-        return [line for line in lines if stamp_us(line) < end_us]
+        return [line for line in lines if stamp_us(line) < 1e6 * scan_s]
 
     result = canprobe.replay(copy_of(lockstep_run.out, until_the_scan))
     assert result.summary["driven_by"] == "other" and result.summary["targets"]["differing"] == 0
@@ -214,7 +241,9 @@ def test_no_targets_in_the_log_means_every_contact(lockstep_run, copy_of):
     )
     assert result.summary["driven_by"] == "other" and result.summary["targets"]["compared"] == 0
     assert "no targets are in the log" in result.text()
-    assert result.tracker.samples[0].t_s < lockstep_run.estimates["recursive"][0].t_s - 0.4  # from the touch-down on
+    start_s = result.estimates["recursive"][0].t_s - result.tracker.records[0].t_s
+    first_s = lockstep_run.estimates["recursive"][0].t_s
+    assert start_s + result.tracker.samples[0].t_s < first_s - 0.4  # from the touch-down on
     np.testing.assert_allclose(result.estimates["recursive"][-1].estimate.kappa, TRUE_KAPPA, atol=2.0)
 
 
@@ -231,9 +260,8 @@ def test_other_methods_get_the_same_contacts(lockstep_run, tmp_path):
     assert list(result.estimates) == ["chen1996", "chord", "ml"]
     assert result.summary["shape"]["method"] == "chen1996"
     assert set(result.summary["shape"]["methods"]) == {"chen1996", "chord", "ml"}
-    contacts = result.tracker.samples
     for records in result.estimates.values():
-        assert records[-1].t_s <= contacts[-1].t_s
+        assert records[-1].t_s <= lockstep_run.log["t_s"][-1]
         np.testing.assert_allclose(records[-1].estimate.kappa, TRUE_KAPPA, atol=0.2 * TRUE_KAPPA[0])
     result.save(tmp_path / "estimates.npz")
     with np.load(tmp_path / "estimates.npz") as saved:

@@ -93,7 +93,7 @@ def test_a_file_of_another_device_is_refused(stored, make_bench, path):
 
 
 def test_a_write_that_fails_aborts_and_keeps_what_was_stored(stored, path):
-    path.with_name(path.name + ".new").mkdir()  # in the way
+    path.with_name(f".part-{path.name}").mkdir()  # in the way
     before = path.read_text()
     stored.write(0x2000, 0, 33, 1)
     assert stored.write(0x1010, 1, SAVE, 4) == 0x06060000

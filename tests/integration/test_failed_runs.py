@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.api import OpenCell
 from canprobe.bus.candump import read_candump
 from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
 from canprobe.errors import NodeError, SafetyStop
-from canprobe.session import Session
 
 MS = 1_000_000
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
 
 
 def run_with(faults: Sequence[Fault], scene: str, out: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
-    class Faulty(Session):
+    class Faulty(OpenCell):
         def __init__(self, *words: Any, **options: Any) -> None:
             super().__init__(*words, **options)
             self.joins = lambda node: FaultyNode(node, faults) if hasattr(node, "node_id") else node
 
-    monkeypatch.setattr("canprobe.api.Session", Faulty)
-    canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds)
+    monkeypatch.setattr("canprobe.api.OpenCell", Faulty)
+    canprobe.run(canprobe.load_scene(scene), out=out, duration_s=seconds, force=True)
 
 
 def read_json(path: Path) -> Any:
@@ -82,11 +82,12 @@ def test_a_file_that_does_not_fit_is_not_there_in_part_and_the_user_is_told(
 
     monkeypatch.setattr(np, "savez_compressed", full)
     monkeypatch.setattr("canprobe.cell.cell.Cell.run", lambda *_: (_ for _ in ()).throw(SafetyStop("stopped")))
-    assert main(["run", "free", "--out", str(tmp_path)]) == 1
+    assert main(["run", "free", "--out", str(tmp_path), "--force"]) == 1
     told = capsys.readouterr().err.splitlines()
     assert told == [
         "canprobe: stopped",
-        f"canprobe: {tmp_path}: not all results could be written: No space left on device",
+        f"canprobe: {tmp_path}/truth.npz: cannot be written: No space left on device",
+        f"canprobe: {tmp_path}/log.npz: cannot be written: No space left on device",
     ]
     assert read_json(tmp_path / "summary.json")["stop_reason"] == "stopped"
-    assert not (tmp_path / "log.npz").exists()
+    assert not [path.name for path in tmp_path.iterdir() if path.name not in ("bus.log", "scene.toml", "summary.json")]

@@ -23,4 +23,5 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
         session.run(disturb, news_teller(session, lines.append))
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
-    assert lines == [what + "at 0.15 s", what + "2 times, first at 0.15 s, last at 0.18 s"]
+    first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log
+    assert lines == [what + f"at {first:.2f} s", what + f"2 times, first at {first:.2f} s, last at {last:.2f} s"]

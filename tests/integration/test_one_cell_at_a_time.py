@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +15,9 @@ import canprobe
 from canprobe import results
 from canprobe.api import Command, results_folder
 from canprobe.bus.candump import CandumpWriter, read_candump
-from canprobe.errors import UsageError
+from canprobe.cli import main
+from canprobe.errors import InterfaceError, SafetyStop, UsageError
+from canprobe.npz_file import read_npz
 
 
 @pytest.fixture
@@ -26,11 +30,111 @@ def test_a_folder_that_is_written_to_is_refused_and_keeps_its_log(free, tmp_path
         writer.write(0x080, b"", 0)
         writer.flush()
         with pytest.raises(UsageError, match="another run writes this file; choose another folder"):
-            undrawn_run(free, out=tmp_path, duration_s=0.1)
+            undrawn_run(free, out=tmp_path, duration_s=0.1, force=True)
         assert len(list(read_candump(tmp_path / "bus.log"))) == 1
         assert {path.name for path in tmp_path.iterdir()} == {"bus.log"}
-    undrawn_run(free, out=tmp_path, duration_s=0.1)
+    undrawn_run(free, out=tmp_path, duration_s=0.1, force=True)
     assert len(list(read_candump(tmp_path / "bus.log"))) > 100
+
+
+FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
+
+
+def without_figures(scene):
+    return replace(scene, scene=replace(scene.scene, figures=False))
+
+
+def nod(measurement):
+    return Command(done=measurement.cycle > 100, columns={"own_m": 0.5})
+
+
+def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
+    with canprobe.open_cell(free, out=tmp_path / "own") as cell:
+        result = cell.run(nod)
+        with pytest.raises(UsageError, match=r"result\.summary: complete when the block of open_cell is left"):
+            _ = result.summary["completed"]
+    task = canprobe.run(free, out=tmp_path / "task", duration_s=0.1)
+    names = {path.name for path in task.out.iterdir()}
+    assert names >= FILES and {path.name for path in result.out.iterdir()} == names
+    assert result.summary["completed"] and result.summary.keys() == task.summary.keys()
+    assert result.summary["bus_load"]["can0"]["measured"] > 0.01
+    assert result.summary["traffic"]["can0"]["as_planned"] == task.summary["traffic"]["can0"]["as_planned"]
+    assert json.loads((result.out / "summary.json").read_text()) == result.summary
+    assert np.nanmax(np.load(result.out / "log.npz")["own_m"]) == 0.5
+    assert result.truth["t_s"].shape[0] >= len(result.log["t_s"]) > 100 and "done" in result.text()
+    assert main(["view", str(result.out), "--html", str(tmp_path / "own.html")]) == 0
+
+
+def test_several_controllers_in_one_block_are_one_run(free, tmp_path):
+    with canprobe.open_cell(without_figures(free), out=tmp_path) as cell:
+        first = cell.run(lambda m: Command(done=m.cycle > 100))
+        second = cell.run(lambda m: Command(done=m.cycle > 300, columns={"second": 1.0}))
+    assert first is second and second.summary["cycle"]["cycles"] > 300
+    assert len(second.log["t_s"]) == len(read_npz(tmp_path / "log.npz")["t_s"]) > 300
+    with pytest.raises(UsageError, match="the cell is closed: open another one"):
+        cell.run(nod)
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"), [(ValueError("oh"), "ValueError: oh"), (SafetyStop("oh"), "oh"), (None, "oh")]
+)
+def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, error, reason):
+    def fail(measurement):
+        if measurement.cycle > 100 and error is not None:
+            raise error
+        return Command(stop_reason="oh" if measurement.cycle > 100 else None)
+
+    with (
+        pytest.raises((ValueError, SafetyStop)) as raised,
+        canprobe.open_cell(without_figures(free), out=tmp_path) as cell,
+    ):
+        cell.run(fail)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert (summary["completed"], summary["stop_reason"]) == (False, reason)
+    assert getattr(raised.value, "summary", summary) == summary
+    assert {path.name for path in tmp_path.iterdir()} >= FILES
+
+
+def test_a_cell_that_is_not_opened_says_how(free):
+    cell = canprobe.open_cell(free)
+    for use in (lambda: cell.run(nod), lambda: cell.cell):
+        with pytest.raises(UsageError, match=r"use `with canprobe\.open_cell\(scene\) as cell:`"):
+            use()
+
+
+def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
+    scene, run = without_figures(free), ["run", "free", "--duration", "0.1", "--out", str(tmp_path)]
+    undrawn_run(free, out=tmp_path, duration_s=0.1)
+    (tmp_path / "surface.npz").write_text("of an earlier run")
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    for call in (canprobe.run, canprobe.open_cell):
+        with pytest.raises(UsageError, match="not empty: name another folder for the results"):
+            call(scene, out=tmp_path)
+    for words in (run, [*run, "--bus", "socketcan", "--channel", "nobus0"], ["view", *run[1:], "--html", "x.html"]):
+        assert main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"canprobe: {tmp_path}: not empty") and "--force" in line
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+    assert main([*run, "--force", "--seed", "1"]) == 0
+    assert not (tmp_path / "surface.npz").exists()
+    assert json.loads((tmp_path / "summary.json").read_text())["seed"] == 1
+    with canprobe.open_cell(scene, out=tmp_path, force=True) as cell:
+        result = cell.run(nod)
+    assert result.summary["seed"] == 0
+
+
+def test_a_run_that_does_not_begin_replaces_nothing(free, tmp_path):
+    (tmp_path / "summary.json").write_text("of an earlier run")
+    with pytest.raises(InterfaceError):
+        canprobe.run(free, interface="socketcan", channel="nobus0", out=tmp_path, force=True)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["of an earlier run"]
+
+
+def test_a_cell_that_is_left_open_keeps_its_last_cycles(free, tmp_path):
+    with canprobe.open_cell(without_figures(free), out=tmp_path, rows_kept=20) as cell:
+        result = cell.run(nod)
+    assert len(result.log["t_s"]) == 20 and result.truth == {} and not (tmp_path / "truth.npz").exists()
+    assert result.summary["cycle"]["cycles"] > 100
 
 
 def test_runs_of_one_second_have_folders_of_their_own(free):

@@ -10,6 +10,7 @@ from canprobe.cell.build import make_task
 from canprobe.cell.scoring import score_shape
 from canprobe.cell.tasks.build import make_shape_estimator
 from canprobe.cell.tasks.shape import replay_samples
+from canprobe.results import shape_lines, summarise_shape
 from canprobe.session import Session, resolve_scene
 
 
@@ -58,6 +59,13 @@ def test_without_the_patch_the_same_contacts_leave_it_unobserved(axial):
     assert list(records[-1].estimate.observed) == [True, False]
     assert records[-1].estimate.kappa[0] == pytest.approx(0.0, abs=1.0)
     assert np.isnan(records[-1].estimate.kappa[1])
+    times = session.cell.log.arrays()["t_s"]
+    shape = summarise_shape(off, None, {"recursive": records}, session.truth, times)
+    assert shape["kappa_true_per_m"] == pytest.approx((1 / 0.036, 0.0), abs=1e-6)  # it is known all the same
+    assert shape_lines(shape) == [
+        f"  curvature  {records[-1].estimate.kappa[0]:.2f} 1/m, the other one not observed; true 27.78, 0.00 1/m",
+        "    recursive  not scored: no estimate of both curvatures after the first 20 mm",
+    ]
 
 
 def test_ml_takes_the_same_help_and_the_paper_s_method_takes_none(axial):

@@ -21,7 +21,7 @@ from canprobe.cell.supervision import Reaction
 from canprobe.cell.tasks.probing import Phase
 from canprobe.emulator.faults import FaultKind
 from canprobe.emulator.faulty_node import FaultyNode
-from canprobe.errors import InterfaceError, NodeError, SafetyStop
+from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.emcy import Emcy
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
@@ -70,7 +70,8 @@ def test_an_emcy_of_the_sensor():
 def test_an_emcy_about_communication_is_noted():
     run = Injected("free", FREE_CYCLE, lambda r: send(r, (EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())), until=10)
     run.assert_counted("emcy_communication")
-    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {FREE_CYCLE * 0.0025:.2f} s"
+    at_s = run.session.cell.start_ns * 1e-9 + FREE_CYCLE * 0.0025
+    told = f"node 4: EMCY 8210h, PDO not processed due to length error, at {at_s:.2f} s"
     assert run.session.cell.faults == [told]
 
 
@@ -568,7 +569,8 @@ def test_a_full_disk(tmp_path):
         run.session.lockstep.recorder = flushed_each_time()
 
     run = OnDisk("press", HOLD_CYCLE, fill)
-    assert "the log cannot be written" in str(run.error) and "No space left" in str(run.error)
+    assert str(run.error) == f"{tmp_path}/bus.log: cannot be written: No space left on device"
+    assert isinstance(run.error, ResultsError)  # after the task has let go
     run.assert_drives_off()
     assert run.session.truth["force"][-1] == 0.0
     text = (tmp_path / "bus.log").read_text()

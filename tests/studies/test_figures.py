@@ -195,7 +195,7 @@ PICTURES = {
     "press": draw_scene("press", 0.5),
     "listen": draw_scene("listen", 1.0),
     "calibrate": draw_scene("press", 0.5, calibration=FOUND),
-    "plan": lambda path: draw_plan(make_plan(canprobe.load_scene("cylinder")), path),
+    "plan": lambda path: draw_plan(canprobe.plan(canprobe.load_scene("cylinder")), path),
     "bound": bound,
     "region": region,
     "estimators": every_estimator,

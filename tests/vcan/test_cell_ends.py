@@ -60,7 +60,7 @@ def test_a_second_cell_is_refused_and_leaves_the_first_one_up_which_ends_with_a_
 def test_the_emulator_is_killed_in_mid_scan(bench: Any) -> None:
     (bench.folder / "results").mkdir()
     (bench.folder / "results" / "truth.npz").write_text("of an earlier run")
-    command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results")
+    command = bench.start("run", bench.scene("cylinder"), *ON_VCAN0, "--out", "results", "--force")
     bench.bus.until_enabled(6, by=command, cycles=300)
     (child,) = command.children
     os.kill(child, signal.SIGKILL)

@@ -43,6 +43,12 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
     assert {pdo.cob_id for pdo in planned.pdos} <= set(results.last)
     with np.load(bench.folder / "results" / "truth.npz") as truth:
         assert truth["force"].max() == pytest.approx(results.summary["contact"]["force_max_n"])
+        at_nodes = truth["t_s"]
+    with np.load(bench.folder / "results" / "log.npz") as log:
+        due = log["t_s"]
+    sent = np.array([t_ns * 1e-9 for t_ns, _, can_id, _ in results.frames if can_id == 0x080])
+    assert len(sent) == len(at_nodes) and np.median(np.abs(at_nodes - sent)) < 2e-3, "one clock for both processes"
+    assert np.median(np.abs(sent[: len(due)] - due)) < 2e-3, "and for every file"
 
 
 def full_scan(bench: Any) -> Any:

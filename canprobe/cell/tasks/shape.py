@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -25,16 +25,21 @@ class ShapeRecord:
     """One estimate with its place in the run.
 
     Attributes:
-        t_s: instant of its last sample, on the cycle's clock, s.
+        t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
-        told_s: instant of the cycle in which it was told, s.
+        told_s: instant of the cycle in which it was told, s, on the same clock.
     """
 
     t_s: float
     travelled_m: float
     estimate: SurfaceEstimate
     told_s: float
+
+
+def on_run_clock(records: Sequence[ShapeRecord], start_s: float) -> list[ShapeRecord]:
+    """Estimates of a run in which the first SYNC was due at ``start_s``."""
+    return [replace(record, t_s=start_s + record.t_s, told_s=start_s + record.told_s) for record in records]
 
 
 class ShapeTracker:
