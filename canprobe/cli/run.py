@@ -7,7 +7,7 @@ from pathlib import Path
 
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_json, add_scene, folder_path, seconds, whole
-from canprobe.cli.target import add_realtime, target_of, with_realtime
+from canprobe.cli.target import add_patient, add_realtime, target_of, with_patience, with_realtime
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
@@ -16,7 +16,7 @@ Emulated nodes run in this process on the lockstep bus, and in a process of thei
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
-  canprobe run cylinder --bus socketcan --channel vcan0
+  canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """
 
 
@@ -26,6 +26,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser)
     add_bus(parser)
     add_realtime(parser)
+    add_patient(parser)
     add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder for the results [runs/<scene>-<time>]")
     parser.add_argument("--tool", metavar="FILE", type=Path, help="tool.toml of a calibration, for the probe's centre")
@@ -42,7 +43,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     from canprobe.scene_loader import load_scene
 
-    scene = with_realtime(load_scene(args.scene), args.realtime)
+    scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
     if args.tool is not None:
         from canprobe.scene_tool import with_tool
 
