@@ -206,7 +206,7 @@ class LimitSettings:
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15  # felt before the run, which the array's tare takes for zero
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
     joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0  # of the model's speed limits
-    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 80.0  # of the last second's, late by half a period
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0  # of the last second's, late by half a period
     workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
     workspace_max_mm: Vec3 | None = None
 

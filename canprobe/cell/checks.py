@@ -50,7 +50,7 @@ def _held_up(seen: Seen) -> str:
     return (
         f"; the last SYNC was sent {seen.gap_ns * 1e-6:.0f} ms after the one before, and the drives stop by themselves"
         f" {patience_ns * 1e-6:g} ms after one (arm.missed_syncs = {seen.limits.missed_cycles}): the machine held the"
-        " master up; leave it more of the processor, or see --realtime"
+        " master up; leave it more of the processor, see --realtime, or for emulated nodes --patient"
     )
 
 

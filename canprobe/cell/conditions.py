@@ -221,7 +221,7 @@ CONDITIONS: tuple[Condition, ...] = (
     Condition(
         "overruns",
         "overrun budget used up",
-        "`limits.late_cycles_max_percent` (80 %) of the last second's cycles late by half a period",
+        "`limits.late_cycles_max_percent` (10 %) of the last second's cycles late by half a period",
         Reaction.RETREAT,
         _after("hold_ns", 2),
         "a quieter machine, or a lower rate",

@@ -77,7 +77,7 @@ class Limits:
     regain: float = 0.0
     force_max: float = 5.0
     preload_max: float = math.inf
-    late_share: float = 0.8
+    late_share: float = 0.1
     hold_ns: int = 1_000_000_000
     joint_low: Vector | None = None
     joint_high: Vector | None = None

@@ -18,7 +18,7 @@ from canprobe.cli.parser import (
     seconds,
     whole,
 )
-from canprobe.cli.target import add_realtime, target_of, with_realtime
+from canprobe.cli.target import add_patient, add_realtime, target_of, with_patience, with_realtime
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
@@ -27,7 +27,7 @@ Emulated nodes run in this process on the lockstep bus, and in a process of thei
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
-  canprobe run cylinder --bus socketcan --channel vcan0
+  canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """
 
 
@@ -37,6 +37,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser)
     add_bus(parser)
     add_realtime(parser)
+    add_patient(parser)
     add_bridge(parser)
     parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder for the results [runs/<scene>-<time>]")
     add_force(parser)
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
     from canprobe.scene_loader import load_scene
 
-    scene = with_realtime(load_scene(args.scene), args.realtime)
+    scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
     if args.tool is not None:
         from canprobe.scene_tool import with_tool
 

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 CONFIG = "config"
 """Stands for the interface where python-can's configuration is to name it."""
+PATIENT_SYNCS = 40
+"""100 ms at 400 Hz: a virtual machine may stand still as long."""
 _LOCKSTEP = "lockstep"
 
 
@@ -55,6 +57,29 @@ def add_realtime(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="SCHED_FIFO, a processor of its own and locked memory, as far as permitted [the scene's cycle.realtime]",
     )
+
+
+def add_patient(parser: argparse.ArgumentParser) -> None:
+    """The option of commands that run emulated nodes on a machine that is too slow for what hardware needs."""
+    parser.add_argument(
+        "--patient",
+        action="store_true",
+        help=f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop nothing",
+    )
+
+
+def with_patience(scene: Scene, wanted: bool) -> Scene:
+    """The scene with drives that wait for their master and a master that is never too late, where it is wanted.
+
+    Raises:
+        UsageError: it is wanted of real nodes.
+    """
+    if not wanted:
+        return scene
+    if _has_real_nodes(scene):
+        raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
+    arm = scene.arm and replace(scene.arm, missed_syncs=PATIENT_SYNCS)
+    return replace(scene, arm=arm, limits=replace(scene.limits, late_cycles_max_percent=100.0))
 
 
 def with_realtime(scene: Scene, wanted: bool) -> Scene:

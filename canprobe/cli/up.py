@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from canprobe.cli.interrupts import left_by_ctrl_c
 from canprobe.cli.output import say
 from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
-from canprobe.cli.target import Target, add_realtime, target_of, with_realtime
+from canprobe.cli.target import Target, add_patient, add_realtime, target_of, with_patience, with_realtime
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser)
     add_bus(parser)
     add_realtime(parser)
+    add_patient(parser)
     add_bridge(parser)
     parser.add_argument(
         "--check-joints",
@@ -46,7 +47,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("up: --check-joints feeds no --bridge")
     from canprobe.scene_loader import load_scene
 
-    scene = with_realtime(load_scene(args.scene), args.realtime)
+    scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
     target = target_of(args, scene)
     if args.check_joints:
         return _check_joints(scene, target, ask=not args.yes)

@@ -15,7 +15,7 @@ without a network; CANPROBE_VCAN tells the command where it is: here, namespace,
 exit status: the command's own, 128 + n after signal n; 124 time-out, 125 no vcan can be had, 123 the guest died
 
 examples:
-  canprobe vcan -- canprobe run cylinder --bus socketcan --channel vcan0
+  canprobe vcan -- canprobe run cylinder --bus socketcan --channel vcan0 --patient
   canprobe vcan --timeout 60 -- sh -c 'cangen vcan0 -n 5 & candump -n 5 vcan0'
 """
 

@@ -29,8 +29,8 @@ from canprobe.studies.fault_scenes import scenario_scene
 
 CHANNEL = "vcan0"
 SCENARIO, HOLD_S = "press, features", 3.0
-MISSED_SYNCS = 20
-"""Patience of the drives: a guest stands still for tens of milliseconds, which is no fault of the cell."""
+PATIENCE = {"missed_syncs": 20, "late_cycles_max_percent": 100}
+"""Of drives and master: a guest stands still for tens of milliseconds, which is no fault of the cell."""
 PATIENCE_S = 60.0
 REACTION_S = 2.0
 """After the fault, until drives that are left alone must have stopped; theirs are 0.2 s, the rest is the guest's."""
@@ -88,7 +88,8 @@ def served_scene() -> Scene:
     """A press whose nodes are a process of their own, which outlives the master."""
     scene = resolve_scene(scenario_scene(SCENARIO, True), interface="socketcan", channel=CHANNEL, duration_s=HOLD_S)
     assert scene.arm is not None
-    return replace(scene, arm=replace(scene.arm, missed_syncs=MISSED_SYNCS))
+    limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
+    return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)
 
 
 def carry_out(case: ProcessCase, folder: Path) -> ProcessRun:

@@ -62,8 +62,6 @@ def scenario_scene(name: str, timed: bool) -> Scene:
         cycle=replace(scene.cycle, rate_hz=scenario.rate_hz),
         limits=replace(scene.limits, force_max_n=FORCE_MAX_N, joint_speed_share=scenario.speed_share),
     )
-    if scene.arm is not None:
-        scene = replace(scene, arm=replace(scene.arm, missed_syncs=5))
     if scene.shape is not None:
         scene = replace(scene, shape=replace(scene.shape, also=()))
     if scene.sensor is not None:

@@ -14,7 +14,7 @@ from random import Random
 from typing import Any
 
 from canprobe.bus.socketcan import check_interface
-from canprobe.studies.fault_processes import CHANNEL, HOLD_S, ProcessCase, ProcessFault, carry_out
+from canprobe.studies.fault_processes import CHANNEL, HOLD_S, PATIENCE, ProcessCase, ProcessFault, carry_out
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -50,7 +50,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         COLUMNS,
         rows,
         findings(rows),
-        measuring_facts(quick, total) | {"interface": CHANNEL},
+        measuring_facts(quick, total) | {"interface": CHANNEL, **PATIENCE},
         lambda path: _draw(rows, path),
     )
 

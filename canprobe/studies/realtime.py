@@ -19,6 +19,7 @@ from canprobe.scene import TactileModeName
 from canprobe.studies.cycle_times import CycleTimes
 from canprobe.studies.realtime_cases import (
     CHANNEL,
+    PATIENCE,
     Measured,
     measure_bare,
     measure_hold,
@@ -69,7 +70,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     measured.append(measure_bare(bare_s))
     for mode in MODES:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
-    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "controller": "scan of cylinder; hold elsewhere"}
+    facts = measuring_facts(quick, 1) | {
+        "interface": CHANNEL,
+        "controller": "scan of cylinder; hold elsewhere",
+        **PATIENCE,
+    }
     return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, _drawer(measured))
 
 

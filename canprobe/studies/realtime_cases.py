@@ -26,8 +26,8 @@ from canprobe.session import Session, resolve_scene
 from canprobe.studies.cycle_times import CycleTimes, answer_latencies, processor_seconds, share_of, woken
 
 CHANNEL = "vcan0"
-PATIENT_SYNCS = 250
-"""That the drives wait for: a rate that cannot be held is measured, not ended by its first drop-out."""
+PATIENCE = {"missed_syncs": 250, "late_cycles_max_percent": 100}
+"""Of the cases' scenes: what cannot be held is measured, and ended neither by a drop-out nor by late cycles."""
 WIRE_BITRATE = 50_000_000
 """Of the sweep's plans: a virtual bus has no bit rate, and what a real one allows is the plan's business."""
 
@@ -85,16 +85,23 @@ def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
 
 
 def with_real_nodes(scene: Scene) -> Scene:
-    """The scene with arm and sensor left to somebody else, and drives that are patient with their master."""
+    """The scene with arm and sensor left to somebody else."""
     assert scene.arm is not None and scene.sensor is not None
-    arm = replace(scene.arm, emulated=False, missed_syncs=PATIENT_SYNCS)
-    return replace(scene, arm=arm, sensor=replace(scene.sensor, emulated=False))
+    arm, sensor = replace(scene.arm, emulated=False), replace(scene.sensor, emulated=False)
+    return replace(scene, arm=arm, sensor=sensor)
 
 
 def _scene(seconds: float | None = None, channel: str = CHANNEL, *, in_realtime: bool = True) -> Scene:
-    """The scene `cylinder`; in real time with the processor and the memory, as far as they are to be had."""
+    """The scene `cylinder`, patient; in real time with the processor and the memory, as far as they are to be had."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel, duration_s=seconds)
-    return replace(scene, cycle=replace(scene.cycle, realtime=in_realtime))
+    return replace(patient(scene), cycle=replace(scene.cycle, realtime=in_realtime))
+
+
+def patient(scene: Scene) -> Scene:
+    """The scene with drives that wait for their master, and a master that is never too late."""
+    assert scene.arm is not None
+    limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
+    return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)
 
 
 def _unheard(_: str) -> None:

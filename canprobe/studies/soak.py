@@ -20,7 +20,7 @@ from canprobe.cell.measurement import Command, Measurement
 from canprobe.child import EmulatorChild
 from canprobe.scene_loader import load_scene
 from canprobe.session import Session, resolve_scene
-from canprobe.studies.realtime_cases import CHANNEL, served, with_real_nodes
+from canprobe.studies.realtime_cases import CHANNEL, PATIENCE, patient, served, with_real_nodes
 from canprobe.studies.study import Column, StudyResult
 from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -118,7 +118,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     seconds = 10.0 if quick else HOUR_S
     sweep.say(f"hold the cell for {seconds:g} s")
     samples = soak(seconds)
-    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds}
+    facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
     rows = [asdict(sample) for sample in samples]
     return StudyResult("soak", COLUMNS, rows, findings(samples), facts, _drawer(samples))
 
@@ -128,7 +128,7 @@ def soak(seconds: float) -> list[Sample]:
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
     with served(CHANNEL, child):
-        session = Session(with_real_nodes(scene), rows_kept=ROWS_OF_UP)
+        session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)
         with session:
             session.run(soaker)

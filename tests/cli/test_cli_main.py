@@ -239,6 +239,21 @@ def test_run_passes_everything_on(calls, tmp_path, capsys):
     assert capsys.readouterr().out == "all went well\n"
 
 
+@pytest.mark.parametrize("command", ["run", "up"])
+def test_patience_is_what_is_asked_for_and_for_emulated_nodes_only(command, calls, tmp_path, capsys):
+    def limits(*words):
+        assert main([command, "cylinder", "--bus", "socketcan", *words]) == 0
+        _, (scene,), _ = calls.pop()
+        return scene.arm.missed_syncs, scene.limits.late_cycles_max_percent
+
+    assert limits() == (5, 10.0)
+    assert limits("--patient") == (40, 100.0)
+    path = tmp_path / "real.toml"
+    path.write_text("[scene]\nname = 'real'\n[arm]\nemulated = false\n[task]\nkind = 'free'\n")
+    assert main([command, str(path), "--bus", "socketcan", "--patient"]) == 2
+    assert "--patient is for emulated nodes" in capsys.readouterr().err and not calls
+
+
 def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
     ((_, _, kwargs),) = calls

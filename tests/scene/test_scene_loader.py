@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from canprobe.errors import SceneError
 from canprobe.scene import (
     ArmSettings,
+    BringUpSettings,
     LimitSettings,
     ProbeSettings,
     Scene,
@@ -210,6 +211,15 @@ def test_packaged_scenes_load_and_survive_the_way_back(name):
     assert scene.name == name
     assert scene.title
     assert parse_scene(dump_scene(scene)) == scene
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_packaged_scenes_carry_the_limits_of_hardware(name):
+    """None is widened for a machine that is slow: who runs on such a one says so."""
+    scene = load_scene(name)
+    assert scene.arm is None or scene.arm.missed_syncs == 5
+    assert (scene.limits, scene.bring_up) == (LimitSettings(), BringUpSettings())
+    assert scene.limits.late_cycles_max_percent == 10
 
 
 def test_packaged_scenes_are_the_promised_ones():

@@ -9,7 +9,7 @@ from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
 from canprobe.studies.cycle_times import CycleTimes, answer_latencies, woken
 from canprobe.studies.realtime import findings
-from canprobe.studies.realtime_cases import PATIENT_SYNCS, Measured, holding_scene
+from canprobe.studies.realtime_cases import Measured, holding_scene
 
 
 def log_of(tmp_path, *lines):
@@ -72,7 +72,8 @@ def test_without_socketcan_the_way_is_told(capsys, tmp_path):
 
 def test_the_studies_scenes_leave_every_node_to_a_process_of_its_own():
     scene = holding_scene("features", 800.0)
-    assert scene.emulated_node_ids == () and scene.arm.missed_syncs == PATIENT_SYNCS
+    assert scene.emulated_node_ids == ()
+    assert (scene.arm.missed_syncs, scene.limits.late_cycles_max_percent) == (250, 100), "measured, never ended"
     assert (scene.cycle.rate_hz, scene.sensor.rate_hz, scene.sensor.mode) == (800.0, 400.0, "features")
 
 

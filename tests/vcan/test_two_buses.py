@@ -22,6 +22,8 @@ rate_hz = 100
 [arm]
 emulated = false
 missed_syncs = 40
+[limits]
+late_cycles_max_percent = 100
 [sensor]
 channel = "can1"
 rate_hz = 50
