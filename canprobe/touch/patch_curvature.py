@@ -18,7 +18,6 @@ The layer's model is stated in `patch_moments`.
 from __future__ import annotations
 
 import math
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -146,16 +145,6 @@ class PatchCurvature:
         self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
         self._last: tuple[float, float, float] | None = None
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
-
-    def still(self) -> PatchCurvature:
-        """What is known now, to be asked later; images that are added meanwhile are not in it."""
-        result = copy(self)
-        result._mean, result._recent = copy(self._mean), copy(self._recent)
-        return result
-
-    def begin_at(self, asked: PatchCurvature) -> None:
-        """Look for the next answer from where that of another was."""
-        self._last = asked._last
 
     def add(self, sample: ContactSample) -> None:
         """Take the image of one contact."""

@@ -428,16 +428,16 @@ def test_a_measured_jump_that_no_joint_can_make():
 def test_an_estimator_that_diverges_starts_afresh():
     def diverge(run):
         estimator = run.task.shape._estimator
-        original, done = estimator.answering, []
+        original, done = estimator.estimate, []
 
         def once():
-            estimate = yield from original()
+            estimate = original()
             if not done and estimate is not None and estimate.observed.all():
                 done.append(True)
                 return replace(estimate, kappa=np.array([5e3, 0.0]))
             return estimate
 
-        estimator.answering = once
+        estimator.estimate = once
 
     run = Injected("cylinder", 620, diverge, until=200, shape={"also": ()})
     assert run.error is None

@@ -395,33 +395,6 @@ def test_patch_completes_a_straight_path(method, line, alone):
     np.testing.assert_array_equal(both.T_frame_contact, without.T_frame_contact)
 
 
-def test_an_answer_in_parts_is_that_of_its_first_part_whatever_is_felt_meanwhile():
-    """A step over an edge to a plane, ever further between two parts; the next answer knows of it."""
-    line = WEAVE[:400]
-    one, other = after_path(line), after_path(line)
-    at_once, parts = one.estimate(), other.answering()
-    felt = 0
-
-    def feel_more():
-        nonlocal felt
-        for _ in range(10):
-            felt += 1
-            sample = cylinder_touch(2e-4 * felt, line[-1][1], (len(line) + felt) * 5e-3, moments=True)
-            other.add(replace(sample, moments=exact((5.0, 1.0, 2.0)), n_base=np.array([0.0, 0.0, 1.0])))
-
-    try:
-        while True:
-            next(parts)
-            feel_more()
-    except StopIteration as end:
-        told = end.value
-    assert felt >= 40
-    for name in ("K", "covariance", "S", "T_frame_contact", "information"):
-        np.testing.assert_array_equal(getattr(told, name), getattr(at_once, name))
-    assert told.notes == at_once.notes and told.method == at_once.method
-    assert np.abs(other.estimate().T_frame_contact - told.T_frame_contact).max() > 1e-3
-
-
 def test_curvature_known_along_the_path_sharpens_that_across():
     touches = [cylinder_touch(x, 0.0, 0.0, True) for x, _ in AXIAL[:20]]
     patch = PatchCurvature(model())

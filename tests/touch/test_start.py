@@ -8,7 +8,6 @@ import pytest
 from canprobe.touch import linearised as one_step
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimators import make_estimator
-from canprobe.touch.estimators.base import whole
 from canprobe.touch.estimators.equations import Touch, batch_design
 from canprobe.touch.estimators.start import LAST, MOST, Start, isolation
 from canprobe.touch.nonlinear import fit
@@ -27,7 +26,7 @@ def touches(truth, name, seed, n=72):
 def stepwise(found, each=4):
     start = Start(MEMORY, PRIOR)
     for i in range(0, len(found), each):
-        whole(start.adding(found[i : i + each], each * 0.125e-3))
+        start.add(found[i : i + each], each * 0.125e-3)
     return start
 
 

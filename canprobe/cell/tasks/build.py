@@ -12,7 +12,7 @@ from canprobe.cell.limits import limits_of
 from canprobe.cell.tasks.calibration import PAD_LAG, array_calibration
 from canprobe.cell.tasks.probe_motion import MotionBounds, ProbeMotion
 from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.shape import ROUND_S, ShapeRecord, ShapeTracker, replay_samples
+from canprobe.cell.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.cell.tasks.touch import TouchTask
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
@@ -134,8 +134,7 @@ def make_shape_tracker(setup: Setup) -> ShapeTracker | None:
     if not isinstance(task, Touch) or task.shape is None:
         return None
     samples = max(1, round(task.shape.every_s * task.array.rate_hz))
-    rounds = max(1, round(1.0 / (setup.rate_hz * ROUND_S)))
-    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples, rounds)
+    return ShapeTracker(make_shape_estimator(task, task.shape.method), samples)
 
 
 def estimates_of(setup: Setup, tracker: ShapeTracker, methods: Iterable[str]) -> dict[str, list[ShapeRecord]]:

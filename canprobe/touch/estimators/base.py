@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Generator
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 
@@ -17,8 +15,6 @@ from canprobe.touch.batch import Touches, make_touches
 from canprobe.touch.contact import ContactSample, Doubt
 from canprobe.touch.estimate import SurfaceEstimate
 from canprobe.touch.noise import make_noise
-
-Result = TypeVar("Result")
 
 
 @dataclass(slots=True)
@@ -66,47 +62,6 @@ class Estimator(Protocol):
 
     def reset(self) -> None:
         """Forget everything but the settings: contact was lost, or the array was reset."""
-
-
-Adding = Generator[None, None, None]
-"""The taking of a contact in parts. Between them the estimator is asked nothing and told nothing."""
-Answering = Generator[None, None, SurfaceEstimate | None]
-"""An answer in parts: each `next` works out one, the last returns it."""
-
-
-def adding(estimator: Estimator, sample: ContactSample) -> Adding:
-    """Take a contact in as many parts as an estimator has for it: one, or those of its own `adding`."""
-    parts: Callable[[ContactSample], Adding] = getattr(estimator, "adding", None) or partial(_added, estimator)
-    return parts(sample)
-
-
-def _added(estimator: Estimator, sample: ContactSample) -> Adding:
-    yield from ()
-    estimator.add(sample)
-
-
-def answering(estimator: Estimator) -> Answering:
-    """The answer of any estimator, in as many parts as it has: one, or those of its own `answering`.
-
-    Samples may be added between two parts; the answer is that of the first.
-    """
-    parts: Callable[[], Answering] = getattr(estimator, "answering", None) or partial(_in_one, estimator)
-    return parts()
-
-
-def _in_one(estimator: Estimator) -> Answering:
-    yield from ()
-    return estimator.estimate()
-
-
-def whole(parts: Generator[None, None, Result]) -> Result:
-    """What comes out once all parts are worked out."""
-    while True:
-        try:
-            next(parts)
-        except StopIteration as end:
-            result: Result = end.value
-            return result
 
 
 class Gate:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
 from typing import NamedTuple
 
 import numpy as np
 
 from canprobe.touch._arrays import Array, inverted, inverted_upper, lower_root, upper_root
 from canprobe.touch.anchor import Anchor, anchor
-from canprobe.touch.estimate import Solution, build_estimate
-from canprobe.touch.estimators.base import Answering
+from canprobe.touch.estimate import Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.evidence import curvature_covariance, evidence_of
@@ -39,7 +37,7 @@ class _Answer(NamedTuple):
     notes: tuple[str, ...]
 
 
-def filter_answering(
+def filter_answer(
     state: InformationFilter,
     point: Array,
     spread: Array,
@@ -50,17 +48,17 @@ def filter_answering(
     prior: str,
     notes: tuple[str, ...],
     expected: Expected | None,
-) -> Answering:
-    """The answer at the foot of a point, in up to four parts.
+) -> SurfaceEstimate:
+    """The answer at the foot of a point.
 
     Args:
-        state: of the filter; it must not change between the parts.
+        state: of the filter.
         point: (3,) in base, m.
         spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
         innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
         expected: of the samples, to allow for what a quadric leaves out (`left_out`); None: the surface is one exactly.
     """
-    found = yield from _answered(state, point, spread, expected)
+    found = _answered(state, point, spread, expected)
     a, decision = found.anchor, found.decision
     deviation = a.M @ found.deviation
     covariance = curvature_covariance(a.c, deviation)
@@ -84,13 +82,10 @@ def filter_answering(
     )
 
 
-def _answered(
-    state: InformationFilter, point: Array, spread: Array, expected: Expected | None
-) -> Generator[None, None, _Answer]:
+def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
     """With the sandwich covariance, amended where all is observed."""
     place = state.place(point)
     a = anchor(state.c, state.T, place, state.length)
-    yield
     tangent = a.T_frame_contact[:3, :2]
     flat = tangent.T @ spread @ tangent
     q = a.M[6:] @ state.inverse / UNIT[:, None]
@@ -98,12 +93,10 @@ def _answered(
     noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
     notes: tuple[str, ...] = ()
     if decision.rank == 3 and expected is not None:
-        yield
         amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, expected)
         notes = misfit_notes(amended.misfit, trusted=amended.trusted)
         if not amended.trusted:
             return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
-        yield
         a = anchor(amended.c, state.T, place, state.length)
         noise += state.root @ amended.covariance @ state.root.T
     return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)

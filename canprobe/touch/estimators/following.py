@@ -18,7 +18,7 @@ import numpy as np
 from canprobe.touch._arrays import Array
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate, is_umbilic
-from canprobe.touch.estimators.base import Adding, Answering, Dropped, Estimator, adding, answering, whole
+from canprobe.touch.estimators.base import Dropped, Estimator
 from canprobe.touch.evidence import TO_Q
 
 SPAN = 0.5
@@ -54,10 +54,6 @@ class FollowingEstimator:
         """Take one contact."""
         self._inner.add(sample)
 
-    def adding(self, sample: ContactSample) -> Adding:
-        """The same in the parts of the estimator inside."""
-        return adding(self._inner, sample)
-
     def reset(self) -> None:
         """Forget everything but the settings."""
         self._inner.reset()
@@ -66,14 +62,9 @@ class FollowingEstimator:
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
-        return whole(self.answering())
-
-    def answering(self) -> Answering:
-        """The same in the parts of the estimator inside, and one more."""
-        answer = yield from answering(self._inner)
+        answer = self._inner.estimate()
         if answer is None or answer.rank < 3:
             return answer
-        yield
         if self._place is not None:
             self._travelled += float(np.linalg.norm(answer.point - self._place))
         self._place = answer.point

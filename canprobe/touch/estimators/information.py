@@ -8,7 +8,6 @@ after a long path. So it counts by `Σ w² / Σ w`: the least mean square of the
 from __future__ import annotations
 
 import math
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -92,12 +91,6 @@ class InformationFilter:
         self._path = _Path(travelled, travelled)
         self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
         self.left_out.start(rows, residuals, travelled)
-
-    def still(self) -> InformationFilter:
-        """The state as it is now, which nothing that is taken later alters: arrays are replaced, never written to."""
-        result = copy(self)
-        result.left_out = self.left_out.still()
-        return result
 
     def take(self, rows: Array, residuals: Array, moved: float) -> None:
         """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""

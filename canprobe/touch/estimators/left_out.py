@@ -8,7 +8,6 @@ the samples say at terms of zero; they are never put into the filter, only into 
 from __future__ import annotations
 
 import math
-from copy import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -95,12 +94,6 @@ class LeftOut:
         wide[:9, :9] = prior
         self.score = Score(wide, correlation)
         self.reset()
-
-    def still(self) -> LeftOut:
-        """As `InformationFilter.still`."""
-        result = copy(self)
-        result.score = copy(self.score)
-        return result
 
     def reset(self) -> None:
         """No samples."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Adding, Answering, Dropped, Estimator, adding, answering, whole
+from canprobe.touch.estimators.base import Dropped, Estimator
 from canprobe.touch.patch_curvature import PatchCurvature
 from canprobe.touch.patch_fusion import patch_estimate, with_patch
 
@@ -31,35 +31,21 @@ class PatchedEstimator:
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact with its moments."""
-        whole(self.adding(sample))
-
-    def adding(self, sample: ContactSample) -> Adding:
-        """The same in the parts of the motion."""
         before = self._motion.dropped.total
-        yield from adding(self._motion, sample)
+        self._motion.add(sample)
         if self._motion.dropped.total == before:
             self._last = sample
             self.patch.add(sample)
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact, or None before there is any."""
-        return whole(self.answering())
-
-    def answering(self) -> Answering:
-        """The same in parts: those of the motion, what the patch says, and both together."""
-        patch = self.patch.still()
-        motion = yield from answering(self._motion)
+        motion = self._motion.estimate()
         if motion is None:
             return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
         if motion.evidence is None:
             return motion
-        yield
-        found = patch.fuse(motion.T_frame_contact, motion.evidence)
-        self.patch.begin_at(patch)
-        if found is None:
-            return motion
-        yield
-        return with_patch(motion, found, self._length)
+        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        return motion if found is None else with_patch(motion, found, self._length)
 
     def reset(self) -> None:
         """Forget everything but the settings."""

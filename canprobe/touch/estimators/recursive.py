@@ -19,10 +19,10 @@ from canprobe.errors import UsageError
 from canprobe.touch._arrays import Array, positive
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate import SurfaceEstimate
-from canprobe.touch.estimators.base import Adding, Answering, Dropped, Gate, whole
+from canprobe.touch.estimators.base import Dropped, Gate
 from canprobe.touch.estimators.change import ChangeTest
 from canprobe.touch.estimators.equations import Equations, Touch, equations, squared_innovations, weight_of
-from canprobe.touch.estimators.filter_answer import filter_answering
+from canprobe.touch.estimators.filter_answer import filter_answer
 from canprobe.touch.estimators.information import InformationFilter
 from canprobe.touch.estimators.left_out import Expected
 from canprobe.touch.estimators.start import Start
@@ -112,10 +112,6 @@ class RecursiveEstimator:
 
     def add(self, sample: ContactSample) -> None:
         """Take one contact."""
-        whole(self.adding(sample))
-
-    def adding(self, sample: ContactSample) -> Adding:
-        """The same in parts, of which only the last contact of a step has more than one."""
         if not self._gate.passes(sample, self.dropped):
             return
         touch = Touch(sample.p_base, sample.n_base, *self._gate.sigmas(sample), self._coupling)
@@ -124,31 +120,25 @@ class RecursiveEstimator:
         if self._last is None or self._travel.weight == 1.0:
             self._last = touch
         if moved > 0.0:
-            yield from self._step(moved)
+            self._step(moved)
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
         """The answer at the last contact that is no outlier; None before the contact has moved."""
-        return whole(self.answering())
-
-    def answering(self) -> Answering:
-        """The same in parts, which all speak of what was known at the first."""
         if self._last is None or self._spread.weight == 0.0:
             return None
         # what has not settled is not called observed
         certain = float(self._settled) / self._gate.sigma_point**2
-        return (
-            yield from filter_answering(
-                self._filter.still(),
-                self._last.point,
-                self._spread.covariance * certain,
-                innovation=self._change.innovation,
-                distance=min(self._travel.total, self._memory),
-                samples=self._spread.weight,
-                prior=self._prior.name,
-                notes=self._notes(),
-                expected=None if self._quadric else self._expected(),
-            )
+        return filter_answer(
+            self._filter,
+            self._last.point,
+            self._spread.covariance * certain,
+            innovation=self._change.innovation,
+            distance=min(self._travel.total, self._memory),
+            samples=self._spread.weight,
+            prior=self._prior.name,
+            notes=self._notes(),
+            expected=None if self._quadric else self._expected(),
         )
 
     def _expected(self) -> Expected:
@@ -163,12 +153,11 @@ class RecursiveEstimator:
         notes += [f"{doubtful} samples with reduced weight"] if doubtful else []
         return (*notes, *self._gate.notes())
 
-    def _step(self, moved: float) -> Adding:
+    def _step(self, moved: float) -> None:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
         if compared and any([self._change.take(square, caution) for square in compared.squares]):
-            yield
             explained = self._explained(compared.equations)
             if explained is None:
                 self._change.alarm()
@@ -178,12 +167,9 @@ class RecursiveEstimator:
             else:
                 compared = explained
         if self._start is not None:
-            yield
-            yield from self._beginning(self._start, moved)
+            self._beginning(self._start, moved)
         elif compared:
-            yield
             self._absorb(compared, moved)
-            yield
             if self._last is not None:
                 self._filter.follow(self._last.point)
 
@@ -211,15 +197,14 @@ class RecursiveEstimator:
         rows, residuals = compared.equations
         self._filter.take(rows * root[:, :, None], residuals * root, moved)
 
-    def _beginning(self, start: Start, moved: float) -> Adding:
+    def _beginning(self, start: Start, moved: float) -> None:
         """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
         crowd = self._weigh(moved, np.ones(len(self._pending)))
         wider = 1.0 / math.sqrt(crowd)
         touches = [p.touch for p in self._pending]
-        yield from start.adding(
+        start.add(
             [t._replace(sigma_point=wider * t.sigma_point, sigma_normal=wider * t.sigma_normal) for t in touches], moved
         )
-        yield
         self._settled = start.settled
         found = start.solution
         if found is None:

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 import numpy as np
 
 from canprobe.touch._arrays import Array
-from canprobe.touch.estimators.base import Adding
 from canprobe.touch.estimators.equations import Touch, batch_design
 from canprobe.touch.frames import homogeneous, tangent_rotation
 from canprobe.touch.linearised import SETTLED, Linearised, gauss_newton, linearised, with_terms
@@ -68,8 +67,8 @@ class Start:
         share = self.travelled / self._length
         return self.solution is not None and (share >= LATEST or (share >= LAST and self.settled))
 
-    def adding(self, touches: Sequence[Touch], moved: float) -> Adding:
-        """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step; in parts."""
+    def add(self, touches: Sequence[Touch], moved: float) -> None:
+        """Take in the contacts of a step of the path (m), and improve the solution by a Gauss–Newton step."""
         self._touches += touches
         if len(self._touches) > MOST:
             self._touches = self._touches[::2]
@@ -82,21 +81,16 @@ class Start:
         d = batch_design(self.T, self._length, self._touches)
         if share < LAST and float(np.linalg.eigvalsh(spread_of(d.X, d.point_variance))[0]) < SPREAD:
             return
-        yield
-        yield from self._improving(d, share >= LAST)
+        self._improve(d, share >= LAST)
 
-    def _improving(self, d: Design, stretch_over: bool) -> Adding:
+    def _improve(self, d: Design, stretch_over: bool) -> None:
         """From the better of the last solution and, until that has settled, a linear one."""
         now = None if self.solution is None else linearised(self.solution.target, d, self._prior)
-        yield
         if now is None or not self.settled:
             plain = self._linear(d)
-            yield
             fresh = linearised(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
-            yield
         better = gauss_newton(now, d, self._prior)
-        yield
         self.solution, self.rows = better, with_terms(better, d)
         known = self.settled or better.decision.rank == 3 or stretch_over
         self.settled = known and better.step < SETTLED
