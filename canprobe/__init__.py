@@ -9,9 +9,24 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from canprobe.api import RunResult, open_cell, run
-    from canprobe.planning import make_plan as plan
+    from canprobe.api import open_cell, plan, run
+    from canprobe.cell.measurement import Command, Controller, Measurement
+    from canprobe.errors import (
+        BusError,
+        CanprobeError,
+        EdsError,
+        InterfaceError,
+        NodeError,
+        PlanError,
+        ProtocolError,
+        ResultsError,
+        SafetyStop,
+        SceneError,
+        StudyError,
+        UsageError,
+    )
     from canprobe.recorded import ReplayResult, replay
+    from canprobe.results import RunResult
     from canprobe.scene_loader import load_scene
     from canprobe.surface_file import load_surface_map
     from canprobe.tables import load_table
@@ -24,30 +39,48 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 
-_EXPORTS = {
-    "load_scene": ("canprobe.scene_loader", "load_scene"),
-    "load_surface_map": ("canprobe.surface_file", "load_surface_map"),
-    "measure_traffic": ("canprobe.traffic_log", "measure_traffic"),
-    "plan": ("canprobe.api", "plan"),
-    "run": ("canprobe.api", "run"),
-    "load_table": ("canprobe.tables", "load_table"),
-    "open_cell": ("canprobe.api", "open_cell"),
-    "replay": ("canprobe.recorded", "replay"),
-    "ReplayResult": ("canprobe.recorded", "ReplayResult"),
-    "RunResult": ("canprobe.api", "RunResult"),
-    "SurfaceMatrix": ("canprobe.touch.surface", "SurfaceMatrix"),
-    "SurfaceMap": ("canprobe.touch.surface_map", "SurfaceMap"),
-    "SurfaceEstimate": ("canprobe.touch.estimate", "SurfaceEstimate"),
-    "fit_surface": ("canprobe.touch.fit", "fit_surface"),
-    "cramer_rao": ("canprobe.touch.bound", "cramer_rao"),
+_MODULES = {
+    "canprobe.api": ("open_cell", "plan", "run"),
+    "canprobe.cell.measurement": ("Command", "Controller", "Measurement"),
+    "canprobe.errors": (
+        *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
+        *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
+    ),
+    "canprobe.recorded": ("ReplayResult", "replay"),
+    "canprobe.results": ("RunResult",),
+    "canprobe.scene_loader": ("load_scene",),
+    "canprobe.surface_file": ("load_surface_map",),
+    "canprobe.tables": ("load_table",),
+    "canprobe.touch.bound": ("cramer_rao",),
+    "canprobe.touch.estimate": ("SurfaceEstimate",),
+    "canprobe.touch.fit": ("fit_surface",),
+    "canprobe.touch.surface": ("SurfaceMatrix",),
+    "canprobe.touch.surface_map": ("SurfaceMap",),
+    "canprobe.traffic_log": ("measure_traffic",),
 }
+_EXPORTS = {name: (module, name) for module, names in _MODULES.items() for name in names}
 
 __all__ = [
+    "BusError",
+    "CanprobeError",
+    "Command",
+    "Controller",
+    "EdsError",
+    "InterfaceError",
+    "Measurement",
+    "NodeError",
+    "PlanError",
+    "ProtocolError",
     "ReplayResult",
+    "ResultsError",
     "RunResult",
+    "SafetyStop",
+    "SceneError",
+    "StudyError",
     "SurfaceEstimate",
     "SurfaceMap",
     "SurfaceMatrix",
+    "UsageError",
     "__version__",
     "cramer_rao",
     "fit_surface",

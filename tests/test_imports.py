@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import canprobe
+from canprobe import errors
 
 PACKAGE = Path(canprobe.__file__).parent
 FILES = glob.glob("**/*.py", root_dir=PACKAGE, recursive=True)  # it follows the links eds and bridge; rglob does not
@@ -199,3 +200,20 @@ def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
     path = tmp_path / "module.py"
     path.write_text(source)
     assert [name for name, _, _ in imports_of(path, Path("bus/module.py"))] == names
+
+
+def test_what_users_need_is_a_name_of_the_package_itself():
+    """To everybody alike: at run time, to `dir` and `import *`, and to a type checker."""
+    named = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and value.__module__ == "canprobe.errors"
+    }
+    named |= {"Command", "Controller", "Measurement", "RunResult"}
+    assert named <= set(canprobe.__all__) <= set(dir(canprobe))
+    for name in canprobe.__all__:
+        assert getattr(canprobe, name) is not None
+    assert canprobe.NodeError is errors.NodeError
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    checked = {a.asname or a.name for n in type_checking_nodes(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
+    assert checked == set(canprobe.__all__) - {"__version__"}
