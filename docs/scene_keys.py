@@ -48,7 +48,7 @@ This page is generated from the definition of a scene: `python docs/scene_keys.p
 ## Sections and tasks
 
 `[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]` and `[bridge]` may stand
-in every scene. The other sections depend on `task.kind`. *Required*: the scene must have the section. *default*: a
+in every scene. The other sections depend on `task.kind`. *required*: the scene must have the section. *default*: a
 scene without the section has all its defaults. *optional*: a scene without the section does without it. *–*: the
 section is an error.
 """
