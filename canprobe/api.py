@@ -58,7 +58,7 @@ __all__ = [
 ]
 
 ROWS_OF_UP = 4000
-"""Cycles that :func:`up` remembers: it runs for days."""
+"""Cycles that `up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
@@ -83,7 +83,7 @@ def run(
     """Carry out a scene's task and write what was measured.
 
     Args:
-        scene: from :func:`canprobe.load_scene`.
+        scene: from `canprobe.load_scene`.
         interface, channel, bitrate: in the place of the scene's bus.
         sensor_channel: the sensor's bus, where it is another one.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
@@ -139,12 +139,12 @@ class _Hold:
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
-    """Where :func:`run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
+    """Where `run` puts the files: ``out``, or ``runs/<scene>-<time>`` to the millisecond."""
     return Path(out) if out is not None else Path("runs") / f"{scene.name}-{datetime.now():%Y%m%d-%H%M%S-%f}"[:-3]
 
 
 def plan(scene: Scene) -> Plan:
-    """Everything that follows from a scene before anything is started; see :func:`canprobe.planning.make_plan`.
+    """Everything that follows from a scene before anything is started; see `canprobe.planning.make_plan`.
 
     Raises:
         UsageError: this is no scene.
@@ -380,11 +380,11 @@ def open_cell(
     The block is the run: its result is complete, and its files are written, when it is left, however it is left.
 
     Args:
-        scene: from :func:`canprobe.load_scene`.
+        scene: from `canprobe.load_scene`.
         interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
         out: folder for the same files as those of :func:`run`; None writes nothing.
         say: called with each step.
-        force, observers, bridge: as for :func:`run`.
+        force, observers, bridge: as for `run`.
         rows_kept: cycles whose row of the log is kept; all by default, which grows by about 1 KiB a cycle. With a
             number nothing is kept of the truth, and the scan is not scored.
 
@@ -425,7 +425,7 @@ def up(
     """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
 
     Raises:
-        UsageError, BusError, SafetyStop: as :func:`run`.
+        UsageError, BusError, SafetyStop: as `run`.
     """
     if (interface or scene.bus.interface) == LOCKSTEP:
         raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
@@ -503,7 +503,7 @@ def commission(
 
     Raises:
         UsageError: the scene does not fit.
-        BusError: see :func:`canprobe.cell.commission.commission`.
+        BusError: see `canprobe.cell.commission.commission`.
         InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
     from canprobe.cell.commission import commission, wanted_by

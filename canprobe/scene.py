@@ -1,7 +1,8 @@
 """A scene: what one experiment consists of, as frozen dataclasses that mirror the TOML file.
 
-Field names are the TOML keys and carry their unit. A section that is None is absent and left out of the plan. Each
-field is one line: type, check, default; `canprobe.scene_loader` reads everything it needs from these annotations.
+Field names are the TOML keys and carry their unit. A section that is None is absent and left out of the plan. A field
+says everything about its key: type and checks, default, and below it the meaning. `canprobe.scene_loader` needs no
+more than that, and `docs/scene_keys.py` makes the reference of all keys from it.
 """
 
 from __future__ import annotations
@@ -48,36 +49,52 @@ WAVE = Only("kind", ("wave",), required=True)
 
 @dataclass(frozen=True, slots=True)
 class SceneInfo:
-    """`[scene]`: what the scene is called, the seed of everything random in it, and whether its run is drawn."""
+    """`[scene]`: the name of the scene, its seed, and whether its runs are drawn."""
 
     name: Annotated[str, Pattern(r"[A-Za-z0-9][A-Za-z0-9_.-]*", "of letters, digits, '_', '.' and '-'")]
+    """Name of the scene. It is part of the name of the results folder."""
     title: str = ""
+    """One line about the scene, which `canprobe scenes` and `canprobe plan` print."""
     seed: Annotated[int, Range(0, 2**63 - 1)] = 0
-    figures: bool = True  # report.png, surface.png and report.html: seconds that a series of runs can spare
+    """Seed of all random numbers. In lockstep the same seed gives the same `bus.log`."""
+    figures: bool = True
+    """Draw `report.png`, `surface.png` and `report.html` after a run. false saves seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class BusSettings:
-    """`[bus]`: where the nodes are. `lockstep`, `socketcan` or any python-can interface."""
+    """`[bus]`: the bus that connects the nodes."""
 
     interface: Annotated[str, Pattern(r"[a-z0-9_-]+", "such as lockstep, socketcan, pcan")] = "lockstep"
+    """`lockstep` (in this process, in virtual time), `socketcan`, or any other python-can interface."""
     channel: Channel = "can0"
+    """Channel of the interface. On a lockstep bus it is only a name in the log."""
     bitrate: Annotated[int, Range(10_000, 1_000_000)] = 1_000_000
-    timed: bool = True  # lockstep: frames take their time on the wire and wait for each other; false: none at all
-    transmit_queue: TransmitQueue = "priority"  # what a node with several frames sends first; "fifo": the oldest
-    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0  # timed lockstep: share of bits that the wire corrupts
-    fd: bool | Auto = False  # PDOs of up to 64 bytes in CAN FD frames, where a device has them; the rest is classical
-    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000  # of the data phase of CAN FD frames
-    cob_ids: CobIds = "default"  # of the PDOs: the cell's own, or priorities in the order of the deadlines
+    """Bit rate of the bus."""
+    timed: bool = True
+    """Lockstep: a frame takes its time on the wire, and frames wait for each other. false: no time."""
+    transmit_queue: TransmitQueue = "priority"
+    """Which frame a node sends first: the lowest identifier, or the oldest (`fifo`)."""
+    bit_error_rate: Annotated[float, Range(0, 0.01)] = 0.0
+    """Timed lockstep: share of bits that the wire corrupts."""
+    fd: bool | Auto = False
+    """Send PDOs of up to 64 bytes in CAN FD frames where a device has them. Other frames stay classical."""
+    data_bitrate: Annotated[int, Range(10_000, 8_000_000)] = 5_000_000
+    """Bit rate of the data phase of CAN FD frames."""
+    cob_ids: CobIds = "default"
+    """COB-IDs of the PDOs: the defaults of the cell, or priorities in the order of the deadlines."""
 
 
 @dataclass(frozen=True, slots=True)
 class CycleSettings:
-    """`[cycle]`: the rate of SYNC and servo."""
+    """`[cycle]`: the control cycle."""
 
     rate_hz: Annotated[float, Range(1, 2000)] = 400.0
-    realtime: bool = False  # on a real interface: SCHED_FIFO, a processor of its own, locked memory
-    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0  # that the plan leaves to the controller in each cycle
+    """Rate of SYNC and of the servo."""
+    realtime: bool = False
+    """On a real interface: request SCHED_FIFO, a processor for the cycle and locked memory."""
+    compute_us: Annotated[float, Range(0, 1_000_000)] = 200.0
+    """Computing time that the plan reserves for the controller in each cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,14 +102,22 @@ class ArmSettings:
     """`[arm]`: six joint drives."""
 
     model: ArmModel = "upenn"
+    """Published geometry of the PUMA 260 that the controller uses."""
     node_ids: Annotated[NodeIds, Distinct()] = (1, 2, 3, 4, 5, 6)
+    """Node ids of the drives, from the base to the wrist."""
     eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
+    """EDS of the drives: a packaged name, or a path relative to the scene."""
     emulated: bool = True
-    # selects the branch of the inverse kinematics; an emulated arm stands here in `free`, above the start in others
+    """canprobe serves the drives. false: the drives are real."""
     start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
-    missed_syncs: Annotated[int, Range(1, 250)] = 5  # then drive and master take each other for dead
-    grouped_rpdo: bool | Auto = False  # two targets in one RPDO through dummy mapping
-    serial_numbers: Annotated[SerialNumbers | None, Distinct()] = None  # 1018h:04 of each drive; None: any
+    """Joint angles that select the branch of the inverse kinematics. An emulated arm starts here in `free`, and
+    above the start point in other tasks."""
+    missed_syncs: Annotated[int, Range(1, 250)] = 5
+    """SYNC periods of silence after which master and drives treat each other as lost."""
+    grouped_rpdo: bool | Auto = False
+    """Put two targets into one RPDO by dummy mapping."""
+    serial_numbers: Annotated[SerialNumbers | None, Distinct()] = None
+    """Serial number (1018h:04) that each drive must have. Left out: any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,91 +125,142 @@ class SensorSettings:
     """`[sensor]`: the 16×16 tactile array."""
 
     node_id: NodeId = 16
+    """Node id of the array."""
     eds: Annotated[str, ScenePath()] = "tactile_array.eds"
+    """EDS of the array: a packaged name, or a path relative to the scene."""
     emulated: bool = True
-    channel: Channel | None = None  # a bus of its own; "auto" as it fits
+    """canprobe serves the array. false: the array is real."""
+    channel: Channel | None = None
+    """Channel of a separate bus for the array. Left out: the bus of the drives. "auto": the plan chooses."""
     mode: TactileModeName = "window"
-    # taxels along the window that follows the contact; the full image is a mode of its own
+    """What the array sends: the taxels round the contact, all taxels, or force, centroid and moments that it
+    computes from them."""
     window: Annotated[Annotated[int, OneOf(WINDOWS)] | Auto, Only("mode", ("window", "auto"))] = 8
+    """Side of the window that follows the contact, in taxels."""
     rate_hz: Annotated[float, Range(1, 1000)] = 200.0
+    """Rate of tactile frames. Each is triggered by a SYNC."""
     full_scale_kpa: Annotated[float, Range(10, 1000)] = 100.0
-    serial_number: SerialNumber | None = None  # 1018h:04; None: any
+    """Pressure at the largest count of a taxel."""
+    serial_number: SerialNumber | None = None
+    """Serial number (1018h:04) that the array must have. Left out: any."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbeSettings:
-    """`[probe]`: the sphere that carries the array, with its elastic layer."""
+    """`[probe]`: the sphere that carries the array and its elastic layer."""
 
     radius_mm: Annotated[float, Range(5, 200)] = 40.0
-    centre_offset_mm: Annotated[float, Range(0, 300)] = 80.0  # of the sphere's centre beyond the flange, along tool z
-    centre_lateral_mm: Vec2 = (0.0, 0.0)  # and along tool x and y; `canprobe run calibrate` finds all three
+    """Radius of the sphere."""
+    centre_offset_mm: Annotated[float, Range(0, 300)] = 80.0
+    """Distance of the centre of the sphere from the flange along tool z. `canprobe run calibrate` finds it."""
+    centre_lateral_mm: Vec2 = (0.0, 0.0)
+    """Offset of the centre along tool x and y. `canprobe run calibrate` finds it."""
     mass_kg: Annotated[float, Range(0, 5)] = 0.3
-    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] = 1.27e8  # K/h of the elastic layer
+    """Mass of the probe; the dynamic arm carries it."""
+    stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] = 1.27e8
+    """Stiffness of the elastic layer: its modulus over its thickness (K/h)."""
 
 
 @dataclass(frozen=True, slots=True)
 class ObjectSettings:
-    """`[object]`: the true object, for the emulated plant and for scoring; the controller never sees it.
+    """`[object]`: the true object, for the emulated plant and for scoring. The controller never reads it.
 
-    The object frame's origin lies on the surface with z outward. A cylinder, a wave and a fillet are straight along
-    x: a wave is z = amplitude (cos(2π y/wavelength) − 1), a fillet an arc that turns by angle between two planes. A
-    saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign (positive: convex); an ellipsoid has
-    three positive semi-axes; a torus lies flat, the origin on its crown, x outward from its axis; a bowl is the inside
-    of a sphere, seen from its bottom; a quadric is XᵀSX = 0 with S = matrix, in metres, negative inside.
+    The origin of the object frame lies on the surface, and its z axis points outward. A cylinder, a wave and a fillet
+    are straight along x. A wave is z = amplitude (cos(2π y/wavelength) − 1). A fillet is an arc between two planes;
+    it turns the normal by the angle. A saddle is z = −x²/(2 radius_x) − y²/(2 radius_y) with radii of opposite sign
+    (positive: convex). An ellipsoid has three positive semi-axes. A torus lies flat; the origin is on its crown, and x
+    points away from its axis. A bowl is the inside of a sphere with the origin at its bottom. A quadric is XᵀSX = 0
+    with S = matrix, in metres, negative inside.
     """
 
     kind: ObjectKind
+    """Shape of the object."""
     radius_mm: Annotated[
         float | None,
         Range(1, 100_000),
         Only("kind", ("sphere", "cylinder", "bowl", "torus", "fillet"), required=True),
     ] = None
+    """Radius; of a torus, the radius of its tube."""
     radius_x_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    """Radius or semi-axis along x of the object frame."""
     radius_y_mm: Annotated[float | None, Range(-100_000, 100_000), TWO_RADII] = None
+    """Radius or semi-axis along y of the object frame."""
     radius_z_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("ellipsoid",), required=True)] = None
+    """Semi-axis along z of the object frame."""
     ring_radius_mm: Annotated[float | None, Range(1, 100_000), Only("kind", ("torus",), required=True)] = None
-    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None  # half of trough to crest
+    """Radius of the circle on which the centre of the tube lies; above `radius_mm`."""
+    amplitude_mm: Annotated[float | None, Range(0, 1000, open_low=True), WAVE] = None
+    """Half of the height from trough to crest."""
     wavelength_mm: Annotated[float | None, Range(1, 100_000), WAVE] = None
+    """Distance from crest to crest."""
     angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
+    """Angle between the two normals."""
     matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
         None
     )
-    position_mm: Vec3 = (-120.0, -122.5, 374.0)  # of the object frame in base: a point on the surface
-    rotation_deg: Vec3 = (0.0, 0.0, 0.0)  # roll, pitch, yaw about fixed x, y, z
+    """Matrix S of the quadric XᵀSX = 0, with lengths in metres."""
+    position_mm: Vec3 = (-120.0, -122.5, 374.0)
+    """Origin of the object frame in the base frame: a point of the surface."""
+    rotation_deg: Vec3 = (0.0, 0.0, 0.0)
+    """Roll, pitch and yaw of the object about the fixed axes x, y and z."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskSettings:
-    """`[task]`: what is done.
+    """`[task]`: what the cell does.
 
-    `scan` approaches, touches and follows the strategy; `press` approaches and holds the force; `calibrate` touches a
-    ball of known radius, its top expected at `start_mm`, from several sides to find the probe's centre on the flange;
-    `listen` reads the sensor only; `free` swings the joints about `arm.start_deg` without a sensor.
+    `scan` approaches, touches and follows a path over the surface. `press` approaches and holds the force. `calibrate`
+    touches a ball of known radius from several sides and finds the centre of the probe on the flange; it expects the
+    top of the ball at `start_mm`. `listen` only reads the array. `free` swings the joints about `arm.start_deg` and
+    needs no array.
     """
 
     kind: TaskKind
-    duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0  # of the scan, press, listen or free phase
+    """Kind of task."""
+    duration_s: Annotated[float, Range(0, 86_400, open_low=True)] = 20.0
+    """Length of the scan, press, listen or free phase."""
     force_n: Annotated[float, Range(0, 20, open_low=True), TOUCHING] = 2.0
+    """Target of the contact force."""
     approach_mm_s: Annotated[float, Range(0, 4, open_low=True), TOUCHING] = 4.0
-    start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)  # expected contact point, approached along −normal
-    approach_normal: Annotated[Vec3, Direction(), TOUCHING] = (0.0, 0.0, 1.0)  # normalised by its users
-    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0  # above start_mm before the approach
-    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 8.0  # below start_mm where it gives up
+    """Speed of the approach."""
+    start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)
+    """Expected contact point, in the base frame."""
+    approach_normal: Annotated[Vec3, Direction(), TOUCHING] = (0.0, 0.0, 1.0)
+    """Expected outward normal at `start_mm`, of any length. The probe approaches against it."""
+    clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0
+    """Distance from `start_mm` at which the approach begins."""
+    search_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 8.0
+    """Distance beyond `start_mm` at which the approach gives up."""
     strategy: Annotated[Strategy, SCANNING] = "weave"
+    """Path of the scan."""
     speed_mm_s: Annotated[float, Range(0, 200, open_low=True), SCANNING] = 25.0
-    heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0  # of the path, in the base xy-plane
-    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0  # towards the object where contact is lost; 0: give up
-    length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0  # full size; a circle's diameter
-    width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0  # full size
-    wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0  # of one weave
-    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05  # 0: pad follows the normal, 1: fixed orientation
+    """Speed of the contact over the surface."""
+    heading_deg: Annotated[float, Range(-360, 360), SCANNING] = 0.0
+    """Heading of the path in the xy plane of the base frame, from x."""
+    regain_mm: Annotated[float, Range(0, 20), SCANNING] = 2.0
+    """Distance over which a scan searches towards the object for a lost contact. 0: it retreats at once."""
+    length_mm: Annotated[float, Range(0.1, 500), SCANNING] = 36.0
+    """Full length of the path along the heading; diameter of a circle."""
+    width_mm: Annotated[float, Range(0, 500, open_low=True), SCANNING, Only("strategy", ("weave",))] = 9.0
+    """Full width of the path across the heading."""
+    wavelength_mm: Annotated[float, Range(1, 500), SCANNING, Only("strategy", ("weave",))] = 12.0
+    """Length of one weave along the heading."""
+    rolling_share: Annotated[float, Range(0, 1), SCANNING] = 0.05
+    """How the probe turns: 0 follows the normal of the surface, 1 keeps its orientation."""
     ball_radius_mm: Annotated[float, Range(5, 500), CALIBRATING] = 25.0
-    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATING] = 3.0  # of its expected centre per axis
+    """Radius of the ball."""
+    ball_sigma_mm: Annotated[float, Range(0, 20, open_low=True), CALIBRATING] = 3.0
+    """Standard deviation of the expected centre of the ball, per axis."""
     touches: Annotated[int, Range(2, 200), CALIBRATING] = 13
-    tilt_deg: Annotated[float, Range(0, 60), CALIBRATING] = 22.0  # of the touches round the top from the top
-    beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0  # of each touch from the pole of the probe
-    swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)  # amplitude of each joint
+    """Number of touches."""
+    tilt_deg: Annotated[float, Range(0, 60), CALIBRATING] = 22.0
+    """Angle of the outer touches from the top of the ball."""
+    beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0
+    """Angle of each touch from the pole of the probe."""
+    swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)
+    """Amplitude of the swing of each joint."""
     swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
+    """Period of the swing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,91 +268,142 @@ class ShapeSettings:
     """`[shape]`: the surface estimator."""
 
     method: ShapeMethod = "recursive"
-    memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0  # of path, whatever the time
-    also: Annotated[tuple[ShapeMethod, ...], Distinct()] = ("ml", "chen1996")  # on the same data, for the report
-    patch: bool = True  # complete what the path leaves open by the second moments of the images
-    every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0  # between two answers; every sample is taken in
+    """Estimator in the control loop."""
+    memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0
+    """Length of path on which an estimate rests, at any speed."""
+    also: Annotated[tuple[ShapeMethod, ...], Distinct()] = ("ml", "chen1996")
+    """Other estimators that compute on the same contacts after the run, for the report."""
+    patch: bool = True
+    """Use the second moments of the tactile images where the path leaves a curvature open."""
+    every_ms: Annotated[float, Range(0, 10_000, open_low=True)] = 40.0
+    """Time between two estimates. Every contact is used."""
 
 
 @dataclass(frozen=True, slots=True)
 class LimitSettings:
-    """`[limits]`: where the cell is stopped for safety."""
+    """`[limits]`: where the cell stops for safety."""
 
     force_max_n: Annotated[float, Range(0, 50, open_low=True)] = 5.0
-    preload_max_n: Annotated[float, Range(0, 50)] = 0.15  # felt before the run, which the array's tare takes for zero
-    joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0  # kept from every joint stop
-    joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0  # of the model's speed limits
-    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0  # of the last second's, late by half a period
-    workspace_min_mm: Vec3 | None = None  # of the probe's tip in base; none without
+    """Highest measured force."""
+    preload_max_n: Annotated[float, Range(0, 50)] = 0.15
+    """Highest force before the run. The tare of the array would take it for zero."""
+    joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
+    """Angle that is kept from every joint stop."""
+    joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0
+    """Share of the speed limits of the arm."""
+    late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
+    """Share of the cycles of the last second that may be late by half a period. 100: no limit."""
+    workspace_min_mm: Vec3 | None = None
+    """Lowest coordinates of the tip of the probe in the base frame. Left out: no limit."""
     workspace_max_mm: Vec3 | None = None
+    """Highest coordinates of the tip of the probe in the base frame. Left out: no limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class BringUpSettings:
-    """`[bring_up]`: how long its steps may take, and what is done about those that take longer."""
+    """`[bring_up]`: the time of each step of bring-up, and what happens when a step takes longer."""
 
-    listen_s: Annotated[float, Range(0, 60)] = 0.25  # for another master
-    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0  # from the reset to the boot-up message
-    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5  # for one answer
-    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0  # from NMT start to the heartbeat that tells it
-    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0  # for the emulated nodes' process to start
-    retries: Annotated[int, Range(0, 100)] = 2  # of a reset, a request or a start without an answer
-    store: bool = False  # 1010h keeps the configuration in the nodes; 1020h tells the next bring-up to leave it out
+    listen_s: Annotated[float, Range(0, 60)] = 0.25
+    """Time in which bring-up only listens for another master."""
+    boot_up_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time from the reset of a node to its boot-up message."""
+    sdo_s: Annotated[float, Range(0, 60, open_low=True)] = 0.5
+    """Longest time to one SDO answer."""
+    start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
+    """Longest time from NMT start to the heartbeat that confirms it."""
+    emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
+    """Longest time in which the process of the emulated nodes starts."""
+    retries: Annotated[int, Range(0, 100)] = 2
+    """How often a reset, request or start without an answer is repeated."""
+    store: bool = False
+    """Store the configuration in the nodes (1010h). The next bring-up finds it by 1020h and does not write it."""
 
 
 @dataclass(frozen=True, slots=True)
 class ServoSettings:
-    """`[servo]`: the tactile servo's gains."""
+    """`[servo]`: the gains of the tactile servo."""
 
-    surface_height_hz: Annotated[float, Range(0, 50, open_low=True)] = 8.0  # how fast its surface follows the samples
-    surface_tilt_hz: Annotated[float, Range(0, 50, open_low=True)] = 6.0  # and that surface's normal
-    drive_lag_ms: Annotated[float, Range(0, 100)] = 6.8  # of the drives behind a ramp: 2 ζ/ω, with −3 dB at 30 Hz
+    surface_height_hz: Annotated[float, Range(0, 50, open_low=True)] = 8.0
+    """Bandwidth with which the servo corrects the height of its surface."""
+    surface_tilt_hz: Annotated[float, Range(0, 50, open_low=True)] = 6.0
+    """Bandwidth with which the servo corrects the normal of its surface."""
+    drive_lag_ms: Annotated[float, Range(0, 100)] = 6.8
+    """Lag of the drives behind a ramp: 2 ζ/ω for second-order drives."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlantSettings:
     """`[plant]`: how the emulated arm, contact and array behave.
 
-    Fidelity `ideal`: each drive tracks as a second-order system, whatever it pushes against. `dynamic`: rigid links,
-    friction, drive cascade, and the object pushes back; the keys that say "dynamic" belong to it.
+    With fidelity `ideal` each drive tracks as a second-order system, whatever pushes against it. `dynamic` adds rigid
+    links, friction, the cascade of the drives and the push of the object.
     """
 
     fidelity: Fidelity = "ideal"
-    arm_model: ArmModel | None = None  # the arm that is really there, its base set so that the start is where it is
+    """Model of the arm."""
+    arm_model: ArmModel | None = None
+    """Geometry of the emulated arm where it differs from `arm.model`. Its base is placed so that the start point
+    stays where it is."""
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
-    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0  # of the integrator
-    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3  # Coulomb, between probe and object
-    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0  # reset time of the velocity loops; 0: none
-    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0  # 1 removes the drives' lag
-    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000  # of the continuous torque
+    """Integrator of the equations of motion."""
+    step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0
+    """Step of the integrator."""
+    friction: Annotated[float, Range(0, 2), DYNAMIC] = 0.3
+    """Coefficient of Coulomb friction between probe and object."""
+    integral_ms: Annotated[float, Range(0, 10_000), DYNAMIC] = 20.0
+    """Reset time of the velocity loops. 0: no integral part."""
+    velocity_feed_forward: Annotated[float, Range(0, 1), DYNAMIC] = 0.0
+    """Share of velocity feed-forward in the drives. 1 removes their lag."""
+    torque_limit_permille: Annotated[int, Range(1, 2000), DYNAMIC] = 2000
+    """Torque limit of the drives, relative to their continuous torque."""
     drive_bandwidth_hz: Annotated[float, Range(1, 1000)] = 30.0
-    tool_error_mm: Vec3 = (0.0, 0.0, 0.0)  # of the probe's centre that is really there, in the flange frame
-    # K/h of the layer that is really there, N/m³; the probe's by default
+    """Bandwidth of the drives (−3 dB)."""
+    tool_error_mm: Vec3 = (0.0, 0.0, 0.0)
+    """Error of the centre of the probe: where it is, less where `[probe]` has it, in the flange frame."""
     stiffness_n_m3: Annotated[float, Range(1e5, 1e12)] | None = None
-    contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3  # Hunt–Crossley α (assumed)
+    """Stiffness K/h of the emulated layer. Left out: that of `[probe]`."""
+    contact_damping_s_m: Annotated[float, Range(0, 100)] = 0.3
+    """Damping of the contact: α of Hunt and Crossley (assumed)."""
     noise: bool = True
+    """Noise of the taxels."""
     gain_error: bool = True
+    """Spread of the gains of the taxels."""
     blur: bool = True
+    """Blur of the pressure by the cover."""
     hysteresis: bool = True
+    """Hysteresis of the taxels."""
     creep: bool = True
+    """Creep of the taxels under constant load."""
     crosstalk: bool = True
+    """Crosstalk between taxels of a row or column."""
     saturation: bool = True
-    threshold: bool = True  # of the array itself, before the node's own
-    adc_bits: Annotated[int, Range(8, 16)] = 8  # beyond 8 the node's features gain by it; taxels go out in whole counts
+    """Saturation of the taxels."""
+    threshold: bool = True
+    """Threshold of the array, below which a taxel reads 0."""
+    adc_bits: Annotated[int, Range(8, 16)] = 8
+    """Resolution of the ADC. Taxels are sent in 8 bits; only the features that the array computes gain."""
 
 
 @dataclass(frozen=True, slots=True)
 class BridgeSettings:
-    """`[bridge]`: the other tools that see this cell, each in a process of its own; `canprobe.planning.bridges`."""
+    """`[bridge]`: other tools that receive the data of this cell, each from a separate process."""
 
     use: Annotated[tuple[BridgeName, ...], Distinct()] = ()
-    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765  # 0 lets the system choose
-    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
+    """Bridges to start."""
+    foxglove_port: Annotated[int, Range(0, 65_535)] = 8765
+    """Port of the Foxglove server. 0: the system chooses."""
+    foxglove_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
+    """Address of the Foxglove server. 0.0.0.0 serves other machines."""
     ros2_domain: Annotated[int, Range(0, 232)] = 0
-    ros2_loopback: bool = True  # false lets other machines see the topics, and command the cell where that is allowed
-    view_port: Annotated[int, Range(0, 65_535)] = 8080  # 0 lets the system choose; where it is taken, the next free one
-    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"  # 0.0.0.0 for other machines
-    ros2_commands: bool = False  # start, stop, target force and speed are taken from topics, within the scene's limits
+    """ROS 2 domain."""
+    ros2_loopback: bool = True
+    """Keep the topics on this machine. false: other machines see them, and may send commands if allowed."""
+    view_port: Annotated[int, Range(0, 65_535)] = 8080
+    """Port of the 3-D view; the next free one if it is taken. 0: the system chooses."""
+    view_host: Annotated[str, Pattern(r"\S+", "without spaces")] = "127.0.0.1"
+    """Address of the 3-D view. 0.0.0.0 serves other machines."""
+    ros2_commands: bool = False
+    """Accept start, stop, target force and speed from ROS 2 topics, within the limits of the scene."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,7 +75,7 @@ def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None
 
 
 def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
-    """Read a map that :func:`save_surface_map` or ``canprobe run`` has written.
+    """Read a map that `save_surface_map` or ``canprobe run`` has written.
 
     Args:
         path: of the file, or of the folder of a run.

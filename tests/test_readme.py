@@ -1,39 +1,123 @@
-"""The README's Python examples run as they stand; its picture is there; its commands exist."""
+"""README, CONTRIBUTING and docs: Python blocks run as they stand, commands are understood, and the cheap ones run."""
 
+import dataclasses
 import re
+import shutil
+import tomllib
+import typing
+from importlib.metadata import entry_points
 from pathlib import Path
 
 import pytest
+from command_lines import command_lines, parse
+from undrawn import undrawn_run
 
+import canprobe
 from canprobe.cell.supervision_text import markdown_table
-from canprobe.cli import COMMANDS
+from canprobe.cli import COMMANDS, main
+from canprobe.eds import eds_path
+from canprobe.planning.bridges import BRIDGES
+from canprobe.scene import Scene
+from canprobe.scene_checks import convert
+from canprobe.scene_loader import load_scene, scenes_folder
+from canprobe.studies.study import STUDIES
 
-README = Path(__file__).resolve().parent.parent / "README.md"
-BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
+PATHS = ("canprobe/", "docs/", "tests/", ".ci/")
+SECTIONS = {name: next(iter(typing.get_args(hint)), hint) for name, hint in typing.get_type_hints(Scene).items()}
 
 
-@pytest.mark.parametrize("block", BLOCKS, ids=range(len(BLOCKS)))
-def test_example_runs(block, tmp_path, monkeypatch, capsys):
+def blocks(language):
+    """Every block of a language as (page, text); a block in a list is indented."""
+    found = re.compile(rf"^( *)```{language}\n(.*?)^ *```$", re.DOTALL | re.MULTILINE)
+    return [pytest.param(match[2], id=f"{page}-{i}") for page, text in TEXTS.items()
+            for i, match in enumerate(found.finditer(text))]  # fmt: skip
+
+
+def commands():
+    """Every command line of canprobe in a block, once."""
+    lines = {tuple(line): page for page, text in TEXTS.items() for block in re.findall(r"```sh\n(.*?)```", text, re.S)
+             for line in command_lines(block)}  # fmt: skip
+    return [pytest.param(list(line), id=f"{page}-{' '.join(line)}") for line, page in lines.items()]
+
+
+def is_cheap(line):
+    """It needs no bus, no extra that tests lack, and less than a second or two."""
+    quick = line[0] in ("scenes", "plan", "eds") or line[:2] == ["study", "--list"]
+    return quick or (line[0] == "replay" and "--bridge" not in line)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the files that the pages name: a scene, an EDS, a run and its log."""
+    folder = tmp_path_factory.mktemp("pages")
+    shutil.copy(scenes_folder() / "cylinder.toml", folder / "mine.toml")
+    shutil.copy(eds_path("puma260_joint"), folder / "drive.eds")
+    undrawn_run(load_scene("cylinder"), out=folder / "runs" / "first", duration_s=0.5)
+    shutil.copy(folder / "runs" / "first" / "bus.log", folder / "candump.log")
+    return folder
+
+
+@pytest.mark.parametrize("block", blocks("python"))
+def test_python_block_runs(block, tmp_path, monkeypatch, capsys):
+    def load_undrawn(name):
+        scene = load_scene(name)
+        return dataclasses.replace(scene, scene=dataclasses.replace(scene.scene, figures=False))
+
     monkeypatch.chdir(tmp_path)
-    namespace: dict[str, object] = {"__name__": "readme"}
-    exec(compile(block, "README.md", "exec"), namespace)
-    if "kappa" in block:
+    monkeypatch.setattr(canprobe, "load_scene", load_undrawn)
+    exec(compile(block, "page", "exec"), {"__name__": "page"})
+    if "fit_surface" in block:
         first = float(re.search(r"[\d.]+", capsys.readouterr().out)[0])
         assert first == pytest.approx(20.0, abs=0.01)
 
 
-def test_there_are_examples_and_the_picture():
-    assert len(BLOCKS) == 3
-    for picture in re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README.read_text(encoding="utf-8")):
-        assert (README.parent / picture).is_file()
+@pytest.mark.parametrize("line", commands())
+def test_command_is_understood(line, folder, monkeypatch):
+    monkeypatch.chdir(folder)
+    args = vars(parse(line))
+    for scene in (args.get("scene"), args.get("what")):
+        if scene is not None and not Path(scene).is_dir():
+            load_scene(scene)
+    assert args.get("name") is None or line[0] != "study" or args["name"] in STUDIES
+    assert set(args.get("bridge") or ()) <= set(BRIDGES)
 
 
-def test_commands_in_the_readme_exist():
-    used = set(
-        re.findall(r"^canprobe (\w+)|-- canprobe (\w+)|&& canprobe (\w+)", README.read_text(encoding="utf-8"), re.M)
-    )
-    assert {name for names in used for name in names if name} <= set(COMMANDS)
+@pytest.mark.parametrize("line", [one for one in commands() if is_cheap(one.values[0])])
+def test_cheap_command_runs(line, folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    assert main(line) == 0
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize("block", blocks("toml"))
+def test_keys_exist_and_take_the_values(block):
+    for section, keys in tomllib.loads(block).items():
+        annotations = typing.get_type_hints(SECTIONS[section], include_extras=True)
+        for key, value in keys.items():
+            convert(value, annotations[key])
+
+
+@pytest.mark.parametrize("block", blocks("sh"))
+def test_paths_and_programs_of_a_shell_block_exist(block):
+    known = entry_points(group="console_scripts").names
+    for word in block.split():
+        assert not word.startswith(PATHS) or (ROOT / word).exists()
+        assert not re.fullmatch(r"can_\w+", word) or word in known
+
+
+@pytest.mark.parametrize("page", TEXTS)
+def test_links_pictures_and_names_of_commands(page):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXTS[page]):
+        assert ((ROOT / page).parent / target).is_file(), target
+    assert set(re.findall(r"`canprobe (\w+)", TEXTS[page])) <= set(COMMANDS)
 
 
 def test_the_table_of_conditions_is_the_one_that_supervises():
-    assert markdown_table() in README.read_text(encoding="utf-8"), "print it: canprobe.cell.supervision_text"
+    assert markdown_table() in TEXTS["docs/supervision.md"], "print it: canprobe.cell.supervision_text"
+
+
+def test_the_readme_stays_short():
+    assert TEXTS["README.md"].count("\n") <= 180

@@ -1,7 +1,8 @@
 """What can go wrong in a running cell: one row a condition, with its check, its time, its reaction and the way back.
 
-The table `CONDITIONS` drives the checks of :class:`canprobe.cell.supervisor.Supervisor` and of the touch tasks, and the
-README prints it (`canprobe.cell.supervision_text`). What a check needs is in `Seen`; `Limits` follows from the plan.
+The table `CONDITIONS` drives the checks of :class:`canprobe.cell.supervisor.Supervisor` and of the touch tasks, and
+docs/supervision.md has it (`canprobe.cell.supervision_text`). What a check needs is in `Seen`; `Limits` follows from
+the plan.
 """
 
 from __future__ import annotations

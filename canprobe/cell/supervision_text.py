@@ -1,4 +1,4 @@
-"""The table of conditions as the README prints it."""
+"""The table of conditions as docs/supervision.md has it."""
 
 from __future__ import annotations
 

@@ -39,10 +39,20 @@ COMMANDS = (
 _WRONG_PATH = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _EXAMPLE = """\
-exit status: 0 done, 1 stopped for safety, 2 wrong usage, scene or plan, 3 bus or node failure or a file that cannot be
-written (full disk), 70 an error that nobody foresaw, 130 and 143 interrupted
+`canprobe COMMAND --help` describes a command, with examples. Defaults stand in [brackets].
 
-example:
+exit status:
+    0  done
+    1  stopped for safety
+    2  wrong usage, scene or plan
+    3  bus or node failure, or a file that cannot be written (full disk)
+   70  unexpected error: please report it
+  130  interrupted by Ctrl-C
+  143  interrupted by SIGTERM or SIGHUP
+
+examples:
+  canprobe scenes
+  canprobe plan cylinder
   canprobe run cylinder
 """
 
@@ -103,9 +113,11 @@ def _forget_output() -> None:
 def _parser(arguments: Sequence[str]) -> Parser:
     """The parser with the named command only, or with all of them when none is named."""
     parser = Parser(
-        prog="canprobe", description="A robot cell on a CAN bus: run it, emulate it, look at it.", epilog=_EXAMPLE
+        prog="canprobe", description="Bring up, run, emulate and watch a robot cell on a CAN bus.", epilog=_EXAMPLE
     )
-    parser.add_argument("--version", action="version", version=f"canprobe {canprobe.__version__}")
+    parser.add_argument(
+        "--version", action="version", version=f"canprobe {canprobe.__version__}", help="print the version"
+    )
     named = next((word for word in arguments if not word.startswith("-")), None)
     if named is not None and named not in COMMANDS:
         parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")

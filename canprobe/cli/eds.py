@@ -1,4 +1,4 @@
-"""`canprobe eds`: the packaged EDS files, for other tools and masters; and what is wrong with any file."""
+"""List the packaged EDS files, print the path of one, or check the EDS or DCF file of any vendor."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ examples:
   canprobe eds check drive.eds
 """
 _CHECK = """\
-Faults prevent serving: what the device would answer cannot be known from the file. Warnings tell what was put right
-or left out. Exit status: 0 without faults, 2 with faults.
+A fault means that the file does not say how the device answers: it cannot be served. A warning names what was corrected
+or ignored.
+
+exit status: 0 without faults, 2 with faults
 
 examples:
   canprobe eds check drive.eds
@@ -30,21 +32,34 @@ examples:
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
-    parser = commands.add_parser(
-        "eds", help="list the EDS files, show where they are, or check one", description=__doc__, epilog=_EXAMPLE
-    )
+    parser = commands.add_parser("eds", help="list, locate or check EDS files", description=__doc__, epilog=_EXAMPLE)
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
-    listing = actions.add_parser("list", help="list the packaged files", epilog="example:\n  canprobe eds list\n")
+    listing = actions.add_parser(
+        "list",
+        help="list the packaged files",
+        description="List the packaged EDS files.",
+        epilog="examples:\n  canprobe eds list\n  canprobe eds list --json\n",
+    )
     add_json(listing)
     listing.set_defaults(run=run, action="list")
     path = actions.add_parser(
-        "path", help="print where one of them is", epilog="example:\n  canprobe eds path puma260_joint\n"
+        "path",
+        help="print the path of a packaged file",
+        description="Print the path of a packaged EDS file.",
+        epilog="example:\n  canprobe eds path puma260_joint\n",
     )
     path.add_argument("name", metavar="NAME", help="name of a packaged file, with or without .eds")
     path.set_defaults(run=run, action="path")
-    check = actions.add_parser("check", help="list the faults of a file, with section and line", epilog=_CHECK)
-    check.add_argument("file", metavar="FILE", help="the path of an EDS or DCF file, or the name of a packaged one")
-    check.add_argument("--node-id", metavar="N", type=whole(1, 127), help="for $NODEID [that of the DCF, or 1]")
+    check = actions.add_parser(
+        "check",
+        help="list the faults of a file, with section and line",
+        description="List the faults and warnings of an EDS or DCF file, with section and line.",
+        epilog=_CHECK,
+    )
+    check.add_argument("file", metavar="FILE", help="path of an EDS or DCF file, or name of a packaged file")
+    check.add_argument(
+        "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
+    )
     add_json(check)
     check.set_defaults(run=run_check)
 

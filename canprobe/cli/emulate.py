@@ -1,7 +1,7 @@
-"""`canprobe emulate`: serve a scene's emulated nodes on a bus until Ctrl-C, for any master.
+"""Serve emulated nodes on a bus until Ctrl-C, for any CANopen master.
 
-Without a scene it serves a node from each EDS file: the values of the file, and the CiA 402 state machine with an
-ideal axis where the file describes a drive.
+With a SCENE the nodes are its arm and array, and a model of the arm and the contact moves them. With --eds each file is
+one node: it answers with the values of the file; where the file describes a CiA 402 drive, it moves an ideal axis.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ examples:
   canprobe emulate cylinder --channel vcan0 --store nodes/
   canprobe emulate --eds drive.eds --node-id 5 --channel vcan0
   canprobe emulate --eds drive.eds --node-id 5 --eds io.eds --node-id 20 --channel vcan0
-  canprobe emulate free --channel vcan0 --without-id 3,5     (canprobe scan --lss gives them their ids)
+  canprobe emulate free --channel vcan0 --without-id 3,5
   canprobe emulate --eds drive.eds --node-id 255 --serial 0x4711 --channel vcan0
   canprobe emulate --bus-yml config/bus.yml --channel vcan0
 """
@@ -42,7 +42,11 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_bus(parser)
     add_realtime(parser)
     parser.add_argument(
-        "--eds", metavar="FILE", action="append", default=[], help="an EDS or DCF file to serve; may be repeated"
+        "--eds",
+        metavar="FILE",
+        action="append",
+        default=[],
+        help="EDS or DCF file of a node; may be repeated, each with its --node-id",
     )
     parser.add_argument(
         "--node-id",
@@ -50,7 +54,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         action="append",
         default=[],
         type=node_id,
-        help="node id of the --eds of the same rank; 255: none, it waits for LSS",
+        help="node id for the --eds at the same position; 255: no id, the node waits for LSS",
     )
     parser.add_argument(
         "--serial",
@@ -58,22 +62,30 @@ def add_parser(commands: Commands[Parser]) -> None:
         action="append",
         default=[],
         type=number_of_32_bits,
-        help="serial number (1018h:04) of the --eds of the same rank",
+        help="serial number (1018h:04) for the --eds at the same position",
     )
     parser.add_argument(
-        "--without-id", metavar="IDS", type=node_ids, default=(), help="nodes that start without an id and wait for LSS"
+        "--without-id",
+        metavar="IDS",
+        type=node_ids,
+        default=(),
+        help="nodes that start without an id; `canprobe scan --lss` assigns it",
     )
-    parser.add_argument("--bus-yml", metavar="FILE", type=Path, help="serve the slaves of a ros2_canopen bus.yml")
-    parser.add_argument("--nodes", metavar="IDS", type=node_ids, help="such as 1-6,16 [those the scene marks emulated]")
-    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
+    parser.add_argument("--bus-yml", metavar="FILE", type=Path, help="serve the slaves of a bus.yml of ros2_canopen")
     parser.add_argument(
-        "--truth", metavar="FILE", type=Path, help="write the plant's true values there at the end (.npz)"
+        "--nodes", metavar="IDS", type=node_ids, help="nodes to serve, such as 1-6,16 [those with emulated = true]"
+    )
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of all random numbers [the scene's]"
+    )
+    parser.add_argument(
+        "--truth", metavar="FILE", type=Path, help="at the end write the true values of the model to this npz file"
     )
     parser.add_argument(
         "--store",
         metavar="DIR",
         type=Path,
-        help="keep there what a master stores by 1010h or LSS [forgotten at the end]",
+        help="folder that keeps what a master stores by 1010h or LSS [nothing is kept]",
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times

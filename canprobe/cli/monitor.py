@@ -1,4 +1,7 @@
-"""`canprobe monitor`: look at a running cell without sending anything: nodes, joints, force, taxels, load, jitter."""
+"""Watch a running cell: nodes, joints, force, taxels, bus load and jitter of SYNC. Nothing is sent.
+
+On a terminal the display is renewed ten times a second. Elsewhere one report is printed after a second.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +23,12 @@ examples:
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
-    parser = commands.add_parser("monitor", help="look at a running cell", description=__doc__, epilog=_EXAMPLE)
+    parser = commands.add_parser("monitor", help="watch a running cell", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
     add_bus(parser)
-    parser.add_argument("--duration", metavar="S", type=seconds, help="end after this time [at Ctrl-C; 1 with --json]")
+    parser.add_argument(
+        "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
+    )
     add_json(parser)
     parser.set_defaults(run=run)
 

@@ -38,7 +38,7 @@ def add_scene(parser: argparse.ArgumentParser, optional: bool = False) -> None:
         "scene",
         metavar="SCENE",
         nargs="?" if optional else None,
-        help="a packaged scene (see `canprobe scenes`) or the path of a TOML file",
+        help="a packaged scene (`canprobe scenes` lists them) or the path of a TOML file",
     )
 
 
@@ -48,16 +48,17 @@ def add_bus(parser: argparse.ArgumentParser) -> None:
         "--bus",
         metavar="B",
         type=word,
-        help="lockstep, socketcan, any python-can interface, or config: what CAN_INTERFACE or python-can's files name",
+        help="lockstep, socketcan or another python-can interface; config: the one that CAN_INTERFACE or python-can's"
+        " configuration files name [the scene's]",
     )
     parser.add_argument(
         "--channel",
         metavar="[NAME=]CH",
         action="append",
         type=channel,
-        help="the channel, or the channel that stands for the scene's channel NAME; may be repeated",
+        help="channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
     )
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate of the bus")
+    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate [the scene's]")
 
 
 def add_bridge(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +67,7 @@ def add_bridge(parser: argparse.ArgumentParser) -> None:
         "--bridge",
         metavar="NAME",
         action="append",
-        help="feed a tool: mcap, foxglove, ros2, view; may be repeated",
+        help="send the data to another tool: mcap, foxglove, ros2 or view; may be repeated",
     )
 
 
@@ -77,7 +78,7 @@ def add_force(parser: argparse.ArgumentParser) -> None:
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     """--json: one document on stdout."""
-    parser.add_argument("--json", action="store_true", help="print one JSON document")
+    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
 
 
 def word(text: str) -> str:

@@ -1,4 +1,7 @@
-"""`canprobe plan`: what a scene needs on the bus, whether it fits, and what it leaves out."""
+"""Show what a scene would send on the bus, whether it fits, and what it leaves out. No bus is opened.
+
+A scene that does not fit is refused with status 2, with every reason and with changes that make it fit.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +18,12 @@ if TYPE_CHECKING:
     from canprobe.planning import Plan
 
 _EXAMPLE = """\
-The files: dcf, one device configuration file a node; dbc and kcd, every frame with its signals (extra `can`); bus.yml,
-for ros2_canopen and dcfgen, with the EDS files it names (extra `can`).
+files of --export:
+  dcf      a device configuration file for each node
+  dbc, kcd every frame with its signals (extra `can`)
+  bus.yml  for ros2_canopen and dcfgen, with the EDS files that it names (extra `can`)
+
+--measured ends with status 3 if the log differs from the plan.
 
 examples:
   canprobe plan cylinder
@@ -31,22 +38,29 @@ EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "plan", help="show what a scene needs and leaves out", description=__doc__, epilog=_EXAMPLE
+        "plan", help="show what a scene sends, needs and leaves out", description=__doc__, epilog=_EXAMPLE
     )
     add_scene(parser)
     parser.add_argument(
-        "--measured", metavar="LOG", type=Path, help="set a candump log or a run's folder beside the plan instead"
+        "--measured", metavar="LOG", type=Path, help="compare a candump log or the folder of a run with the plan"
     )
     parser.add_argument(
-        "--auto", action="store_true", help="let the plan choose every key that stands at its default, so that it fits"
+        "--auto",
+        action="store_true",
+        help="let the plan choose bus.fd, bus.cob_ids, arm.grouped_rpdo and sensor.channel, except those that the"
+        " scene sets",
     )
     parser.add_argument(
-        "--export", choices=EXPORTS, action="append", default=[], help="write the plan for other tools; may be repeated"
+        "--export",
+        choices=EXPORTS,
+        action="append",
+        default=[],
+        help="write the plan as a file for other tools; may be repeated",
     )
     parser.add_argument(
-        "--figure", metavar="FILE.png", type=Path, help="draw cycles and response times (extra `study`)"
+        "--figure", metavar="FILE.png", type=Path, help="draw the cycles and the response times (extra `study`)"
     )
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder for what is exported [.]")
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
     add_json(parser)
     parser.set_defaults(run=run)
 

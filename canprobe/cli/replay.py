@@ -1,4 +1,7 @@
-"""`canprobe replay`: estimate the shape again from a recorded bus."""
+"""Estimate the shape again from a recorded bus.
+
+The log of a run gives the estimates of that run again. In another candump of the same nodes every contact is used.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,6 @@ from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
 from canprobe.errors import ResultsError
 
 _EXAMPLE = """\
-The log of a run gives its online result once more. In any other candump of the same nodes every contact is used.
-
 examples:
   canprobe replay runs/cylinder-20260101-120000-000
   canprobe replay runs/cylinder-20260101-120000-000 --method ml --method chen1996 --out estimates.npz
@@ -25,14 +26,17 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser = commands.add_parser(
         "replay", help="estimate the shape again from a recorded bus", description=__doc__, epilog=_EXAMPLE
     )
-    parser.add_argument("log", metavar="LOG", type=Path, help="folder of a run, or a candump file")
+    parser.add_argument("log", metavar="LOG", type=Path, help="folder of a run, or a candump log")
     parser.add_argument(
-        "--scene", metavar="SCENE", help="a packaged scene or the path of a TOML file [the scene.toml of the run]"
+        "--scene", metavar="SCENE", help="packaged scene or path of a TOML file [the scene.toml of the run]"
     )
     parser.add_argument(
-        "--method", metavar="M", action="append", help="estimator; may be repeated [those of the scene]"
+        "--method",
+        metavar="M",
+        action="append",
+        help="recursive, ml, chord or chen1996; may be repeated [those of the scene]",
     )
-    parser.add_argument("--out", metavar="FILE", type=Path, help="write every estimate into this npz file")
+    parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
     add_bridge(parser)
     add_json(parser)
     parser.set_defaults(run=run)

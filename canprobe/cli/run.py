@@ -1,4 +1,8 @@
-"""`canprobe run`: carry out a scene and write what was measured."""
+"""Run a scene: bring the cell up, carry out the task, stop, and write the results.
+
+On the lockstep bus the emulated nodes run in this process, in virtual time. On any other bus they run in a second
+process, in real time.
+"""
 
 from __future__ import annotations
 
@@ -22,31 +26,37 @@ from canprobe.cli.target import add_patient, add_realtime, target_of, with_patie
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
-Emulated nodes run in this process on the lockstep bus, and in a process of their own on any other.
-
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
+  canprobe run cylinder --tool runs/calibrate/tool.toml
   canprobe run cylinder --bus socketcan --channel vcan0 --patient
 """
 
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
-    parser = commands.add_parser("run", help="carry out a scene", description=__doc__, epilog=_EXAMPLE)
+    parser = commands.add_parser("run", help="run a scene and write the results", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
     add_bus(parser)
     add_realtime(parser)
     add_patient(parser)
     add_bridge(parser)
-    parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder for the results [runs/<scene>-<time>]")
+    parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder of the results [runs/<scene>-<time>]")
     add_force(parser)
-    parser.add_argument("--tool", metavar="FILE", type=Path, help="tool.toml of a calibration, for the probe's centre")
-    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of everything random [the scene's]")
     parser.add_argument(
-        "--duration", metavar="S", type=seconds, help="length of the scene's phase, seconds [the scene's]"
+        "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
-    parser.add_argument("--blf", action="store_true", help="write the bus as bus.blf too, when the run is over")
+    parser.add_argument(
+        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of all random numbers [the scene's]"
+    )
+    parser.add_argument(
+        "--duration",
+        metavar="S",
+        type=seconds,
+        help="length of the scan, press, listen or free phase in seconds [the scene's]",
+    )
+    parser.add_argument("--blf", action="store_true", help="also write the bus log as bus.blf at the end")
     add_json(parser)
     parser.set_defaults(run=run)
 

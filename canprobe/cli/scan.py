@@ -1,8 +1,8 @@
-"""`canprobe scan`: list the nodes on a bus with their identity; with --lss also give ids to nodes that have none.
+"""List the nodes on a bus with their identities; with --lss also assign ids to nodes that have none.
 
-LSS (CiA 305) finds nodes without an id by their vendor, product, revision and serial number (1018h). --assign names a
-device by its serial number and the id that it gets; with a SCENE its nodes get theirs, as the identities in their EDS
-files and the scene's serial_numbers tell. A device keeps its id (unless --no-store) and boots with it at once.
+LSS (CiA 305) finds nodes without an id by vendor, product, revision and serial number (1018h). --assign gives an id to
+one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers say which device is which. A device
+boots with its new id at once and keeps it, unless --no-store is given.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 _EXAMPLE = """\
 examples:
   canprobe scan --bus socketcan --channel can0
-  canprobe scan --lss --channel can0                         who has no id yet?
-  canprobe scan --lss --assign 3 --channel can0              the only one that has none gets 3
+  canprobe scan --lss --channel can0                   # also the nodes without an id
+  canprobe scan --lss --assign 3 --channel can0        # the only node without an id gets 3
   canprobe scan --lss --assign 0x4711=3 --assign 0x4712=4 --channel can0
-  canprobe scan mine.toml --lss --channel can0               as the scene says
+  canprobe scan mine.toml --lss --channel can0         # the nodes of the scene get their ids
 """
 _COLUMNS = ("node_id", "state", "vendor_id", "product_code", "revision_number", "serial_number", "device_name")
 _NUMBERS = 4
@@ -39,20 +39,22 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--bus",
         metavar="B",
         type=word,
-        help="any python-can interface [as CAN_INTERFACE or python-can's files say, or socketcan]",
+        help="python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]",
     )
-    parser.add_argument("--channel", metavar="CH", type=channel, default=(None, None), help="the channel [can0]")
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="[1000000]")
-    parser.add_argument("--lss", action="store_true", help="look for nodes without an id too")
+    parser.add_argument(
+        "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
+    )
+    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_argument("--lss", action="store_true", help="also find nodes without an id")
     parser.add_argument(
         "--assign",
         metavar="[SERIAL=]ID",
         action="append",
         type=assignment,
         default=[],
-        help="give the device of this serial number (or VENDOR:PRODUCT:REVISION:SERIAL) this id; may be repeated",
+        help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
     )
-    parser.add_argument("--no-store", action="store_true", help="a device has its new id only until its power goes")
+    parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
     add_json(parser)
     parser.set_defaults(run=run)
 

@@ -1,4 +1,4 @@
-"""`canprobe scenes`: the packaged scenes, and where their files are."""
+"""List the packaged scenes and print the folder of their files."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Commands, Parser, add_json
 
 _EXAMPLE = """\
-example:
+examples:
   canprobe scenes
+  canprobe scenes --json
 """
 
 

@@ -1,4 +1,8 @@
-"""`canprobe study`: measure estimators and supervision against truth, and draw it."""
+"""Run a study: accuracy of the estimators, limits of the force loop, faults, timing. It writes tables and pictures.
+
+Finished cells of a study are kept in DIR/cells.jsonl. The same command computes what is missing, after Ctrl-C or a
+crash. Cells whose code has changed since are computed again.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +14,6 @@ from canprobe.cli.output import print_json, print_table, progress_bar, say
 from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
 
 _EXAMPLE = """\
-Cells that are finished are kept in DIR/cells.jsonl: the same command again, after Ctrl-C or anything worse, computes
-what is left. Code that has changed since is noticed, and its cells are computed again.
-
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
@@ -25,21 +26,21 @@ examples:
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser(
-        "study", help="measure estimators and supervision against truth", description=__doc__, epilog=_EXAMPLE
+        "study", help="measure accuracy, limits, faults and timing", description=__doc__, epilog=_EXAMPLE
     )
-    parser.add_argument("name", metavar="NAME", nargs="?", help="which study; see --list")
-    parser.add_argument("--list", action="store_true", help="list the studies and leave")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="folder for the files; runs/study-NAME by default")
-    parser.add_argument("--quick", action="store_true", help="fewer repeats: a first look")
+    parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
+    parser.add_argument("--list", action="store_true", help="list the studies, and end")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")
+    parser.add_argument("--quick", action="store_true", help="fewer cases and repeats")
     parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="faults: only this run, told step by step"
+        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="faults: only the run with this number, step by step"
     )
     parser.add_argument(
-        "--vcan", action="store_true", help="faults: on the real vcan0, with processes killed and the link taken down"
+        "--vcan", action="store_true", help="faults: on a real vcan0; processes are killed and the link is taken down"
     )
-    parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="processes [one for each core]")
-    parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler instead")
-    parser.add_argument("--fresh", action="store_true", help="compute everything, whatever is kept in DIR")
+    parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
+    parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
+    parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
     add_json(parser)
     parser.set_defaults(run=run, complain=parser.error)
 

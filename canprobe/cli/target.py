@@ -55,7 +55,8 @@ def add_realtime(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--realtime",
         action="store_true",
-        help="SCHED_FIFO, a processor of its own and locked memory, as far as permitted [the scene's cycle.realtime]",
+        help="request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
+        " reported [the scene's cycle.realtime]",
     )
 
 

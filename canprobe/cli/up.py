@@ -1,4 +1,7 @@
-"""`canprobe up`: bring the cell up, hold and supervise it until Ctrl-C, then stop it safely."""
+"""Bring the cell up, hold and supervise it until Ctrl-C, then stop it safely.
+
+The drives hold their positions. A SocketCAN interface is checked before anything is sent.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +21,7 @@ if TYPE_CHECKING:
 _EXAMPLE = """\
 examples:
   canprobe up free --bus socketcan --channel can0
-  canprobe up free --bus socketcan --channel can0 --check-joints     (the first motion: each joint by 1 deg, slowly)
+  canprobe up free --bus socketcan --channel can0 --check-joints
 """
 
 
@@ -33,9 +36,9 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--check-joints",
         action="store_true",
-        help="turn each joint by 1 deg and back, one at a time, compare the encoders and end; asks before each",
+        help="turn one joint after the other by 1 deg and back, compare the encoders, and end; asks before each motion",
     )
-    parser.add_argument("--yes", action="store_true", help="with --check-joints: ask nobody")
+    parser.add_argument("--yes", action="store_true", help="with --check-joints: do not ask")
     parser.set_defaults(run=run)
 
 

@@ -1,4 +1,9 @@
-"""`canprobe vcan`: run a command where a real vcan0 exists, in a guest machine if need be."""
+"""Run a command where a real vcan0 exists: on this machine if possible, else in a small virtual machine.
+
+The command has the working folder and the environment of the caller, separate stdout and stderr, and no stdin. Signals
+are passed on; the third one kills. The virtual machine is a user-mode Linux with the same files and without a network;
+the command runs there as root. CANPROBE_VCAN names the way that was taken: here, namespace, link or guest.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +13,8 @@ from canprobe.cli.parser import Commands, Parser, seconds
 from canprobe.errors import UsageError
 
 _EXAMPLE = """\
-The command has the same working folder and environment, separate stdout and stderr, no stdin; signals are passed on
-(the third one kills). Where this kernel has no vcan it runs as root of a user-mode Linux guest on the same files,
-without a network; CANPROBE_VCAN tells the command where it is: here, namespace, link or guest.
-
-exit status: the command's own, 128 + n after signal n; 124 time-out, 125 no vcan can be had, 123 the guest died
+exit status: that of the command, 128 + n after signal n; 124 time-out, 125 no vcan0 possible here, 123 the virtual
+machine ended early
 
 examples:
   canprobe vcan -- canprobe run cylinder --bus socketcan --channel vcan0 --patient
@@ -29,10 +31,16 @@ def add_parser(commands: Commands[Parser]) -> None:
         description=__doc__,
         epilog=_EXAMPLE,
     )
-    parser.add_argument("--install", action="store_true", help="install the guest's Debian package if it is missing")
+    parser.add_argument(
+        "--install", action="store_true", help="install the Debian package user-mode-linux if it is needed (as root)"
+    )
     parser.add_argument("--timeout", metavar="S", type=seconds, help="stop the command after S seconds")
-    parser.add_argument("--realtime", action="store_true", help="pin the guest to one processor under SCHED_FIFO")
-    parser.add_argument("command", metavar="COMMAND", nargs=argparse.REMAINDER, help="program and arguments")
+    parser.add_argument(
+        "--realtime", action="store_true", help="pin the virtual machine to one processor under SCHED_FIFO"
+    )
+    parser.add_argument(
+        "command", metavar="COMMAND", nargs=argparse.REMAINDER, help="command to run, with its arguments"
+    )
     parser.set_defaults(run=run)
 
 

@@ -1,4 +1,8 @@
-"""`canprobe view`: see a scene or a recorded run in three dimensions, in a browser."""
+"""Show a scene or a recorded run in three dimensions, in a browser (extra `view`).
+
+A scene is run and shown live, at the pace of real time, and then as a replay. The page is served until Ctrl-C. If a
+folder has the name of a packaged scene, write ./NAME for the folder.
+"""
 
 from __future__ import annotations
 
@@ -19,9 +23,6 @@ if TYPE_CHECKING:
     from canprobe.api import AnyObserver
 
 _EXAMPLE = """\
-A scene is run and shown live, in the pace of real time, and afterwards as a replay. The page stays until Ctrl-C.
-Where a folder is called like a packaged scene, ./NAME is the folder.
-
 examples:
   canprobe view cylinder
   canprobe view runs/cylinder-20260101-120000-000 --port 9000 --no-open
@@ -31,17 +32,26 @@ examples:
 
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
-    parser = commands.add_parser("view", help="see a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE)
-    parser.add_argument("what", metavar="SCENE|RUN_DIR", help="a scene to run, or the folder of a recorded run")
+    parser = commands.add_parser(
+        "view", help="show a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE
+    )
+    parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
     add_bus(parser)
-    parser.add_argument("--host", metavar="H", default="127.0.0.1", help="0.0.0.0 for other machines too [127.0.0.1]")
-    parser.add_argument("--port", metavar="N", type=whole(0, 65_535), default=8080, help="0 takes a free one [8080]")
-    parser.add_argument("--no-open", action="store_true", help="only say where it is to be seen")
-    parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay into one file, and leave")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder for the results")
+    parser.add_argument(
+        "--host",
+        metavar="H",
+        default="127.0.0.1",
+        help="address of the server; 0.0.0.0 serves other machines [127.0.0.1]",
+    )
+    parser.add_argument(
+        "--port", metavar="N", type=whole(0, 65_535), default=8080, help="port of the server; 0: any free port [8080]"
+    )
+    parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
+    parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder of the results")
     add_force(parser)
-    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: of everything random")
-    parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase, seconds")
+    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: seed of all random numbers")
+    parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase in seconds")
     parser.set_defaults(run=run)
 
 

@@ -9,6 +9,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from command_lines import command_lines, parse
 
 import canprobe
 from canprobe import api
@@ -55,13 +56,15 @@ def calls(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "argv", [["--help"], *([command, "--help"] for command in COMMANDS), ["eds", "path", "--help"]]
+    "command", [(), *((command,) for command in COMMANDS), ("eds", "list"), ("eds", "path"), ("eds", "check")]
 )
-def test_help_has_an_example(argv, capsys):
-    assert main(argv) == 0
-    out = capsys.readouterr().out
-    assert "example" in out
-    assert "canprobe " in out
+def test_help_has_examples_of_its_command_that_parse(command, capsys):
+    assert main([*command, "--help"]) == 0
+    _, _, examples = capsys.readouterr().out.partition("example")
+    lines = command_lines(examples)
+    assert any(tuple(line[: len(command)]) == command for line in lines)
+    for line in lines:
+        parse(line)
 
 
 def test_help_lists_every_command(capsys):

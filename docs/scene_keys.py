@@ -1,0 +1,127 @@
+"""The page of all scene keys, from the dataclasses of a scene: `python docs/scene_keys.py > docs/scene-keys.md`."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import itertools
+import typing
+from collections.abc import Iterator
+from typing import Any
+
+from canprobe.scene import Scene
+from canprobe.scene_checks import Only, conditions_of, expected
+from canprobe.scene_rules import SECTIONS_OF_TASK
+from canprobe.scene_writer import toml_value
+
+UNITS = {  # the longest suffix that fits
+    "bitrate": "bit/s",
+    "n_m3": "N/m³",
+    "mm_s": "mm/s",
+    "s_m": "s/m",
+    "percent": "%",
+    "permille": "‰",
+    "hz": "Hz",
+    "kpa": "kPa",
+    "deg": "°",
+    "kg": "kg",
+    "mm": "mm",
+    "ms": "ms",
+    "us": "µs",
+    "n": "N",
+    "s": "s",
+}
+NEEDS = {"must": "required", "default": "default", "may": "optional", "never": "–"}
+INTRODUCTION = """\
+# Scene keys
+
+A scene is a TOML file. `canprobe scenes` lists the packaged ones and prints the folder of their files: copy one and
+change it. `canprobe plan FILE` checks a scene and reports every mistake at once, with the key and, where a name is
+misspelt, the name that was probably meant.
+
+A key that a scene leaves out has its default. The suffix of a key is its unit. Numbers may be written with or without
+a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.
+
+This page is generated from the definition of a scene: `python docs/scene_keys.py > docs/scene-keys.md`.
+
+## Sections and tasks
+
+`[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]` and `[bridge]` may stand
+in every scene. The other sections depend on `task.kind`. *required*: the scene must have the section. *default*: a
+scene without the section has all its defaults. *optional*: a scene without the section does without it. *–*: the
+section is an error.
+"""
+
+
+def page() -> str:
+    """The whole page."""
+    sections = [(name, _class_of(hint)) for name, hint in typing.get_type_hints(Scene).items()]
+    return "\n".join([INTRODUCTION, *_needs(), "", *(line for name, cls in sections for line in _section(name, cls))])
+
+
+def meanings(cls: type[Any]) -> dict[str, str]:
+    """The text below each field of a section, by key."""
+    body = typing.cast(ast.ClassDef, ast.parse(inspect.getsource(cls)).body[0]).body
+    return {
+        field.target.id: inspect.cleandoc(text.value.value).replace("\n", " ")
+        for field, text in itertools.pairwise(body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant) and isinstance(text.value.value, str)
+    }
+
+
+def _class_of(hint: Any) -> type[Any]:
+    cls: type[Any] = next(iter(typing.get_args(hint)), hint)
+    return cls
+
+
+def _needs() -> Iterator[str]:
+    tasks = list(SECTIONS_OF_TASK)
+    yield f"| section | {' | '.join(f'`{task}`' for task in tasks)} |"
+    yield "| --- |" + " --- |" * len(tasks)
+    for section in SECTIONS_OF_TASK[tasks[0]]:
+        needs = (NEEDS[SECTIONS_OF_TASK[task][section][0]] for task in tasks)
+        yield f"| [`[{section}]`](#{section}) | {' | '.join(needs)} |"
+
+
+def _section(name: str, cls: type[Any]) -> Iterator[str]:
+    head, _, rest = (inspect.getdoc(cls) or "").partition("\n\n")
+    about = head.partition(": ")[2].replace("\n", " ")
+    yield f"## `[{name}]` {{#{name}}}\n"
+    yield about[0].upper() + about[1:]
+    if rest:
+        yield f"\n{rest}"
+    yield "\n| key | value | unit | default | meaning |"
+    yield "| --- | --- | --- | --- | --- |"
+    annotations, texts = typing.get_type_hints(cls, include_extras=True), meanings(cls)
+    for field in dataclasses.fields(cls):
+        annotation = annotations[field.name]
+        cells = (
+            f"`{field.name}`",
+            expected(annotation),
+            _unit(field.name),
+            _default(field),
+            " ".join([texts[field.name], *map(_condition, conditions_of(annotation, Only))]),
+        )
+        yield f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+    yield ""
+
+
+def _unit(key: str) -> str:
+    return next((unit for suffix, unit in UNITS.items() if f"_{key}".endswith(f"_{suffix}")), "")
+
+
+def _default(field: dataclasses.Field[Any]) -> str:
+    if field.default is dataclasses.MISSING:
+        return "required"
+    return "–" if field.default is None else f"`{toml_value(field.default)}`"
+
+
+def _condition(only: Only) -> str:
+    values = " or ".join(f"`{toml_value(value)}`" for value in only.values)
+    return f"*{'Required' if only.required else 'Only'} with `{only.key}` = {values}.*"
+
+
+if __name__ == "__main__":
+    print(page(), end="")
