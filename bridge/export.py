@@ -1,11 +1,32 @@
-"""A plan as files of other tools, by format."""
+"""A plan as files of other tools, by format: device configuration files, ros2_canopen's `bus.yml`, CAN databases."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import operator
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from canprobe.planning import Plan
+from canprobe.bridge.database import need
+from canprobe.bus.disk import whole_file, write_text
+from canprobe.cell.bringup import NodeSetup, Write
+from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, make_setups
+from canprobe.eds.packaged import eds_file
+from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
+from canprobe.errors import UsageError
+from canprobe.planning.model import (
+    HEARTBEAT_CONSUMED_MS,
+    HEARTBEAT_PRODUCED_MS,
+    MASTER_NODE_ID,
+    Direction,
+    Plan,
+    PlannedNode,
+    PlannedPdo,
+)
+from canprobe.planning.traffic import CLASSIC_BYTES
+
+# A plan as files of other tools, by format.
 
 
 def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
@@ -30,13 +51,338 @@ def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
 
 def _export(plan: Plan, folder: Path, form: str) -> list[Path]:
     if form == "dcf":
-        from canprobe.bridge.dcf import write_dcfs
-
         return write_dcfs(plan, folder)
     if form == "bus.yml":
-        from canprobe.bridge.bus_yml import write_bus_yml
-
         return write_bus_yml(plan, folder)
     from canprobe.bridge.database import write_database
 
     return [write_database(plan, folder, form)]
+
+
+# Device configuration files: the EDS of each node with the values that bring-up writes into it.
+#
+# A configuration tool, or another master's boot slave, brings the nodes to the same state from them. Source: CiA 306-1,
+# "Device configuration file": `ParameterValue`, `[DeviceComissioning]` (spelt so there), `[<index>Value]`.
+
+Values = Mapping[tuple[int, int], int]
+"""By (index, sub-index)."""
+
+
+def write_dcfs(plan: Plan, folder: Path) -> list[Path]:
+    """Write ``node001.dcf`` and so on, one for each node of the plan.
+
+    Args:
+        plan: whose nodes.
+        folder: exists.
+
+    Returns:
+        The files.
+    """
+    paths = []
+    for setup in make_setups(plan):
+        path = folder / f"node{setup.node_id:03}.dcf"
+        write_text(path, _dcf_of(plan, setup, path.name), newline="")
+        paths.append(path)
+    return paths
+
+
+def final_values(setup: NodeSetup) -> dict[tuple[int, int], int]:
+    """What each entry holds after bring-up; commands, which hold nothing, are left out."""
+    return {(write.index, write.subindex): write.value for write in setup.writes if write.read_back}
+
+
+def _dcf_of(plan: Plan, setup: NodeSetup, name: str) -> str:
+    source = eds_file(setup.eds)
+    commissioning = {
+        "NodeID": str(setup.node_id),
+        "NodeName": setup.name,
+        "Baudrate": str(plan.scene.bus.bitrate // 1000),
+        "NetNumber": "1",
+        "NetworkName": plan.scene.bus.channel,
+        "CANopenManager": "0",
+    }
+    keys = {"fileinfo": {"FileName": name, "LastEDS": source.name}, "devicecomissioning": commissioning}
+    return dcf_text(decode(source.read_bytes(), Faults()), final_values(setup), keys)
+
+
+def dcf_text(eds: str, values: Values, keys: Mapping[str, Mapping[str, str]]) -> str:
+    """An EDS text with values and keys put in; every other line stays as it is.
+
+    Args:
+        eds: text of the file.
+        values: the `ParameterValue` of each entry.
+        keys: other keys by section in lower case; a section that is not there is added.
+    """
+    lines = LINE_END.split(eds.rstrip())
+    sections = split_sections(eds, Faults())
+    wanted: dict[str, dict[str, str]] = {name: dict(items) for name, items in keys.items()}
+    for (index, subindex), value in values.items():
+        section, key = _place(sections, index, subindex)
+        wanted.setdefault(section, {})[key] = _number(value)
+    added = [line for name, items in wanted.items() if name not in sections for line in _new_section(name, items)]
+    present = [name for name in wanted if name in sections]
+    for name in sorted(present, key=lambda name: sections[name].line, reverse=True):  # from the end: lines keep theirs
+        _edit(lines, sections[name], wanted[name])
+    return "\n".join([*lines, *added]) + "\n"
+
+
+def _place(sections: Sections, index: int, subindex: int) -> tuple[str, str]:
+    """Section and key of a value; that of a sub-index which the file lists nowhere stands in [indexValue]."""
+    member = f"{index:x}sub{subindex:x}"
+    if member in sections:
+        return member, "ParameterValue"
+    if subindex == 0 and not sections.get(f"{index:x}", Section("", 0)).value("SubNumber"):
+        return f"{index:x}", "ParameterValue"
+    return f"{index:x}value", str(subindex)
+
+
+def _edit(lines: list[str], section: Section, items: Mapping[str, str]) -> None:
+    last = max((item.line for item in section.items.values()), default=section.line)
+    new = []
+    for key, value in items.items():
+        if (old := section.items.get(key.lower())) is not None:
+            lines[old.line - 1] = f"{old.key}={value}"
+        else:
+            new.append(f"{key}={value}")
+    lines[last:last] = new
+
+
+def _new_section(name: str, items: Mapping[str, str]) -> list[str]:
+    if name == "devicecomissioning":
+        return ["", "[DeviceComissioning]", *(f"{key}={value}" for key, value in items.items())]
+    head = f"{name.removesuffix('value').upper()}{'Value' if name.endswith('value') else ''}"
+    count = [f"NrOfEntries={len(items)}"] if name.endswith("value") else []
+    return ["", f"[{head}]", *count, *(f"{key}={value}" for key, value in items.items())]
+
+
+def _number(value: int) -> str:
+    return f"0x{value:X}" if value > 9 else str(value)
+
+
+# ros2_canopen's `bus.yml`: a plan written as one, and the nodes of one read.
+#
+# The file's keys are those of Lely's dcfgen, which makes the master's configuration of it; ros2_canopen adds `driver`
+# and `package`. dcfgen maps neither dummies nor PDOs of CAN FD: such a one is written by `sdo` entries, in the order of
+# bring-up, and the master's side of it has to be configured by hand. Source: ros2_canopen manual, "Bus configuration
+# file"; lely-core's dcfgen.
+
+_PURPOSE = "a bus.yml"
+_DRIVERS = {
+    "drive": ("ros2_canopen::Cia402Driver", "canopen_402_driver"),
+    "tactile": ("ros2_canopen::ProxyDriver", "canopen_proxy_driver"),
+}
+_NOT_SLAVES = ("options", "master", "defaults")
+_PDO_OBJECTS = range(0x1400, 0x1C00)
+_OWN_KEYS = (0x1016, 0x1017)  # dcfgen writes them from heartbeat_producer and heartbeat_consumer
+
+
+@dataclass(frozen=True, slots=True)
+class BusNode:
+    """A slave of a bus.yml.
+
+    Attributes:
+        name: its key.
+        node_id: 1–127.
+        eds: its EDS or DCF file, found beside the bus.yml where the path is relative.
+    """
+
+    name: str
+    node_id: int
+    eds: Path
+
+
+@dataclass(frozen=True, slots=True)
+class BusFile:
+    """What a bus.yml says of a bus.
+
+    Attributes:
+        nodes: ascending node ids.
+        master_id: node id of the master, None where it is not given.
+        sync_period_us: 0 or None without SYNC.
+    """
+
+    nodes: tuple[BusNode, ...]
+    master_id: int | None
+    sync_period_us: int | None
+
+
+def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
+    """Write ``bus.yml`` and the EDS files that it names.
+
+    Args:
+        plan: whose nodes.
+        folder: exists.
+
+    Returns:
+        The files.
+
+    Raises:
+        UsageError: PyYAML is not installed.
+    """
+    yaml = need("yaml", "can", _PURPOSE)
+    files = {node.eds: folder / eds_file(node.eds).name for node in plan.nodes}
+    for eds, path in files.items():
+        if not path.exists() or not path.samefile(eds_file(eds)):
+            with whole_file(path) as part:
+                part.write_bytes(eds_file(eds).read_bytes())
+    setups = {setup.node_id: setup for setup in make_setups(plan)}
+    document: dict[str, Any] = {"options": {"dcf_path": "."}, "master": _master(plan)}
+    for node in plan.nodes:
+        document[node.role.replace(" ", "_")] = _slave(plan, node, setups[node.node_id], files[node.eds].name)
+    path = folder / "bus.yml"
+    write_text(path, _dump(yaml, document))
+    return [path, *files.values()]
+
+
+class _Hex(int):
+    """An integer that people read in hexadecimal."""
+
+
+def _dump(yaml: Any, document: Mapping[str, Any]) -> str:
+    class Dumper(yaml.SafeDumper):  # type: ignore[misc]
+        """As PyYAML's, with hexadecimal numbers, and without anchors."""
+
+        def ignore_aliases(self, data: object) -> bool:
+            return True
+
+    Dumper.add_representer(_Hex, lambda dumper, value: dumper.represent_scalar("tag:yaml.org,2002:int", f"0x{value:X}"))
+    text: str = yaml.dump(document, Dumper=Dumper, sort_keys=False, default_flow_style=None, width=120)
+    return text
+
+
+def _master(plan: Plan) -> dict[str, Any]:
+    return {
+        "node_id": MASTER_NODE_ID,
+        "driver": "ros2_canopen::MasterDriver",
+        "package": "canopen_master_driver",
+        "baudrate": plan.scene.bus.bitrate // 1000,
+        "sync_period": plan.sync.period_us,
+        "sync_overflow": plan.sync.overflow,
+        "heartbeat_producer": HEARTBEAT_PRODUCED_MS,
+        "heartbeat_multiplier": HEARTBEAT_CONSUMED_MS / HEARTBEAT_PRODUCED_MS,
+    }
+
+
+def _slave(plan: Plan, node: PlannedNode, setup: NodeSetup, eds: str) -> dict[str, Any]:
+    driver, package = _DRIVERS[node.kind]
+    identity = node.identity
+    return {
+        "node_id": node.node_id,
+        "dcf": eds,
+        "driver": driver,
+        "package": package,
+        **({"revision_number": identity.revision_number} if identity.revision_number is not None else {}),
+        "heartbeat_producer": HEARTBEAT_PRODUCED_MS,
+        "heartbeat_consumer": True,
+        "rpdo": _pdos(plan, node, setup, "rpdo"),
+        "tpdo": _pdos(plan, node, setup, "tpdo"),
+        "sdo": [
+            {"index": _Hex(write.index), "sub_index": write.subindex, "value": int(write.value)}
+            for write in setup.writes
+            if _by_sdo(plan, node, write)
+        ],
+    }
+
+
+def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
+    """Whether dcfgen has no key of its own for this write."""
+    if write.index not in _PDO_OBJECTS:
+        return write.index not in _OWN_KEYS
+    direction: Direction = "rpdo" if write.index < 0x1800 else "tpdo"
+    pdos = {pdo.number: pdo for pdo in plan.pdos_of(node.node_id, direction)}
+    pdo = pdos.get((write.index & 0x1FF) + 1)
+    return pdo is not None and (_by_hand(pdo) or (direction == "rpdo" and write.index < 0x1600 and write.subindex == 5))
+
+
+def _by_hand(pdo: PlannedPdo) -> bool:
+    """Whether dcfgen cannot map it: dummies, and what is longer than a classical frame."""
+    return pdo.layout.length > CLASSIC_BYTES or any(entry.is_dummy for entry in pdo.entries)
+
+
+def _pdos(plan: Plan, node: PlannedNode, setup: NodeSetup, direction: Direction) -> dict[int, Any]:
+    off = {n: {"enabled": False, "cob_id": _Hex(INVALID)} for way, n in node.switched_off if way == direction}
+    written = {write.index for write in setup.writes}
+    on = {pdo.number: _pdo(pdo, written) for pdo in plan.pdos_of(node.node_id, direction) if not _by_hand(pdo)}
+    return dict(sorted((off | on).items()))
+
+
+def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
+    found: dict[str, Any] = {"enabled": True, "cob_id": _Hex(pdo.cob_id), "transmission": pdo.transmission_type}
+    if pdo.direction == "tpdo" and 1 < pdo.transmission_type <= 240:
+        found["sync_start"] = SYNC_START_VALUE
+    if MAPPING[pdo.direction] + pdo.number - 1 in written:  # a fixed mapping cannot be written
+        found["mapping"] = [{"index": _Hex(entry.index), "sub_index": entry.subindex} for entry in pdo.entries]
+    return found
+
+
+def read_bus_yml(path: Path | str) -> BusFile:
+    """Read the nodes and the SYNC of a bus.yml.
+
+    Args:
+        path: of the file; `dcf` paths are looked up beside it, and beside it by their last part where they begin with
+            a variable such as ``@BUS_CONFIG_PATH@``.
+
+    Raises:
+        UsageError: PyYAML is missing, or the file is no bus.yml; with the node and the key.
+    """
+    yaml = need("yaml", "can", _PURPOSE)
+    path = Path(path)
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(document, Mapping):
+        raise UsageError(f"{path}: expected the nodes of a bus by name, got {type(document).__name__}")
+    options, master, defaults = (_mapping(path, document, key) for key in _NOT_SLAVES)
+    names = [str(name) for name in document if name not in _NOT_SLAVES]
+    nodes = [_read_node(path, name, {**defaults, **_mapping(path, document, name)}, options) for name in names]
+    if not nodes:
+        raise UsageError(f"{path}: no node besides {', '.join(_NOT_SLAVES)}")
+    _check_distinct(path, nodes)
+    return BusFile(
+        nodes=tuple(sorted(nodes, key=lambda node: node.node_id)),
+        master_id=_integer(path, "master", master, "node_id"),
+        sync_period_us=_integer(path, "master", master, "sync_period"),
+    )
+
+
+def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str, Any]:
+    found = document.get(name)
+    if found is None:
+        return {}
+    if not isinstance(found, Mapping):
+        raise UsageError(f"{path}: {name}: expected keys and values, got {found!r}")
+    return found
+
+
+def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> BusNode:
+    node_id = _integer(path, name, keys, "node_id")
+    if node_id is None or not 1 <= node_id <= 127:
+        raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
+    dcf = keys.get("dcf")
+    if not isinstance(dcf, str) or not dcf:
+        raise UsageError(f"{path}: {name}: dcf: expected the name of an EDS or DCF file, got {dcf!r}")
+    folders = [path.parent, path.parent / str(keys.get("dcf_path", options.get("dcf_path", ".")))]
+    tried = [folder / part for folder in folders for part in (dcf, Path(dcf).name)]
+    eds = next((candidate for candidate in tried if candidate.is_file()), None)
+    if eds is None:
+        raise UsageError(f"{path}: {name}: dcf: no file {dcf} beside the bus.yml")
+    return BusNode(name, node_id, eds)
+
+
+def _integer(path: Path, name: str, keys: Mapping[str, Any], key: str) -> int | None:
+    value = keys.get(key)
+    try:
+        return None if value is None else int(value, 0) if isinstance(value, str) else operator.index(value)
+    except (TypeError, ValueError):
+        raise UsageError(f"{path}: {name}: {key}: expected an integer, got {value!r}") from None
+
+
+def _check_distinct(path: Path, nodes: list[BusNode]) -> None:
+    owners: dict[int, str] = {}
+    for node in nodes:
+        other = owners.setdefault(node.node_id, node.name)
+        if other != node.name:
+            raise UsageError(f"{path}: {node.name}: node_id: {node.node_id} is that of {other} too")

@@ -10,11 +10,8 @@ from importlib import resources
 
 import foxglove
 
-from canprobe.bridge.cdr import Encoder
-from canprobe.bridge.messages import Messages
-from canprobe.bridge.sample import Sample
-from canprobe.bridge.sink import Context
-from canprobe.bridge.topics import TOPICS, Topic
+from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.bridge.sample import Context, Sample
 from canprobe.errors import UsageError
 
 LAYOUT = "foxglove_layout.json"

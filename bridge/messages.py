@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from canprobe.bridge import topics
-from canprobe.bridge.cdr import Encoder, encode_can_frame
 from canprobe.bridge.sample import (
     BASE,
     CONTACT,
@@ -23,12 +24,125 @@ from canprobe.bridge.sample import (
     SurfacePatch,
     TaxelImage,
     Wrench,
+    flange_transform,
+    link_transforms,
+    quaternion_of,
 )
-from canprobe.bridge.topics import Topic
-from canprobe.bridge.transforms import flange_transform, link_transforms, quaternion_of
 from canprobe.planning.model import Plan
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene_geometry import T_flange_probe
+from canprobe.robot.kinematics import MODELS
+from canprobe.scene.geometry import T_flange_probe
+
+# The one encoder of all sinks: ROS 2 messages → CDR, their definitions, and their RIHS01 hashes, by `rosbags`.
+#
+# Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
+# ros2_socketcan_msgs, which it does not.
+
+CAN_FRAME = "can_msgs/msg/Frame"
+CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"
+_CAN_FRAME_MSG = """\
+std_msgs/Header header
+uint32 id
+bool is_rtr
+bool is_extended
+bool is_error
+uint8 dlc
+uint8[8] data
+"""
+
+_CAN_FD_FRAME_MSG = """\
+std_msgs/Header header
+uint32 id
+bool is_extended
+bool is_error
+uint8 len
+uint8[<=64] data
+"""
+_CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
+"""Encapsulation, stamp, an empty frame_id, id, three flags, dlc, data: a bus has twenty of them a cycle."""
+_LITTLE_ENDIAN = b"\x00\x01\x00\x00"
+
+
+def encode_can_frame(t_ns: int, frame: CanFrame) -> bytes:
+    """A `can_msgs/msg/Frame` as the encoder makes it, for a fiftieth of its time.
+
+    Args:
+        t_ns: since the epoch.
+        frame: the frame.
+    """
+    seconds, ns = divmod(t_ns, 1_000_000_000)
+    data = frame.data
+    return _CAN_FRAME_CDR.pack(
+        _LITTLE_ENDIAN, seconds, ns, 1, 0, frame.can_id, frame.remote, frame.extended, False, len(data), data
+    )
+
+
+class Encoder:
+    """Messages of one type store.
+
+    Attributes:
+        store: of rosbags; `types[name]` are the message classes.
+    """
+
+    def __init__(self) -> None:
+        self.store: Any = get_typestore(Stores.ROS2_JAZZY)
+        self.store.register(get_types_from_msg(_CAN_FRAME_MSG, CAN_FRAME))
+        self.store.register(get_types_from_msg(_CAN_FD_FRAME_MSG, CAN_FD_FRAME))
+
+    def encode(self, type_name: str, message: object) -> bytes:
+        """A message as CDR, little-endian, with its four bytes of encapsulation."""
+        return bytes(self.store.serialize_cdr(message, type_name))
+
+    def decode(self, type_name: str, data: bytes) -> Any:
+        """The inverse of `encode`."""
+        return self.store.deserialize_cdr(data, type_name)
+
+    def definition(self, type_name: str) -> str:
+        """The definition as MCAP's `ros2msg` and Foxglove want it: with all that it refers to."""
+        text, _ = self.store.generate_msgdef(type_name, ros_version=2)
+        return str(text)
+
+    def type_hash(self, type_name: str) -> str:
+        """`RIHS01_…`, which ROS 2 compares before it connects (REP 2016)."""
+        return str(self.store.hash_rihs01(type_name))
+
+
+# The topics that every ROS sink has in common: names, types, and the quality of service that ROS expects of them.
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One topic.
+
+    Attributes:
+        name: as ROS writes it.
+        type_name: as rosbags and ROS write it.
+        depth: of the history that is kept.
+        transient: late readers get the last message (transient local).
+        best_effort: a lost message is not sent again (sensor data); reliable otherwise.
+    """
+
+    name: str
+    type_name: str
+    depth: int = 10
+    transient: bool = False
+    best_effort: bool = False
+
+
+JOINT_STATES = Topic("/joint_states", "sensor_msgs/msg/JointState")
+WRENCH = Topic("/wrench", "geometry_msgs/msg/WrenchStamped")
+TF = Topic("/tf", "tf2_msgs/msg/TFMessage", depth=100)
+TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", depth=1, transient=True)
+TAXELS = Topic("/taxels/image", "sensor_msgs/msg/Image", depth=5, best_effort=True)
+PATCH = Topic("/surface_patch", "sensor_msgs/msg/PointCloud2", depth=5)
+CURVATURE = Topic("/curvature", "geometry_msgs/msg/Vector3Stamped")
+CAN_FD_FRAMES = Topic("/can_fd_frames", CAN_FD_FRAME, depth=500)
+CAN_FRAMES = Topic("/can_frames", CAN_FRAME, depth=500)
+DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+
+TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS)
+
+
+# One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
 
 Array = NDArray[np.float64]
 Message = tuple[Topic, int, bytes]
@@ -76,15 +190,15 @@ class Messages:
 
     def _can_frames(self, frames: tuple[CanFrame, ...]) -> Iterator[Message]:
         """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
-        classic, fd = self._wanted(topics.CAN_FRAMES), self._wanted(topics.CAN_FD_FRAMES)
+        classic, fd = self._wanted(CAN_FRAMES), self._wanted(CAN_FD_FRAMES)
         for frame in frames:
             t_ns = self._epoch_time(frame.t_ns)
             if len(frame.data) <= 8:
                 if classic:
-                    yield topics.CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+                    yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
             elif fd:
                 message = self._make(
-                    topics.CAN_FD_FRAMES.type_name,
+                    CAN_FD_FRAMES.type_name,
                     header=self._header(frame.t_ns, ""),
                     id=frame.can_id,
                     is_extended=frame.extended,
@@ -92,7 +206,7 @@ class Messages:
                     len=len(frame.data),
                     data=np.frombuffer(frame.data, np.uint8),
                 )
-                yield topics.CAN_FD_FRAMES, t_ns, self.encoder.encode(topics.CAN_FD_FRAMES.type_name, message)
+                yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
         """What there is in a sample: topic, time, and how to make the message."""
@@ -100,21 +214,21 @@ class Messages:
         taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
         if self._model is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
-            yield topics.TF_STATIC, t_ns, lambda: self._static(t_ns)
+            yield TF_STATIC, t_ns, lambda: self._static(t_ns)
         if joints is not None and self._model is not None:
-            yield topics.JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
-            yield topics.TF, t_ns, lambda: self._links(t_ns, joints)
+            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
+            yield TF, t_ns, lambda: self._links(t_ns, joints)
         if taxels is not None:
-            yield topics.TAXELS, taxels.t_ns, lambda: self._image(taxels)
+            yield TAXELS, taxels.t_ns, lambda: self._image(taxels)
         if wrench is not None:
-            yield topics.WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
+            yield WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
         if contact is not None:
-            yield topics.TF, contact.t_ns, lambda: self._contact(contact)
+            yield TF, contact.t_ns, lambda: self._contact(contact)
         if patch is not None:
-            yield topics.PATCH, patch.t_ns, lambda: self._cloud(patch)
-            yield topics.CURVATURE, patch.t_ns, lambda: self._curvature(patch)
+            yield PATCH, patch.t_ns, lambda: self._cloud(patch)
+            yield CURVATURE, patch.t_ns, lambda: self._curvature(patch)
         if sample.diagnostics:
-            yield topics.DIAGNOSTICS, t_ns, lambda: self._diagnostics(sample)
+            yield DIAGNOSTICS, t_ns, lambda: self._diagnostics(sample)
 
     # one function a message
 

@@ -10,22 +10,146 @@ Source: ROS 2's mapping to DDS names (`rt/` before a topic), REP 2016 (`typehash
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import math
+import types as python_types
+from dataclasses import replace
 from typing import Any
 
 from cyclonedds.core import DDSException, Policy, Qos
 from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.idl import annotations as annotate
+from cyclonedds.idl import types as idl
 from cyclonedds.pub import DataWriter, Publisher
 from cyclonedds.sub import DataReader, Subscriber
 from cyclonedds.topic import Topic as DdsTopic
 from cyclonedds.util import duration
 
-from canprobe.bridge.cdr import Encoder
-from canprobe.bridge.limits import refuse
-from canprobe.bridge.messages import Messages
-from canprobe.bridge.ros2_types import DdsTypes
-from canprobe.bridge.sample import Sample
-from canprobe.bridge.sink import Context
-from canprobe.bridge.topics import TOPICS, Topic
+from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
+from canprobe.bridge.sample import Context, Sample
+from canprobe.errors import UsageError
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import Plan
+from canprobe.scene.load import dump_scene, parse_scene
+from canprobe.scene.resolve import resolve
+
+# Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass.
+
+KINDS = ("start", "stop", "target_force_n", "speed_m_s")
+
+
+def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
+    """Why a command is refused, or None.
+
+    A target force or a speed is put into the scene, which is then checked and planned as if it had been written so:
+    ranges, `limits.force_max_n`, the speeds of the joints.
+
+    Args:
+        plan: of the run.
+        kind: one of `KINDS`.
+        value: N or m/s; None for start and stop.
+    """
+    if kind in ("start", "stop"):
+        return None
+    needs = ("scan", "press") if kind == "target_force_n" else ("scan",)
+    task = plan.scene.task
+    if task.kind not in needs:
+        return f'task.kind = "{task.kind}" has none'
+    if value is None or not math.isfinite(value):
+        return f"expected a number, got {value}"
+    changed = replace(task, force_n=value) if kind == "target_force_n" else replace(task, speed_mm_s=value * 1e3)
+    try:
+        make_plan(resolve(parse_scene(dump_scene(replace(plan.scene, task=changed)))))
+    except UsageError as error:
+        return str(error).splitlines()[0].removeprefix("scene: ")
+    return None
+
+
+# ROS 2 message types as Cyclone DDS knows types, made from rosbags' definitions: one type store for all sinks.
+#
+# A type made here carries messages that are CDR already, byte for byte. Built field by field it is serialised by
+# Cyclone itself, which the tests hold against rosbags.
+#
+# Source: ROS 2's mapping to DDS: `pkg/msg/Name` is `pkg::msg::dds_::Name_`, final, plain CDR (XCDR1).
+
+_BASE: dict[str, Any] = {
+    "bool": bool,
+    "byte": idl.uint8,
+    "char": idl.uint8,
+    "string": str,
+    **{f"{kind}{bits}": getattr(idl, f"{kind}{bits}") for kind in ("int", "uint") for bits in (8, 16, 32, 64)},
+    "float32": idl.float32,
+    "float64": idl.float64,
+}
+_NODE_BASE, _NODE_NAME, _NODE_ARRAY = 1, 2, 3
+
+
+def _serialize(self: Any, buffer: Any = None, endianness: Any = None, use_version_2: Any = None) -> bytes:
+    """What goes onto the wire, encapsulation included: the bytes that a message carries, or its fields."""
+    carried = self.__dict__.get("carried")
+    if carried is not None:
+        return bytes(carried)
+    data: bytes = IdlStruct.serialize(self, buffer, endianness, use_version_2)
+    return data
+
+
+class DdsTypes:
+    """The DDS types of one type store, each made when it is first asked for.
+
+    Args:
+        encoder: with the store.
+    """
+
+    def __init__(self, encoder: Encoder) -> None:
+        self._encoder = encoder
+        self._made: dict[str, Any] = {}
+
+    def of(self, type_name: str) -> Any:
+        """The class of a ROS type, such as `sensor_msgs/msg/JointState`."""
+        if type_name not in self._made:
+            _, fields = self._encoder.store.fielddefs[type_name]
+            self._made[type_name] = self._make(type_name, {name: self._field(node) for name, node in fields})
+        return self._made[type_name]
+
+    def carry(self, type_name: str, cdr: bytes) -> Any:
+        """A message of a type that will be sent as the bytes that it is."""
+        cls = self.of(type_name)
+        message = cls.__new__(cls)
+        message.__dict__["carried"] = cdr
+        return message
+
+    def _make(self, type_name: str, fields: dict[str, Any]) -> Any:
+        name = dds_name(type_name)
+
+        def body(namespace: dict[str, Any]) -> None:
+            namespace["__annotations__"].update(fields)
+            namespace["__module__"] = __name__
+            namespace["serialize"] = _serialize
+
+        typename = {"typename": name.replace("::", ".")}
+        cls = python_types.new_class(name.rpartition(":")[2], (IdlStruct,), typename, body)
+        return annotate.final(dataclasses.dataclass(cls))
+
+    def _field(self, node: tuple[Any, Any]) -> Any:
+        kind, of = int(node[0]), node[1]
+        if kind == _NODE_BASE:
+            return _BASE[of[0]]
+        if kind == _NODE_NAME:
+            return self.of(of)
+        inner, length = self._field(of[0]), of[1]
+        if kind == _NODE_ARRAY:
+            return idl.array[inner, length]  # type: ignore[misc]
+        return idl.sequence[(inner, length) if length else inner]  # type: ignore[misc]
+
+
+def dds_name(type_name: str) -> str:
+    """`sensor_msgs/msg/JointState` → `sensor_msgs::msg::dds_::JointState_`."""
+    package, kind, name = type_name.split("/")
+    return f"{package}::{kind}::dds_::{name}_"
+
+
+# Live ROS 2 topics without ROS: Cyclone DDS with ROS's names, types, hashes and quality of service; commands back.
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)

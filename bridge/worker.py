@@ -1,4 +1,4 @@
-"""The process of one bridge: records from the cell on stdin, lines of JSON back on stdout.
+"""The process of one bridge: records from the cell on stdin, made into samples, lines of JSON back on stdout.
 
 Back go `{"ready": where}`, then requests of the other tool, then `{"done": {"received": n, "where": …}}`, or `{"error":
 text}` at any time. The end of stdin without a last record means that the cell is gone: the sink is closed all the same.
@@ -15,19 +15,250 @@ import signal
 import sys
 import traceback
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from canprobe.bridge.codec import unpack_observation
-from canprobe.bridge.feed import read_records
-from canprobe.bridge.sink import Context, Sink
-from canprobe.bridge.source import SampleSource
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge.process import EstimateParts, Received, read_records, unpack_observation
+from canprobe.bridge.sample import (
+    CanFrame,
+    ContactFrame,
+    Context,
+    Diagnostic,
+    Joints,
+    Sample,
+    Sink,
+    SurfacePatch,
+    TaxelImage,
+    Wrench,
+)
+from canprobe.bus.port import TimedFrame
+from canprobe.cell.assembly import patch_of
+from canprobe.cell.controller import Measurement, TactileSample
+from canprobe.cell.supervision import TOUCH_FORCE
+from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError
-from canprobe.planning import make_plan
 from canprobe.planning.bridges import BRIDGES
-from canprobe.scene import BridgeSettings
-from canprobe.scene_loader import parse_scene
-from canprobe.scene_resolve import resolve
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
+from canprobe.protocol.cia402 import DriveState, known_state
+from canprobe.protocol.frames import EFF_FLAG, NO_ERROR, RTR_FLAG, NmtState, describe
+from canprobe.robot.kinematics import forward
+from canprobe.scene.load import parse_scene
+from canprobe.scene.model import BridgeSettings
+from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Setup, Touch
+from canprobe.tasks.probing import Phase
+from canprobe.tasks.sensing import ContactSensing
+from canprobe.touch.contact import ContactSample, pad_to_direction
+from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
+from canprobe.touch.patch.array_model import array_calibration
+from canprobe.touch.patch.image import Patch
+
+# The state of the nodes as a sample tells it, about once a second: from heartbeats, emergencies and statuswords.
+
+PERIOD_NS = 1_000_000_000
+WELL, LOOK, FAILED, SILENT = range(4)
+_SUPERVISED = (0x080, 0x700)
+
+
+class Health:
+    """Follows the nodes of a plan.
+
+    Args:
+        plan: whose nodes.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._watch = NodeWatch(plan.node_ids, MASTER_NODE_ID, HEARTBEAT_CONSUMED_MS * 1_000_000)
+        self._heard: dict[int, int] = {}
+        self._due_ns: int | None = None
+
+    def step(self, t_ns: int, received: Received) -> tuple[Diagnostic, ...]:
+        """Take what one observation says; the state of all where it is time for it, else nothing."""
+        for frame in received.frames:
+            self._push(frame)
+        if received.measurement is None:
+            return ()
+        if self._due_ns is not None and t_ns < self._due_ns:
+            return ()
+        self._due_ns = t_ns + PERIOD_NS
+        nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
+        return (*nodes, _cell(received))
+
+    def _push(self, frame: TimedFrame) -> None:
+        can_id, data, t_ns = frame
+        node_id = can_id & 0x7F
+        if can_id > 0x7FF or can_id & 0x780 not in _SUPERVISED or node_id not in self._watch.boot_ups:
+            return
+        self._watch.push(can_id, data, t_ns)
+        if can_id & 0x780 == 0x700:
+            self._heard[node_id] = t_ns
+
+    def _node(self, node: PlannedNode, measurement: Measurement, t_ns: int) -> Diagnostic:
+        node_id, watch = node.node_id, self._watch
+        state = watch.states.get(node_id)
+        drive = self._drive(node, measurement)
+        event = watch.last_emcy.get(node_id)
+        silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
+        level, message = WELL, "operational"
+        if silent:
+            level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
+        elif event is not None and event.emcy.code != NO_ERROR:
+            level, message = FAILED, f"EMCY {event.emcy.code:04X}h, {describe(event.emcy.code)}"
+        elif drive in (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE):
+            level, message = FAILED, "drive fault"
+        elif state is not NmtState.OPERATIONAL:
+            level, message = LOOK, state.name.lower() if state is not None else "no heartbeat yet"
+        values = [("nmt_state", state.name.lower() if state is not None else "unknown")]
+        if drive is not None:
+            values.append(("drive_state", drive.name.lower()))
+        return Diagnostic(f"node {node_id} ({node.role})", level, message, tuple(values))
+
+    def _drive(self, node: PlannedNode, measurement: Measurement) -> DriveState | None:
+        arm = self._plan.scene.arm
+        if arm is None or node.kind != "drive" or not measurement.statuswords:
+            return None
+        return known_state(measurement.statuswords[arm.node_ids.index(node.node_id)])
+
+
+def _cell(received: Received) -> Diagnostic:
+    """The cell as a whole, and the bridge that tells it."""
+    m = received.measurement
+    assert m is not None
+    oldest = max(m.q_age, default=0)
+    values = [("cycle", str(m.cycle)), ("oldest_tpdo_cycles", str(oldest)), ("dropped_samples", str(received.dropped))]
+    if m.tactile_age is not None:
+        values.append(("tactile_age_cycles", str(m.tactile_age)))
+    if received.dropped:
+        return Diagnostic("cell", LOOK, f"{received.dropped} samples were lost on the way here", tuple(values))
+    return Diagnostic("cell", WELL, "running", tuple(values))
+
+
+# Observations → neutral samples, in the bridge's process: patch, contact, frames and the state of the nodes.
+
+Array = NDArray[np.float64]
+_PHASES = {float(phase): phase.name.lower() for phase in Phase}
+
+
+class SampleSource:
+    """Makes the samples of one run, with the scene's own calibration and geometry.
+
+    Args:
+        plan: of the run.
+    """
+
+    def __init__(self, plan: Plan) -> None:
+        arm, array, probe = plan.setup.arm, plan.setup.array, plan.setup.probe
+        self._health = Health(plan)
+        self._sensing = _sensing(plan.setup)
+        self._model = arm.model if arm is not None else None
+        self._T_flange_probe = probe.T_flange_probe if plan.setup.scene.probe is not None else None
+        self._radius = probe.radius
+        self._calibration = array_calibration(array.full_scale, probe.radius) if array is not None else None
+
+    def sample(self, received: Received) -> Sample:
+        """The sample of one observation."""
+        measurement, t_ns = received.measurement, received.t_ns
+        frames = tuple(_frame(frame) for frame in received.frames)
+        diagnostics = self._health.step(t_ns, received)
+        if measurement is None:
+            return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
+        self._feel(received.estimate)  # before the contact, as the task does
+        if received.depth is not None and self._sensing is not None:
+            self._sensing.set_depth_at_1_n(received.depth * 1e-3)
+        taxels, wrench, contact = self._touch(measurement, t_ns - measurement.t_ns)
+        return Sample(
+            t_ns,
+            cycle=measurement.cycle,
+            phase=_PHASES.get(received.phase) if received.phase is not None else None,
+            joints=self._joints(measurement),
+            taxels=taxels,
+            wrench=wrench,
+            contact=contact,
+            patch=self._patch(received),
+            frames=frames,
+            diagnostics=diagnostics,
+            dropped=received.dropped,
+        )
+
+    def _joints(self, m: Measurement) -> Joints | None:
+        if m.q is None or self._model is None:
+            return None
+        tool = self._T_flange_probe
+        T = forward(self._model, m.q) @ tool if tool is not None else None
+        return Joints(m.q, T, m.q_age, m.torque_permille, m.statuswords)
+
+    def _patch(self, received: Received) -> SurfacePatch | None:
+        estimate = received.estimate
+        if estimate is None:
+            return None
+        return SurfacePatch(received.t_ns, estimate.T_frame_contact, estimate.K, estimate.covariance, estimate.observed)
+
+    def _touch(self, m: Measurement, shift_ns: int) -> tuple[TaxelImage | None, Wrench | None, ContactFrame | None]:
+        """What the array felt; ``shift_ns`` takes the cycle's clock to that of the samples."""
+        sensing, sample = self._sensing, m.tactile
+        patch = sensing.step(m) if sensing is not None else None
+        if sample is None or self._calibration is None:
+            return None, None, None
+        if patch is None:
+            patch = patch_of(sample, self._calibration)
+        t_ns = sample.t_sample_ns + shift_ns
+        felt = patch.force > TOUCH_FORCE / 2
+        contact = sensing.contact(sample, patch) if sensing is not None and felt else None
+        wrench = _wrench(t_ns, patch, self._radius)
+        return _image(sample, t_ns), wrench, _contact(t_ns, contact) if contact is not None else None
+
+    def _feel(self, estimate: EstimateParts | None) -> None:
+        """Contacts are placed on the estimated curvature from now on."""
+        if estimate is not None and self._sensing is not None and all(estimate.observed):
+            low, high = np.linalg.eigvalsh(estimate.K).tolist()
+            self._sensing.set_kappa(np.array([high, low]))
+
+
+def _sensing(setup: Setup) -> ContactSensing | None:
+    """Contacts, where there is an arm to place them; second moments are the estimator's business."""
+    from canprobe.tasks.from_plan import make_sensing
+
+    touch = setup.touch
+    if touch is None:
+        return None
+    return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
+
+
+def _frame(frame: TimedFrame) -> CanFrame:
+    can_id, data, t_ns = frame
+    if can_id <= 0x7FF:
+        return CanFrame(t_ns, can_id, data)
+    extended = bool(can_id & EFF_FLAG)
+    return CanFrame(t_ns, can_id & (0x1FFFFFFF if extended else 0x7FF), data, extended, bool(can_id & RTR_FLAG))
+
+
+def _image(sample: TactileSample, t_ns: int) -> TaxelImage | None:
+    """The taxels; None in features mode, where there are none."""
+    frame = sample.frame
+    if frame.features is not None:
+        return None
+    row, column, rows, _ = frame.window
+    return TaxelImage(t_ns, frame.taxels, (row, column) if rows < 16 else None, frame.header.overload)
+
+
+def _wrench(t_ns: int, patch: Patch, radius: float) -> Wrench:
+    """The object pushes the probe back along the direction in which it is felt."""
+    if patch.force <= 0.0:
+        return Wrench(t_ns, np.zeros(3), np.zeros(3))
+    return Wrench(t_ns, -patch.force * pad_to_direction(patch.u, patch.v, radius), np.zeros(3))
+
+
+def _contact(t_ns: int, contact: ContactSample) -> ContactFrame:
+    return ContactFrame(t_ns, homogeneous(tangent_rotation(-contact.n_base), contact.p_base), contact.force_n)
+
+
+# The process of one bridge: records from the cell on stdin, lines of JSON back on stdout.
 
 NICE = 10
 """Whatever a bridge computes, the cell and its nodes come first."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from canprobe.api import open_cell, plan, run
-    from canprobe.cell.measurement import Command, Controller, Measurement
+    from canprobe.cell.controller import Command, Controller, Measurement
     from canprobe.errors import (
         BusError,
         CanprobeError,
@@ -25,38 +25,34 @@ if TYPE_CHECKING:
         StudyError,
         UsageError,
     )
-    from canprobe.recorded import ReplayResult, replay
-    from canprobe.results import RunResult
-    from canprobe.scene_loader import load_scene
-    from canprobe.surface_file import load_surface_map
-    from canprobe.tables import load_table
-    from canprobe.touch.bound import cramer_rao
-    from canprobe.touch.estimate import SurfaceEstimate
-    from canprobe.touch.fit import fit_surface
+    from canprobe.recorded.reestimate import ReplayResult, replay
+    from canprobe.results.files import load_surface_map, load_table
+    from canprobe.results.summary import RunResult, measure_traffic
+    from canprobe.scene.load import load_scene
+    from canprobe.touch.estimate.answer import SurfaceEstimate
+    from canprobe.touch.estimate.fit import fit_surface
+    from canprobe.touch.estimate.likelihood import cramer_rao
     from canprobe.touch.surface import SurfaceMatrix
     from canprobe.touch.surface_map import SurfaceMap
-    from canprobe.traffic_log import measure_traffic
 
 __version__ = "0.1.0"
 
 _MODULES = {
     "canprobe.api": ("open_cell", "plan", "run"),
-    "canprobe.cell.measurement": ("Command", "Controller", "Measurement"),
+    "canprobe.cell.controller": ("Command", "Controller", "Measurement"),
     "canprobe.errors": (
         *("BusError", "CanprobeError", "EdsError", "InterfaceError", "NodeError", "PlanError", "ProtocolError"),
         *("ResultsError", "SafetyStop", "SceneError", "StudyError", "UsageError"),
     ),
-    "canprobe.recorded": ("ReplayResult", "replay"),
-    "canprobe.results": ("RunResult",),
-    "canprobe.scene_loader": ("load_scene",),
-    "canprobe.surface_file": ("load_surface_map",),
-    "canprobe.tables": ("load_table",),
-    "canprobe.touch.bound": ("cramer_rao",),
-    "canprobe.touch.estimate": ("SurfaceEstimate",),
-    "canprobe.touch.fit": ("fit_surface",),
+    "canprobe.recorded.reestimate": ("ReplayResult", "replay"),
+    "canprobe.scene.load": ("load_scene",),
+    "canprobe.results.files": ("load_surface_map", "load_table"),
+    "canprobe.touch.estimate.likelihood": ("cramer_rao",),
+    "canprobe.touch.estimate.answer": ("SurfaceEstimate",),
+    "canprobe.touch.estimate.fit": ("fit_surface",),
     "canprobe.touch.surface": ("SurfaceMatrix",),
     "canprobe.touch.surface_map": ("SurfaceMap",),
-    "canprobe.traffic_log": ("measure_traffic",),
+    "canprobe.results.summary": ("RunResult", "measure_traffic"),
 }
 _EXPORTS = {name: (module, name) for module, names in _MODULES.items() for name in names}
 

@@ -11,24 +11,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from canprobe.bridging import Bridges
-from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
-from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Controller, Measurement
-from canprobe.cell.observe import Observation, Observer, Observers
-from canprobe.cell.tasks.shape import ShapeRecord, on_run_clock
-from canprobe.emulation import emulate, emulate_eds
+from canprobe.bus.disk import whole_file
+from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
+from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import BusError, CanprobeError, ResultsError, UsageError
-from canprobe.joint_report import check_joints
-from canprobe.link_report import check_links, need_controllers
-from canprobe.note_report import news_teller, telling_notes
-from canprobe.planning import Plan, make_plan
-from canprobe.results import RunResult, log_columns, summarise, write_files
-from canprobe.scene import Scene
-from canprobe.scene_resolve import resolve
-from canprobe.session import LOCKSTEP, Say, Session, hush_canopen, quiet, resolve_scene
-from canprobe.session_bus import open_ports
-from canprobe.whole_file import whole_file
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import Plan
+from canprobe.results.summary import RunResult, log_columns, summarise, write_files
+from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
+from canprobe.session.children import Bridges
+from canprobe.session.emulation import emulate, emulate_eds
+from canprobe.session.links import check_links, need_controllers
+from canprobe.session.session import LOCKSTEP, Say, Session, hush_canopen, open_ports, quiet, resolve_scene
+from canprobe.session.up import check_joints, news_teller, telling_notes
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.shape import ShapeRecord, on_run_clock
+from canprobe.tasks.untouched import _Hold
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from canprobe.cell.monitor import CellView
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
+
 
 MONITOR_PERIOD_NS = 100_000_000
 SILENCE_NS = 1_000_000_000
@@ -125,17 +126,9 @@ def _requested(
     """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
     if not bridges.requests:
         return task if task is not None else _Hold()
-    from canprobe.cell.tasks.requested import RequestedTask
+    from canprobe.tasks.from_plan import RequestedTask
 
     return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
-
-
-class _Hold:
-    """Stay where the drives are."""
-
-    def step(self, _: Measurement) -> Command:
-        """Nothing to do."""
-        return Command()
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -144,7 +137,7 @@ def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
 
 
 def plan(scene: Scene) -> Plan:
-    """Everything that follows from a scene before anything is started; see `canprobe.planning.make_plan`.
+    """Everything that follows from a scene before anything is started; see `canprobe.planning.make.make_plan`.
 
     Raises:
         UsageError: this is no scene.
@@ -177,7 +170,7 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
         return {}
-    from canprobe.cell.tasks.build import estimates_of
+    from canprobe.tasks.from_plan import estimates_of
 
     return estimates_of(resolve(scene), tracker, (scene.shape.method, *scene.shape.also))
 
@@ -189,7 +182,7 @@ def _mapped(
     tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
         return None, None, None
-    from canprobe.cell.mapping import map_of_scan, summarise_map
+    from canprobe.results.scores import map_of_scan, summarise_map
     from canprobe.touch.consistency import check_consistency
 
     surface_map = map_of_scan(tracker, scene.shape.method, start_s)
@@ -201,7 +194,7 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
     if not len(result.log["t_s"]):
         return
     if "report.html" in result.plan.outputs:
-        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("page", "recorded"))
+        page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
             shown = recorded.read_run(out)
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
@@ -209,8 +202,8 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
         else:
             page.write_page(shown, out / "report.html")
     if "report.png" in result.plan.outputs:
-        from canprobe.studies.run_figure import draw_run
-        from canprobe.studies.surface_figure import draw_surface
+        from canprobe.results.figures import draw_run
+        from canprobe.results.surface_figure import draw_surface
 
         with whole_file(out / "report.png") as part:
             draw_run(result, part)
@@ -454,7 +447,7 @@ def scan(
     Raises:
         InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
-    from canprobe.cell.scan import scan_nodes
+    from canprobe.cell.commission import scan_nodes
 
     with _bus_without_scene(interface, channel, bitrate, say) as port:
         nodes = scan_nodes(port, timeout_s)
@@ -466,9 +459,9 @@ def scan(
 @contextlib.contextmanager
 def _bus_without_scene(interface: str, channel: str, bitrate: int, say: Say) -> Iterator[Port]:
     """A port of a bus of which nothing more is known, whose setting is no reason to leave it alone."""
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.bus.open import open_port
-    from canprobe.cell.link_checks import Expected
+    from canprobe.bus.interfaces import open_port
+    from canprobe.bus.port import MonotonicClock
+    from canprobe.session.links import Expected
 
     hush_canopen()
     check_links(interface, {channel: Expected(bitrate, of_scene=False)}, say, must=False)
@@ -506,8 +499,7 @@ def commission(
         BusError: see `canprobe.cell.commission.commission`.
         InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
     """
-    from canprobe.cell.commission import commission, wanted_by
-    from canprobe.cell.lss_choice import Wanted
+    from canprobe.cell.commission import Wanted, commission, wanted_by
 
     wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
     if scene is not None:
@@ -544,9 +536,9 @@ def monitor(
         UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
         InterfaceError: no such interface, or it was lost; or a bus is silent and its CAN controller's state is why.
     """
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.cell.link_checks import expected_of
+    from canprobe.bus.port import MonotonicClock
     from canprobe.cell.monitor import Monitor
+    from canprobe.session.links import expected_of
 
     resolved = resolve_scene(
         scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from typing import Any
 
 from canprobe.scene import Scene
-from canprobe.scene_checks import Only, conditions_of, expected
-from canprobe.scene_rules import SECTIONS_OF_TASK
-from canprobe.scene_writer import toml_value
+from canprobe.scene.checks import Only, conditions_of, expected
+from canprobe.scene.load import toml_value
+from canprobe.scene.rules import SECTIONS_OF_TASK
 
 UNITS = {  # the longest suffix that fits
     "bitrate": "bit/s",

@@ -1,6 +1,7 @@
-"""The layers of the package: who may import whom, read from the source.
+"""The rooms of the package: who may import whom, read from the source; no circles, no crowded folder.
 
-errors < protocol, eds < robot, touch (pure) < scene, planning < bus < cell | emulator < api < studies < cli
+errors < protocol, eds, robot, touch < scene < planning < bus < vcan, cell < tasks | emulator < session < results
+< recorded < bridge, api < studies < cli
 """
 
 import ast
@@ -11,17 +12,18 @@ from pathlib import Path
 import pytest
 
 import canprobe
-from canprobe import errors
 
 PACKAGE = Path(canprobe.__file__).parent
 FILES = glob.glob("**/*.py", root_dir=PACKAGE, recursive=True)  # it follows the links eds and bridge; rglob does not
 MODULES = {PACKAGE / name: Path(name) for name in sorted(FILES)}
 
-# layer → layers of this package that it may import, besides itself and errors
+# room → rooms of this package that it may import, besides itself and errors
 LOW = {"protocol", "eds"}
 PURE = LOW | {"robot", "touch"}
 SCENE = PURE | {"scene", "planning"}
 EDGE = SCENE | {"bus"}
+MASTER = EDGE | {"cell", "tasks"}
+BOTH = MASTER | {"emulator", "plant", "session"}
 ALLOWED = {
     "errors": set(),
     "protocol": set(),
@@ -32,48 +34,39 @@ ALLOWED = {
     "scene": PURE,
     "planning": PURE | {"scene"},
     "bus": SCENE,
+    "vcan": {"bus"},
     "cell": EDGE,
+    "tasks": EDGE | {"cell"},
     "emulator": EDGE | {"plant"},
-    "api": EDGE | {"cell", "emulator", "plant", "studies"},
-    "studies": EDGE | {"cell", "emulator", "plant", "api"},
-    "cli": EDGE | {"cell", "emulator", "plant", "api", "studies", "bridge"},
-    "bridge": EDGE | {"cell", "emulator", "plant", "api", "studies"},
+    "session": BOTH,
+    "results": BOTH,
+    "recorded": BOTH | {"results"},
+    "bridge": BOTH | {"results", "recorded"},
+    "api": BOTH | {"results"},
+    "studies": BOTH | {"results", "recorded", "api"},
+    "cli": BOTH | {"results", "recorded", "api", "studies", "bridge", "vcan"},
     "examples": {"package", "api"},
-    "package": {*EDGE, "api", "cli"},
+    "package": {*MASTER, "api", "cli", "session", "results", "recorded"},
 }
-# top-level modules that join cell and emulator
-COMPOSITION = {
-    "api",
-    "bridging",
-    "results",
-    "session",
-    "session_bus",
-    "child",
-    "rehearsal",
-    "recorded",
-    "recorded_bridges",
-    "recorded_summary",
-    "npz_file",
-    "surface_file",
-    "tables",
-    "traffic_log",
-    "emulation",
-    "link_report",
-    "joint_report",
-    "note_report",
-}
+ROOT = {"__init__", "__main__", "api", "errors"}
+MOST_MODULES = 16
+# a node's application and its services know each other, by their types only
+KNOWN_CIRCLES = [{"canprobe.emulator.node.core", "canprobe.emulator.node.slave_node"}]
 
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {
-    "bridge/cdr.py": {"rosbags"},
+    "bridge/messages.py": {"rosbags"},
     "bridge/mcap_file.py": {"mcap"},
     "bridge/foxglove_live.py": {"foxglove"},
     "bridge/ros2_dds.py": {"cyclonedds"},
-    "bridge/ros2_types.py": {"cyclonedds"},
-    "bridge/view/server.py": {"viser"},
+    "bridge/view/stage.py": {"viser"},
+    "results/picture.py": {"matplotlib"},
+    "results/figures.py": {"matplotlib"},
+    "results/surface_figure.py": {"matplotlib"},
 }
 
 EDGE_ONLY = {"time", "socket", "threading", "can", "selectors", "asyncio", "sched"}
+AT_THE_EDGE = {"bus", "vcan"}
 NEVER_IN_PURE = EDGE_ONLY | {
     "canopen",
     "os",
@@ -88,16 +81,10 @@ PURE_LAYERS = {"protocol", "robot", "touch", "plant"}
 
 
 def layer_of(parts):
-    """The layer of a module, from the parts of its path or dotted name below the package."""
+    """The room of a module, from the parts of its path or dotted name below the package."""
     top = parts[0] if parts else "package"
-    if top in ("emulator",) and len(parts) > 1 and parts[1] == "plant":
+    if top == "emulator" and len(parts) > 1 and parts[1] == "plant":
         return "plant"
-    if top in COMPOSITION:
-        return "api"
-    if top == "whole_file":  # of the standard library alone, for everybody who writes a file
-        return "errors"
-    if top.startswith("scene"):
-        return "scene"
     return "package" if top in ("__init__", "__main__") else top
 
 
@@ -107,10 +94,10 @@ def type_checking_nodes(tree):
     return {inner for node in guarded for statement in node.body for inner in ast.walk(statement)}
 
 
-def imports_of(path, relative):
-    """Dotted names that a module imports, absolute, with the line."""
+def imports_of(path, relative, *, typed=False):
+    """Dotted names that a module imports, absolute, with the line; `typed`: those for types alone, too."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
-    skipped = type_checking_nodes(tree)
+    skipped = set() if typed else type_checking_nodes(tree)
     package = ["canprobe", *relative.parent.parts]
     for node in ast.walk(tree):
         if node in skipped:
@@ -149,7 +136,7 @@ def test_imports_point_downward(path):
         elif layer == "studies" and top == "time":
             fine = what in ("perf_counter", "process_time")
         else:
-            fine = layer == "bus" or top not in EDGE_ONLY
+            fine = layer in AT_THE_EDGE or top not in EDGE_ONLY
         if not fine:
             wrong.append(f"{relative}:{line} imports {name}")
     assert not wrong, "; ".join(wrong)
@@ -165,16 +152,49 @@ def test_nothing_imports_the_bridges_but_a_command_that_is_asked_for_one():
 
 
 def test_cell_and_emulator_never_see_each_other():
-    assert not {"cell"} & ALLOWED["emulator"]
-    assert not {"emulator", "plant"} & ALLOWED["cell"]
+    assert not {"cell", "tasks"} & (ALLOWED["emulator"] | ALLOWED["plant"])
+    assert not {"emulator", "plant"} & (ALLOWED["cell"] | ALLOWED["tasks"])
 
 
-def test_every_module_belongs_to_a_layer():
+def test_every_module_belongs_to_a_room():
     assert {layer_of(relative.with_suffix("").parts) for relative in MODULES.values()} <= set(ALLOWED)
 
 
+def test_the_root_holds_two_modules_and_no_room_has_the_name_of_a_function():
+    assert {relative.stem for relative in MODULES.values() if relative.parent == Path(".")} == ROOT
+    assert not {"plan", "run", "replay"} & {part for relative in MODULES.values() for part in relative.parent.parts}
+
+
+def test_no_room_is_crowded():
+    rooms = {}
+    for relative in MODULES.values():
+        if relative.name != "__init__.py":
+            rooms.setdefault(str(relative.parent), []).append(relative.stem)
+    crowded = {room: len(modules) for room, modules in rooms.items() if len(modules) > MOST_MODULES}
+    assert not crowded
+
+
+@pytest.mark.parametrize("typed", [False, True], ids=["run", "types"])
+def test_no_modules_import_each_other_in_a_circle(typed):
+    names = {path: ".".join(("canprobe", *relative.with_suffix("").parts)) for path, relative in MODULES.items()}
+    names = {path: name.removesuffix(".__init__") for path, name in names.items()}
+    known = set(names.values())
+    graph = {
+        name: {target for target, _, _ in imports_of(path, MODULES[path], typed=typed)} & known - {name, "canprobe"}
+        for path, name in names.items()
+    }
+    for circle in KNOWN_CIRCLES if typed else ():
+        for name in circle:
+            graph[name] = graph[name] - circle
+    while leaves := {name for name, targets in graph.items() if not targets & set(graph)}:
+        graph = {name: targets for name, targets in graph.items() if name not in leaves}
+    while tops := set(graph) - {target for targets in graph.values() for target in targets}:
+        graph = {name: targets for name, targets in graph.items() if name not in tops}
+    assert not graph, {name: sorted(targets & set(graph)) for name, targets in graph.items()}
+
+
 def test_only_declared_packages_are_imported():
-    """Base dependencies everywhere; an extra's package only in studies, and in the one bridge that needs it."""
+    """Base dependencies everywhere; an extra's package only in studies, and in the one module that needs it."""
     base = {"can", "canopen", "numpy", "scipy"}
     for path, relative in MODULES.items():
         extras = {"matplotlib", "distributed"} if layer_of(relative.with_suffix("").parts) == "studies" else set()
@@ -201,20 +221,3 @@ def test_the_reader_of_imports_sees_every_form(tmp_path, source, names):
     path = tmp_path / "module.py"
     path.write_text(source)
     assert [name for name, _, _ in imports_of(path, Path("bus/module.py"))] == names
-
-
-def test_what_users_need_is_a_name_of_the_package_itself():
-    """To everybody alike: at run time, to `dir` and `import *`, and to a type checker."""
-    named = {
-        name
-        for name, value in vars(errors).items()
-        if isinstance(value, type) and value.__module__ == "canprobe.errors"
-    }
-    named |= {"Command", "Controller", "Measurement", "RunResult"}
-    assert named <= set(canprobe.__all__) <= set(dir(canprobe))
-    for name in canprobe.__all__:
-        assert getattr(canprobe, name) is not None
-    assert canprobe.NodeError is errors.NodeError
-    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-    checked = {a.asname or a.name for n in type_checking_nodes(tree) if isinstance(n, ast.ImportFrom) for a in n.names}
-    assert checked == set(canprobe.__all__) - {"__version__"}

@@ -13,14 +13,14 @@ from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.supervision_text import markdown_table
+from canprobe.cell.conditions import markdown_table
 from canprobe.cli import COMMANDS, main
-from canprobe.eds import eds_path
+from canprobe.eds.packaged import eds_path
 from canprobe.planning.bridges import BRIDGES
-from canprobe.scene import Scene
-from canprobe.scene_checks import convert
-from canprobe.scene_loader import load_scene, scenes_folder
-from canprobe.studies.study import STUDIES
+from canprobe.scene.checks import convert
+from canprobe.scene.load import load_scene, scenes_folder
+from canprobe.scene.model import Scene
+from canprobe.studies.harness import STUDIES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -116,7 +116,7 @@ def test_links_pictures_and_names_of_commands(page):
 
 
 def test_the_table_of_conditions_is_the_one_that_supervises():
-    assert markdown_table() in TEXTS["docs/supervision.md"], "print it: canprobe.cell.supervision_text"
+    assert markdown_table() in TEXTS["docs/supervision.md"], "print it: canprobe.cell.conditions"
 
 
 def test_the_readme_stays_short():

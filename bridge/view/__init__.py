@@ -1,5 +1,5 @@
 """A cell in three dimensions: live in a browser, a recorded run with a time slider, one file to share.
 
-Shapes, colours and what is read from a run are plain numpy; only ``server`` imports viser, and only ``stage``,
-``path_nodes``, ``panel``, ``page``, ``replay`` and ``live`` speak to it. The extra ``view`` installs it.
+Shapes, colours and what is read from a run are plain numpy; only ``stage`` imports viser, and only ``stage``, ``path``
+and ``browser`` speak to it. The extra ``view`` installs it.
 """

@@ -13,16 +13,52 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
+from canprobe.bridge.view.instants import Moment, curvature_error, curvature_sigma, true_kappa
 from canprobe.bridge.view.meshes import Array
-from canprobe.bridge.view.moments import Moment, curvature_error, curvature_sigma, true_kappa
-from canprobe.bridge.view.recorded_taxels import read_taxels
-from canprobe.cell.tasks.probing import Phase
+from canprobe.bus.disk import read_candump
+from canprobe.cell.assembly import make_tactile
 from canprobe.errors import UsageError
-from canprobe.results import SCHEMA, check_clock
-from canprobe.scene import Scene
-from canprobe.scene_geometry import true_object
-from canprobe.scene_loader import load_scene
-from canprobe.touch.frames import tangent_rotation
+from canprobe.planning.make import make_plan
+from canprobe.results.summary import SCHEMA, check_clock
+from canprobe.scene.geometry import true_object
+from canprobe.scene.load import load_scene
+from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
+from canprobe.tasks.probing import Phase
+from canprobe.touch.linear_algebra import tangent_rotation
+
+# The tactile images of a recorded bus, without the rest of the cell.
+
+TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
+
+
+def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
+    """Tactile frames with the time of their arrival, on the clock of the log.
+
+    Args:
+        file: a candump log; nothing comes from one that does not exist.
+        scene: with a sensor.
+
+    Returns:
+        (t_s, (16, 16) uint8 counts) by rising time; empty in features mode.
+
+    Raises:
+        UsageError: a line that is not candump's.
+    """
+    assert scene.sensor is not None
+    if scene.sensor.mode == "features" or not file.is_file():
+        return ()
+    receiver = make_tactile(make_plan(resolve(scene)))
+    assert receiver is not None
+    frames = []
+    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
+        frame = receiver.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            frames.append((t_ns * 1e-9, frame.taxels))
+    return tuple(frames)
+
+
+# A folder that `canprobe run` wrote → what there is to show, instant by instant.
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),

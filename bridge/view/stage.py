@@ -1,24 +1,42 @@
-"""The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes."""
+"""The scene in the browser: a viser server, its nodes for arm, probe, object, contact and path, and the panel beside
+them.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import io
 import math
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.transforms import quaternion_of
-from canprobe.bridge.view.arm import arm_parts, link_frames, probe_parts
-from canprobe.bridge.view.colours import UNKNOWN, linear_light
-from canprobe.bridge.view.meshes import Array, Mesh
-from canprobe.bridge.view.moments import Moment
-from canprobe.bridge.view.objects import object_lines, object_mesh
-from canprobe.bridge.view.patch import disc_faces, disc_points, patch_shape
-from canprobe.bridge.view.taxels import taxel_colours, taxel_poses, tile
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import Scene
-from canprobe.scene_geometry import T_flange_probe, true_object
+from canprobe.bridge.sample import quaternion_of
+from canprobe.bridge.view.bodies import (
+    arm_parts,
+    disc_faces,
+    disc_points,
+    link_frames,
+    object_lines,
+    object_mesh,
+    patch_shape,
+    probe_parts,
+    taxel_colours,
+    taxel_image,
+    taxel_poses,
+    tile,
+)
+from canprobe.bridge.view.instants import Curves, Moment
+from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
+from canprobe.bridge.view.path import ErrorScale
+from canprobe.errors import InterfaceError, UsageError
+from canprobe.robot.kinematics import MODELS
+from canprobe.scene.geometry import T_flange_probe, true_object
+from canprobe.scene.model import Scene
+
+# The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 
 OBJECT, PROBE, SHELL, PATCH, FORCE = (126, 150, 176), (78, 88, 104), (255, 150, 40), (250, 190, 40), (214, 40, 30)
 FORCE_M_PER_N = 0.02
@@ -190,3 +208,147 @@ def _place(handle: Any, T: Array) -> None:
     x, y, z, w = quaternion_of(T[:3, :3])
     handle.wxyz = (w, x, y, z)
     handle.position = T[:3, 3]
+
+
+# A viser server that says nothing on stdout and leaves nothing behind.
+
+PIP = "pip install 'canprobe[view]'"
+DEFAULT_PORT = 8080
+
+
+@contextlib.contextmanager
+def open_server(port: int, host: str = "127.0.0.1", title: str = "canprobe") -> Iterator[Any]:
+    """A server for browsers, stopped on leaving.
+
+    Args:
+        port: 0 lets the system choose; where it is taken, the next free one.
+        host: 0.0.0.0 for other machines too.
+        title: above the panel.
+
+    Raises:
+        UsageError: viser is not installed.
+        InterfaceError: no port can be had.
+    """
+    viser = import_viser()
+    with contextlib.redirect_stdout(io.StringIO()):  # viser greets and leaves with a box on stdout
+        try:
+            server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+        except OSError as error:
+            raise InterfaceError(f"{host}:{port}: no port to show the cell on: {error.strerror or error}") from error
+    try:
+        yield server
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):
+            server.stop()
+
+
+def import_viser() -> Any:
+    """The package, or a `UsageError` with the line that installs it."""
+    try:
+        import viser
+    except ImportError as error:
+        raise UsageError(f"the view needs viser: {PIP}") from error
+    return viser
+
+
+def address(server: Any) -> str:
+    """Where a browser finds a server."""
+    host = server.get_host()
+    return f"http://{'localhost' if host == '0.0.0.0' else host}:{server.get_port()}"
+
+
+# Beside the scene: what the task does in figures, the taxel image, plots over time.
+
+INK, FIRST, SECOND, FAINT = "#1f2933", "#c2410c", "#0f6e84", "#9aa5b1"
+HEIGHT = 130
+PIXELS = 8
+"""Of a taxel in its image."""
+
+
+class Panel:
+    """What a browser shows beside the scene.
+
+    Args:
+        server: a `viser.ViserServer`.
+        scene: that is shown.
+        errors: what the path's colours mean.
+    """
+
+    def __init__(self, server: Any, scene: Scene, errors: ErrorScale) -> None:
+        gui = server.gui
+        gui.configure_theme(control_layout="fixed", control_width="medium", show_logo=False, brand_color=(15, 110, 132))
+        gui.set_panel_label(f"canprobe · {scene.name}")
+        self._target = scene.task.force_n if scene.task.kind in ("scan", "press") else None
+        self._status = gui.add_markdown("")
+        self._plots: list[tuple[Any, tuple[str, ...]]] = []
+        self._taxels = None
+        if scene.shape is not None:
+            bar = np.broadcast_to(scale(np.linspace(0.0, 1.0, 256), 0.0, 1.0), (14, 256, 3))
+            gui.add_image(np.ascontiguousarray(bar), label=f"path: 0 … {errors.high:.2g}  {errors.text}", format="png")
+        if scene.sensor is not None:
+            blank = np.zeros((16, 16), np.uint8)
+            self._taxels = gui.add_image(taxel_image(blank, PIXELS), label="taxel image", format="png")
+            self._add_plot(gui, "force (N)", ("force", "target"), (FIRST, FAINT))
+        if scene.shape is not None:
+            names = ("true1", "true2", "low1", "high1", "low2", "high2", "kappa1", "kappa2")
+            colours = (FAINT, FAINT, FIRST, FIRST, SECOND, SECOND, FIRST, SECOND)
+            self._add_plot(gui, "κ1, κ2 with 95 % bands; grey: true (1/m)", names, colours)
+            self._add_plot(gui, "error of K; grey: stated deviation (1/m)", ("error", "sigma"), (INK, FAINT))
+
+    def _add_plot(self, gui: Any, title: str, names: tuple[str, ...], colours: tuple[str, ...]) -> None:
+        uplot = import_viser().uplot
+        series = [uplot.Series(label="t (s)")]
+        for name, colour in zip(names, colours, strict=True):
+            thin = name.startswith(("low", "high", "true")) or name in ("target", "sigma")
+            series.append(uplot.Series(label=name, stroke=colour, width=1.0 if thin else 2.0))
+        empty = tuple(np.array([0.0, 1.0]) if i == 0 else np.full(2, np.nan) for i in range(len(series)))
+        handle = gui.add_uplot(
+            empty, tuple(series), title=title, height=HEIGHT, scales=_scales(empty[0], []),
+            legend=uplot.Legend(show=False),
+        )  # fmt: skip
+        self._plots.append((handle, names))
+
+    def show(self, moment: Moment, curves: Curves | None = None) -> None:
+        """Show a moment, and curves where there are new ones."""
+        self._status.content = self._text(moment)
+        if self._taxels is not None and moment.taxels is not None:
+            self._taxels.image = taxel_image(moment.taxels, PIXELS)
+        if curves is None or len(curves["t_s"]) < 2:
+            return
+        for handle, names in self._plots:
+            columns = [self._column(curves, name) for name in names]
+            handle.scales = _scales(curves["t_s"], columns)
+            handle.data = (curves["t_s"], *columns)
+
+    def _column(self, curves: Curves, name: str) -> Any:
+        if name == "target":
+            return np.full(len(curves["t_s"]), math.nan if self._target is None else self._target)
+        return curves[name]
+
+    def _text(self, moment: Moment) -> str:
+        rows = [("time", f"{moment.t_s:.2f} s")]
+        if moment.phase is not None:
+            rows.append(("phase", moment.phase))
+        if math.isfinite(moment.force):
+            rows.append(("force", f"{moment.force:.2f} N"))
+        if moment.patch is not None:
+            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in moment.patch.kappa)
+            rows.append(("κ", f"{kappa} 1/m"))
+            if math.isfinite(moment.kappa_true[0]):
+                rows.append(("κ true", f"{moment.kappa_true[0]:.2f}, {moment.kappa_true[1]:.2f} 1/m"))
+            rows.append(("error of K", "–" if math.isnan(moment.error) else f"{moment.error:.2f} 1/m"))
+        if moment.dropped:
+            rows.append(("samples dropped", str(moment.dropped)))
+        return "| | |\n|:--|:--|\n" + "\n".join(f"| {name} | **{text}** |" for name, text in rows)
+
+
+def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:
+    """Fixed ends of the axes: uPlot finds none of its own where a value is missing (NaN)."""
+    scale_of = import_viser().uplot.Scale
+    values = np.concatenate([column[np.isfinite(column)] for column in columns]) if columns else np.empty(0)
+    low, high = np.percentile(values, (1.0, 99.0)).tolist() if len(values) else (0.0, 1.0)
+    low = min(low, 0.0)
+    spare = 0.08 * (high - low) or 1.0
+    ends = (low - spare if low < 0.0 else 0.0, high + spare)
+    span = (float(times[0]), max(float(times[-1]), float(times[0]) + 1e-3))
+    return {"x": scale_of(time=False, auto=False, range=span), "y": scale_of(auto=False, range=ends)}

@@ -1,4 +1,5 @@
-"""Where canprobe touches the world: clocks, CAN ports, canopen's network over them, recording, and vcan.
+"""Where canprobe touches the world: clocks, CAN ports, canopen's network over them, and files.
 
-The only package that imports `time`, `socket`, `threading` or `can`.
+`port` is what the cycle knows of it. Behind it stand `lockstep` and `timed`, buses in virtual time; `socketcan` with
+`mmsg`; and `interfaces` for whatever python-can drives.
 """

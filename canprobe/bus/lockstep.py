@@ -15,10 +15,10 @@ from collections.abc import Callable, Container, Sequence
 from heapq import heapify, heappop, heappush
 from typing import Protocol
 
-from canprobe.bus.clock import VirtualClock
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Frame, PortCounters, TimedFrame
+from canprobe.bus.port import ControllerState, PortCounters, TimedFrame, VirtualClock
 from canprobe.errors import BusError, InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 Recorder = Callable[[int, bytes, int], None]
 """Called with (can_id, data, t_ns)."""

@@ -17,7 +17,7 @@ import struct
 from collections.abc import Sequence
 from typing import Protocol
 
-from canprobe.bus.port import Frame
+from canprobe.protocol.frames import Frame
 
 SO_TIMESTAMPNS = 35
 SO_RXQ_OVFL = 40

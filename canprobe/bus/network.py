@@ -1,4 +1,5 @@
-"""canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own time.
+"""canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own
+time.
 
 Whoever waits for an answer pumps the port: it receives frames itself, gives canopen its own and everything else to a
 callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost no real time.
@@ -8,20 +9,143 @@ Not for the cycle: PDO objects of canopen and periodic messages are left out on 
 
 from __future__ import annotations
 
+import queue
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Never, cast
 
 import canopen
 from canopen.emcy import EmcyConsumer, EmcyError
+from canopen.lss import LssError, LssMaster
 from canopen.nmt import NmtError, NmtMaster
 from canopen.node.remote import RemoteNode
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
 
-from canprobe.bus.lss import PumpedLss
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Port, TimedFrame
+from canprobe.bus.port import Port, TimedFrame
 from canprobe.errors import UsageError
+from canprobe.protocol.frames import (
+    EFF_FLAG,
+    LSS_LENGTH,
+    LSS_REQUEST_ID,
+    NOTHING_ASKED,
+    RTR_FLAG,
+    SDO_RX_BASE,
+    SDO_TX_BASE,
+    LssCommand,
+    pack_fastscan,
+    pack_lss,
+    pack_number,
+)
+
+# canopen's LSS master, waiting by receiving: on the port's clock, whatever that is.
+#
+# canopen's own waits for a thread that puts answers into a queue, sleeps 10 ms after each question of a search and 0.2
+# s after each part of an address, and takes a second answer to one question for the answer to the next one.
+
+SETTLE_S = 0.005
+"""Several nodes may give the same answer to one question, one after another: so long the later ones are waited for."""
+
+
+class _Arrivals(queue.Queue[bytes]):
+    """Answers; whoever waits for one, receives."""
+
+    def __init__(self, network: PumpedNetwork) -> None:
+        super().__init__()
+        self._network = network
+
+    def get(self, block: bool = True, timeout: float | None = None) -> bytes:
+        self._network.pump_until(lambda: self.qsize() > 0, timeout or 0.0)
+        return super().get(block=False)
+
+
+class PumpedLss(LssMaster):
+    """LSS over a `PumpedNetwork`; RESPONSE_TIMEOUT (s) runs on the port's clock. Errors are canopen's `LssError`."""
+
+    RESPONSE_TIMEOUT = 0.5
+    SCAN_TIMEOUT = 0.05
+    """How long nobody has to answer a question of fastscan before it is taken for a no."""
+
+    def __init__(self, network: PumpedNetwork) -> None:
+        self._pumped = network
+        super().__init__()
+        self.network = network
+
+    @property
+    def responses(self) -> queue.Queue[Any]:
+        """Answers that have arrived. canopen forgets old ones by putting a new queue in their place."""
+        return self._arrivals
+
+    @responses.setter
+    def responses(self, _: Any) -> None:
+        self._arrivals = _Arrivals(self._pumped)
+
+    def on_message_received(self, can_id: int, data: bytearray, timestamp: float) -> None:
+        """Keep an answer; one of another length is none."""
+        if len(data) != LSS_LENGTH:
+            raise struct.error("an LSS message has 8 bytes")
+        self.responses.put(bytes(data))
+
+    def send_switch_state_selective(
+        self, vendorId: int, productCode: int, revisionNumber: int, serialNumber: int
+    ) -> bool:
+        """Put the node of this address into configuration; whether it answered."""
+        numbers = (vendorId, productCode, revisionNumber, serialNumber)
+        *first, last = [pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), n) for i, n in enumerate(numbers)]
+        for message in first:
+            self._pumped.send_message(LSS_REQUEST_ID, message)
+        return self._ask(last, self.RESPONSE_TIMEOUT, LssCommand.SELECTED) > 0
+
+    def inquire_node_ids(self) -> list[int]:
+        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
+        self._ask(pack_lss(LssCommand.INQUIRE_NODE_ID), self.RESPONSE_TIMEOUT, LssCommand.INQUIRE_NODE_ID)
+        return [answer[1] for answer in self._answers]
+
+    def fast_scan(self) -> tuple[bool, list[int] | None]:
+        """Find the unconfigured node with the lowest address; it is in configuration afterwards.
+
+        Returns:
+            (True, the four numbers of 1018h), or (False, None) where nobody answers.
+
+        Raises:
+            LssError: somebody answers, but to no address: answers were lost or came late.
+        """
+        for timeout_s in (self.SCAN_TIMEOUT, 5 * self.SCAN_TIMEOUT):
+            if not self._identified(0, NOTHING_ASKED, 0, 0, self.RESPONSE_TIMEOUT):
+                return False, None
+            if (numbers := self._search(timeout_s)) is not None:
+                return True, numbers
+        raise LssError("nodes without an id answer, but not to the end of a search; connect them one at a time")
+
+    def _search(self, timeout_s: float) -> list[int] | None:
+        found: list[int] = []
+        for position in range(4):
+            number = 0
+            for bit in range(31, -1, -1):
+                if not self._identified(number, bit, position, position, timeout_s):
+                    number |= 1 << bit
+            if not self._identified(number, 0, position, (position + 1) % 4, self.RESPONSE_TIMEOUT):
+                return None
+            found.append(number)
+        return found
+
+    def _identified(self, number: int, bit: int, position: int, following: int, timeout_s: float) -> bool:
+        return self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED) > 0
+
+    def _ask(self, message: bytes, timeout_s: float, answer: LssCommand) -> int:
+        """Ask, and count the answers that come; `_answers` are they."""
+        self._pumped.pump_until(lambda: True, 0.0)
+        self.responses = None
+        self._pumped.send_message(LSS_REQUEST_ID, message)
+        self._answers: Sequence[bytes] = ()
+        if self._pumped.pump_until(lambda: self.responses.qsize() > 0, timeout_s):
+            self._pumped.pump_until(lambda: False, SETTLE_S)
+            arrived = [self.responses.get_nowait() for _ in range(self.responses.qsize())]
+            self._answers = [data for data in arrived if data[0] == answer]
+        return len(self._answers)
+
+
+# canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own time.
 
 _NOT_FOR_CANOPEN = EFF_FLAG | RTR_FLAG
 _SDO_LENGTH = 8
@@ -190,3 +314,36 @@ class PumpedEmcy(EmcyConsumer):
 
         network = cast(PumpedNetwork, self._node.network)
         return new()[0] if network.pump_until(lambda: bool(new()), timeout) else None
+
+
+# Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too.
+
+UPLOAD_DEVICE_TYPE = bytes((0x40, 0x00, 0x10, 0x00, 0, 0, 0, 0))
+BURST = 8
+BURST_PAUSE_NS = 2_000_000
+
+
+def answering_nodes(port: Port, node_ids: Iterable[int], timeout_s: float) -> tuple[int, ...]:
+    """Node ids, ascending, whose SDO server answers within the time-out. Every other frame that arrives is dropped.
+
+    Args:
+        port: the bus.
+        node_ids: whom to ask, 1–127.
+        timeout_s: after the last question.
+
+    Raises:
+        InterfaceError: the interface failed.
+    """
+    asked = sorted(set(node_ids))
+    found: set[int] = set()
+    for first in range(0, len(asked), BURST):
+        port.send_batch([(SDO_RX_BASE + n, UPLOAD_DEVICE_TYPE) for n in asked[first : first + BURST]])
+        _listen(port, asked, found, port.clock.now_ns() + BURST_PAUSE_NS)
+    _listen(port, asked, found, port.clock.now_ns() + round(timeout_s * 1e9))
+    return tuple(sorted(found))
+
+
+def _listen(port: Port, asked: list[int], found: set[int], until_ns: int) -> None:
+    while len(found) < len(asked) and port.clock.now_ns() < until_ns:
+        port.wait(until_ns)
+        found.update(can_id - SDO_TX_BASE for can_id, _, _ in port.drain() if can_id - SDO_TX_BASE in asked)

@@ -1,4 +1,5 @@
-"""What the cycle sees of a CAN bus: frames out in batches, frames in with their time, and a wait.
+"""What the cycle sees of the world: clocks, and CAN ports with frames out in batches, frames in with their time, and
+a wait.
 
 A frame is `(can_id, data)`. Identifiers above 11 bits and remote requests carry the flags of Linux's `struct
 can_frame`: `EFF_FLAG` for a 29-bit identifier, `RTR_FLAG` for a remote request; plain data frames are the bare
@@ -10,28 +11,192 @@ Source: Linux include/uapi/linux/can/error.h (error classes).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+import ctypes
+import errno
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Protocol
 
-from canprobe.bus.clock import Clock
-from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.errors import InterfaceError
+from canprobe.protocol.frames import Frame
 
-__all__ = [
-    "EFF_FLAG",
-    "ERR_FLAG",
-    "RTR_FLAG",
-    "CanFilter",
-    "ControllerState",
-    "Frame",
-    "Port",
-    "PortCounters",
-    "Reports",
-    "TimedFrame",
-    "is_bus_error",
-    "state_after",
-]
+# Two kinds of time behind one interface: virtual time that jumps, and the monotonic clock of the machine.
+#
+# All times are integer nanoseconds. The cycle asks only for `now_ns` and `sleep_until_ns`; with a `VirtualClock` a
+# sleep is a jump that runs everything due on the way, so a simulated second lasts as long as its computation.
+
+_CLOCK_MONOTONIC = 1
+_TIMER_ABSTIME = 1
+
+
+class Clock(Protocol):
+    """A source of time and the only way to wait for it."""
+
+    def now_ns(self) -> int:
+        """Return the present time in ns; it never decreases."""
+        ...
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Return when the clock shows `t_ns` or later; at once if it does already."""
+        ...
+
+
+class Driver(Protocol):
+    """Something that lives in virtual time, such as a `LockstepBus`."""
+
+    def next_deadline_ns(self) -> int | None:
+        """Return when it next has something to do, `None` if it only waits for others."""
+        ...
+
+    def settle(self) -> None:
+        """Do everything due at the present instant; afterwards its next deadline lies in the future."""
+        ...
+
+    def run_until_ns(self, until_ns: int) -> None:
+        """Do everything due up to and including `until_ns`, and move the clock to each instant on the way."""
+        ...
+
+
+class VirtualClock:
+    """A clock that stands still until somebody waits, then jumps from one thing that is due to the next.
+
+    Several drivers (buses) may share one clock: they are settled at each instant in the order of their attachment.
+
+    Args:
+        start_ns: the time at which the clock starts.
+    """
+
+    __slots__ = ("_drivers", "_now_ns")
+
+    def __init__(self, start_ns: int = 0) -> None:
+        self._now_ns = start_ns
+        self._drivers: list[Driver] = []
+
+    def now_ns(self) -> int:
+        """Return the present virtual time in ns."""
+        return self._now_ns
+
+    def attach(self, driver: Driver) -> None:
+        """Let `driver` be run whenever time passes one of its deadlines."""
+        self._drivers.append(driver)
+
+    def detach(self, driver: Driver) -> None:
+        """Stop running `driver`."""
+        self._drivers.remove(driver)
+
+    def step(self, until_ns: int) -> bool:
+        """Go to the next instant at which something is due and do it, or to `until_ns` if nothing is due by then.
+
+        Returns:
+            True if something was done (call again), False if `until_ns` is reached and nothing is due any more.
+        """
+        target = until_ns + 1
+        for driver in self._drivers:
+            due = driver.next_deadline_ns()
+            if due is not None and due < target:
+                target = due
+        if target > until_ns:
+            self._now_ns = max(self._now_ns, until_ns)
+            return False
+        self._now_ns = max(self._now_ns, target)
+        for driver in self._drivers:
+            driver.settle()
+        return True
+
+    def move_ns(self, t_ns: int) -> None:
+        """Show `t_ns`, unless it is past; for a driver that runs."""
+        self._now_ns = t_ns if t_ns > self._now_ns else self._now_ns
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Run every driver up to and including `t_ns`; whoever is first runs alone until the next one is due."""
+        if len(self._drivers) == 1:
+            self._drivers[0].run_until_ns(t_ns)
+            self.move_ns(t_ns)
+            return
+        while True:
+            first, alone_ns, earliest = None, t_ns + 1, t_ns + 1
+            for driver in self._drivers:
+                due = driver.next_deadline_ns()
+                if due is None or due >= alone_ns:
+                    continue
+                if due < earliest:
+                    first, alone_ns, earliest = driver, earliest, due
+                else:
+                    alone_ns = due
+            if first is None:
+                self.move_ns(t_ns)
+                return
+            if alone_ns > earliest:
+                first.run_until_ns(alone_ns - 1)
+            else:
+                self.step(t_ns)
+
+
+class Timespec(ctypes.Structure):
+    """struct timespec of the C library."""
+
+    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
+
+
+class MonotonicClock:
+    """CLOCK_MONOTONIC, with sleeps on absolute deadlines so that periods do not drift.
+
+    Args:
+        spin_ns: the last part of each sleep, spent awake; 150 µs steadies the wake-up where a core can be spared.
+    """
+
+    __slots__ = ("_clock_nanosleep", "_request", "_spin_ns")
+
+    def __init__(self, spin_ns: int = 0) -> None:
+        self._spin_ns = spin_ns
+        self._request = Timespec()
+        self._clock_nanosleep = getattr(ctypes.CDLL(None), "clock_nanosleep", None)
+
+    def now_ns(self) -> int:
+        """Return CLOCK_MONOTONIC in ns."""
+        return time.monotonic_ns()
+
+    def sleep_until_ns(self, t_ns: int) -> None:
+        """Sleep until CLOCK_MONOTONIC shows `t_ns`; a signal handler that raises ends the sleep.
+
+        A time that is past costs a reading of the clock: the system call alone costs five in a virtual machine.
+        """
+        if time.monotonic_ns() >= t_ns:
+            return
+        self._sleep(t_ns - self._spin_ns)
+        if self._spin_ns:
+            while time.monotonic_ns() < t_ns:
+                pass
+
+    def _sleep(self, t_ns: int) -> None:
+        clock_nanosleep = self._clock_nanosleep
+        if clock_nanosleep is None:
+            time.sleep(max(0, t_ns - time.monotonic_ns()) * 1e-9)
+            return
+        request = self._request
+        request.tv_sec, request.tv_nsec = divmod(max(0, t_ns), 1_000_000_000)
+        while status := clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None):
+            if status != errno.EINTR:
+                raise OSError(status, os.strerror(status))
+
+
+def epoch_now_ns() -> int:
+    """The time of day in ns since the Unix epoch, for what leaves this machine; nothing is decided by it."""
+    return time.time_ns()
+
+
+def elapsed_ns() -> int:
+    """A running count of real nanoseconds, to measure what something costs; never to decide anything.
+
+    On a virtual clock too this is real time: the cost of a cycle is the same question in lockstep.
+    """
+    return time.perf_counter_ns()
+
+
+# What the cycle sees of a CAN bus: frames out in batches, frames in with their time, and a wait.
 
 ERR_FLAG = 0x20000000
 ERR_CONTROLLER, ERR_PROTOCOL, ERR_ACK, ERR_BUS_OFF, ERR_BUS, ERR_RESTARTED = 0x004, 0x008, 0x020, 0x040, 0x080, 0x100
@@ -186,3 +351,125 @@ class Port(Protocol):
     def close(self) -> None:
         """Give the interface back; closing twice is allowed, everything else afterwards raises InterfaceError."""
         ...
+
+
+# Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
+#
+# SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus. A bus that is lost
+# is told once; then the others go on without it, so that their nodes can be stopped in an orderly way.
+
+_SLICE_NS = 200_000
+"""How long one bus is waited for before the others are looked at again."""
+
+
+class JoinedPort:
+    """A port on several buses.
+
+    Args:
+        ports: by channel; all on one clock.
+        routes: channel of each identifier that belongs to one bus alone.
+    """
+
+    def __init__(self, ports: Mapping[str, Port], routes: Mapping[int, str]) -> None:
+        self._ports = dict(ports)
+        self._routes = {can_id: self._ports[channel] for can_id, channel in routes.items()}
+        self._arrived: list[TimedFrame] = []
+        self._lost: set[str] = set()
+
+    @property
+    def clock(self) -> Clock:
+        """The ports' clock."""
+        return next(iter(self._ports.values())).clock
+
+    @property
+    def channel(self) -> str:
+        """The channels."""
+        return "+".join(self._ports)
+
+    @property
+    def counters(self) -> PortCounters:
+        """What has passed through all of them."""
+        every = [port.counters for port in self._ports.values()]
+        return PortCounters(*(sum(getattr(one, field.name) for one in every) for field in fields(PortCounters)))
+
+    @property
+    def state(self) -> ControllerState:
+        """The worst of their controllers' states."""
+        return max(port.state for port in self._ports.values())
+
+    @property
+    def stamps_arrival(self) -> bool:
+        """Whether all of them do."""
+        return all(port.stamps_arrival for port in self._ports.values())
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send each frame on the bus of its identifier, or on all.
+
+        Raises:
+            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each bus is told
+                once, as long as there is another.
+        """
+
+        def send(port: Port) -> None:
+            mine = [frame for frame in frames if self._routes.get(frame[0], port) is port]
+            if mine:
+                port.send_batch(mine, t_ns)
+
+        self._on_each(send)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return every frame that has arrived on any bus, by time.
+
+        Raises:
+            InterfaceError: as `send_batch`; what came on the others is kept for the next call.
+        """
+        self._take()
+        frames, self._arrived = self._arrived, []
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Return as soon as a frame is there on any bus, at `until_ns` at the latest."""
+        clock = self.clock
+        self._take()
+        while not self._arrived and clock.now_ns() < until_ns:
+            for name, port in self._ports.items():
+                if name not in self._lost:
+                    port.wait(min(until_ns, clock.now_ns() + _SLICE_NS))
+                self._take()
+                if self._arrived:
+                    return
+
+    def close(self) -> None:
+        """Close all of them."""
+        for port in self._ports.values():
+            port.close()
+
+    def _take(self) -> None:
+        new: list[TimedFrame] = []
+        try:
+            self._on_each(lambda port: new.extend(port.drain()))
+        finally:
+            if new:
+                self._arrived = sorted([*self._arrived, *new], key=_time)
+
+    def _on_each(self, act: Callable[[Port], None]) -> None:
+        """Do it on every bus, then raise the first failure that is news; on lost ones too, as they may come back."""
+        news: InterfaceError | None = None
+        failed: set[str] = set()
+        for name, port in self._ports.items():
+            try:
+                act(port)
+            except InterfaceError as error:
+                failed.add(name)
+                if name not in self._lost:
+                    news = news or error
+                last = error
+        self._lost |= failed
+        if news is not None:
+            raise news
+        if failed and len(self._lost) == len(self._ports):
+            raise last
+
+
+def _time(frame: TimedFrame) -> int:
+    return frame[2]

@@ -21,23 +21,22 @@ import struct
 import time
 from collections.abc import Collection, Sequence
 
-from canprobe.bus.clock import Clock, Timespec
 from canprobe.bus.link import TX_QUEUE, emptying_line, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import (
-    EFF_FLAG,
     ERR_FLAG,
-    RTR_FLAG,
     CanFilter,
+    Clock,
     ControllerState,
-    Frame,
     PortCounters,
     Reports,
     TimedFrame,
+    Timespec,
     state_after,
 )
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 _SOL_CAN_RAW = 101
 _CAN_RAW_FILTER = 1

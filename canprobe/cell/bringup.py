@@ -17,13 +17,11 @@ from typing import Any
 from canopen import ObjectDictionary
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.probe import UPLOAD_DEVICE_TYPE
+from canprobe.bus.network import UPLOAD_DEVICE_TYPE, PumpedNetwork
 from canprobe.bus.sdo_client import SdoTimeoutError, download, hold_dialogues, read_value, upload
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
-from canprobe.protocol.emcy import NO_ERROR, describe
-from canprobe.protocol.frames import SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, pack_nmt
+from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020

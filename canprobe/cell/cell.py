@@ -8,27 +8,24 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from canprobe.bus.interrupts import Interrupts
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters, TimedFrame
+from canprobe.bus.scheduling import Interrupts
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
-from canprobe.cell.cycle import Cycle, CycleSettings
-from canprobe.cell.drives import DriveGroup, Vector
-from canprobe.cell.log import RunLog
-from canprobe.cell.measurement import Command, Controller, Measurement, TactileSample
-from canprobe.cell.notes import Notes
-from canprobe.cell.observe import Observers
+from canprobe.cell.controller import Command, Controller, Measurement, TactileSample
+from canprobe.cell.cycle import Cycle, CycleSettings, Observers
+from canprobe.cell.drives import DriveGroup, TactileReceiver, Vector
+from canprobe.cell.log import Notes, RunLog
 from canprobe.cell.supervision import Limits, Reaction, Seen
 from canprobe.cell.supervisor import Finding, Supervisor
-from canprobe.cell.tactile import TactileReceiver
 from canprobe.cell.watch import NodeWatch, obeys
 from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
 
 if TYPE_CHECKING:
-    from canprobe.cell.lift_off import LiftOff
-    from canprobe.touch.patch import Patch
+    from canprobe.cell.supervisor import LiftOff
+    from canprobe.touch.patch.image import Patch
 
 Result = TypeVar("Result")
 

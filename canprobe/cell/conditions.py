@@ -1,11 +1,13 @@
-"""The table of conditions; see `canprobe.cell.supervision` for what its columns mean."""
+"""The table of conditions; see `canprobe.cell.supervision` for what its columns mean. Also as the README prints it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-from canprobe.cell import checks
+from canprobe.cell import supervision as checks
 from canprobe.cell.supervision import Condition, Limits, Reaction
+
+# The table of conditions; see `canprobe.cell.supervision` for what its columns mean.
 
 AGAIN = "run again"
 BY_ITSELF = "by itself"
@@ -376,3 +378,22 @@ BY_KEY = {condition.key: condition for condition in CONDITIONS}
 CYCLE_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and not c.touch)
 TOUCH_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and c.touch)
 COUNTED = tuple(c for c in CONDITIONS if c.count is not None)
+
+
+# The table of conditions as docs/supervision.md has it.
+
+HEADINGS = ("what", "how it is seen", "at the latest after", "what the cell does", "afterwards")
+USUAL = Limits(period_ns=2_500_000)
+"""400 Hz, tactile frames at 200 Hz, and the other values that a scene has by default."""
+
+
+def markdown_table(limits: Limits = USUAL) -> str:
+    """The table in Markdown, its times for ``limits``."""
+    rows = [HEADINGS, ("---",) * len(HEADINGS), *(_row(condition, limits) for condition in CONDITIONS)]
+    return "".join(f"| {' | '.join(row)} |\n" for row in rows)
+
+
+def _row(condition: Condition, limits: Limits) -> tuple[str, ...]:
+    does = condition.reaction.value + (f": {condition.does}" if condition.does else "")
+    within = f"{condition.within(limits) / 1e6:g} ms" if condition.within is not None else "–"
+    return condition.what, condition.seen, within, does, condition.back

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.cell.bringup import Given, NodeSetup, Write
-from canprobe.eds import (
+from canprobe.eds.packaged import (
     FULL_SCALE,
     LONG_PDOS,
     MISSED_SYNCS,
@@ -28,10 +28,10 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.planning.wire_bits import CLASSIC_BYTES
+from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
-from canprobe.robot.puma260 import Array, PumaModel
+from canprobe.robot.kinematics import Array, PumaModel
 
 INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}

@@ -1,20 +1,107 @@
-"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else."""
+"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs → observers. It knows a port and a clock,
+nothing else.
+"""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, MutableSequence
+from collections.abc import Callable, Iterable, MutableSequence
 from dataclasses import dataclass, field
+from typing import Protocol
 
-from canprobe.bus.clock import elapsed_ns
-from canprobe.bus.port import Port, TimedFrame
-from canprobe.cell.drives import DriveGroup
-from canprobe.cell.intake import SYNCS_REMEMBERED, Intake
-from canprobe.cell.measurement import Command, Measurement
-from canprobe.cell.tactile import TactileReceiver
+from canprobe.bus.port import Port, TimedFrame, elapsed_ns
+from canprobe.cell.controller import Command, Measurement
+from canprobe.cell.drives import DriveGroup, TactileReceiver
 from canprobe.cell.watch import NodeWatch
-from canprobe.protocol.frames import NmtState, pack_heartbeat
-from canprobe.protocol.sync import SyncCounter, pack_sync
+from canprobe.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
+
+# What arrives within one cycle → Measurement. The same for a bus and for a recorded log: no clock, no port.
+
+SYNCS_REMEMBERED = 240
+"""Where the SYNC has no counter."""
+
+
+class Intake:
+    """Routes the PDOs of one cycle to the drives and the sensor, and says what they know together.
+
+    Args:
+        drives: the arm's drives; None in a scene without an arm.
+        tactile: the sensor's receiver; None in a scene without a sensor.
+        sync_overflow: of the SYNC counter (1019h); so many SYNCs are remembered.
+    """
+
+    def __init__(self, drives: DriveGroup | None, tactile: TactileReceiver | None, sync_overflow: int) -> None:
+        self.drives = drives
+        self.tactile = tactile
+        self.number = -1
+        self._feedback = drives.feedback_ids if drives is not None else frozenset()
+        self._taxels = frozenset(tactile.cob_ids) if tactile is not None else frozenset()
+        self._sync_times: deque[int] = deque(maxlen=sync_overflow)
+        self._sync_stamps: deque[int] = deque(maxlen=sync_overflow)
+
+    def begin(self, number: int, t_ns: int, sync_ns: int) -> None:
+        """A SYNC is out.
+
+        Args:
+            number: of its cycle.
+            t_ns: its deadline, ns since the first one.
+            sync_ns: when it went out, on the clock of the frames.
+        """
+        self.number = number
+        self._sync_times.append(t_ns)
+        self._sync_stamps.append(sync_ns)
+        if self.drives is not None:
+            self.drives.begin(number, sync_ns, t_ns)
+
+    def route(self, frames: list[TimedFrame]) -> list[TimedFrame]:
+        """Take the PDOs among ``frames``; the others are returned."""
+        rest: list[TimedFrame] = []
+        feedback, taxels = self._feedback, self._taxels
+        for frame in frames:
+            can_id, data, t_ns = frame
+            if can_id in feedback:
+                self.drives.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            elif can_id in taxels:
+                self.tactile.push(can_id, data, t_ns)  # type: ignore[union-attr]
+            else:
+                rest.append(frame)
+        return rest
+
+    @property
+    def complete(self) -> bool:
+        """No drive's TPDO of this cycle is outstanding."""
+        return self.drives is None or self.drives.complete
+
+    def end(self) -> None:
+        """The collection window is over: what comes now is late."""
+        if self.drives is not None:
+            self.drives.end_collect()
+
+    def measure(self, counter: int) -> Measurement:
+        """The cell at this SYNC.
+
+        Args:
+            counter: of the SYNC; 0 where it has none.
+        """
+        drives, tactile, times = self.drives, self.tactile, self._sync_times
+        sample = tactile.take(self.number, counter, times, self._sync_stamps) if tactile is not None else None
+        age = self.number - (tactile.newest_cycle or 0) if tactile is not None else None
+        if drives is None:
+            return Measurement(self.number, times[-1], enabled=True, tactile=sample, tactile_age=age)
+        return Measurement(
+            cycle=self.number,
+            t_ns=times[-1],
+            q=drives.joints() if drives.heard_all else None,
+            q_age=drives.ages(),
+            torque_permille=tuple(drives.torque_permille),
+            statuswords=tuple(drives.statuswords),
+            enabled=drives.enabled,
+            tactile=sample,
+            tactile_age=age,
+        )
+
+
+# The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else.
 
 TIMED_CYCLES = 5
 """The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending. What
@@ -185,3 +272,99 @@ class Cycle:
         if self._started_ns:
             self.statistics.response_ns.append(self._sent_ns - self._started_ns)
             self.statistics.compute_ns.append(elapsed_ns() - self._started_ns)
+
+
+# Observers of a cell: what they see of every cycle after its work is done, and why they cannot harm it.
+
+MOST_FRAMES = 100_000
+"""Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
+
+
+COSTS_KEPT = 100_000
+"""Costs that are kept: a cell may be left up for days."""
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """One cycle as an observer sees it, once its commands are on the bus.
+
+    Attributes:
+        t_ns: deadline of its SYNC on the run's clock, ns, as in `bus.log`. A time of the cycle's own, such as
+            `measurement.t_ns` or a tactile sample's, is on this clock with `t_ns - measurement.t_ns` added.
+        measurement: what the cell saw; None in an observation of frames alone, at bring-up and after the last cycle.
+        command: what the controller said; None while the drives are enabled and stopped.
+        frames: what was on the bus since the last observation, (can_id, data, t_ns).
+    """
+
+    t_ns: int
+    measurement: Measurement | None
+    command: Command | None
+    frames: list[TimedFrame]
+
+
+class Observer(Protocol):
+    """Anything with ``observe(observation)``; a plain function will do as well."""
+
+    def observe(self, observation: Observation) -> None:
+        """Take one observation, quickly: the next SYNC is waiting."""
+
+
+class Observers:
+    """Calls every observer after each cycle. One that raises is not called again; the cell goes on.
+
+    Args:
+        observers: whom to call.
+
+    Attributes:
+        origin_ns: where the run's clock is 0, on the clock of the frames.
+        cost_ns: what all of them took together, every ``TIMED_CYCLES`` cycles.
+        faults: those that failed, one line each.
+    """
+
+    def __init__(self, observers: Iterable[Observer | Callable[[Observation], None]]) -> None:
+        self.origin_ns = 0
+        self.cost_ns: deque[int] = deque(maxlen=COSTS_KEPT)
+        self.faults: list[str] = []
+        self._calls = [one.observe if hasattr(one, "observe") else one for one in observers]
+        self._frames: list[TimedFrame] = []
+
+    def tap(self, write: Callable[[int, bytes, int], None]) -> Callable[[int, bytes, int], None]:
+        """A recorder of frames that passes them on to ``write``."""
+
+        def both(can_id: int, data: bytes, t_ns: int) -> None:
+            write(can_id, data, t_ns)
+            frames = self._frames
+            if len(frames) < MOST_FRAMES:
+                frames.append((can_id, data, t_ns - self.origin_ns))
+
+        return both
+
+    def cycle(self, start_ns: int, measurement: Measurement, command: Command | None) -> None:
+        """A cycle is over.
+
+        Args:
+            start_ns: deadline of the first SYNC, on the run's clock.
+            measurement: of the cycle.
+            command: of the cycle; None without a controller.
+        """
+        timed = measurement.cycle % TIMED_CYCLES == 0
+        started_ns = elapsed_ns() if timed else 0
+        frames, self._frames = self._frames, []
+        self._call(Observation(start_ns + measurement.t_ns, measurement, command, frames))
+        if timed:
+            self.cost_ns.append(elapsed_ns() - started_ns)
+
+    def frames_alone(self, t_ns: int) -> None:
+        """Hand over what was on the bus where there is no cycle, at ``t_ns`` on the clock of the frames."""
+        frames, self._frames = self._frames, []
+        if frames:
+            self._call(Observation(t_ns - self.origin_ns, None, None, frames))
+
+    def _call(self, observation: Observation) -> None:
+        for call in tuple(self._calls):
+            try:
+                call(observation)
+            except Exception as error:  # whoever only watches must not stop the cell; the fault is in the summary
+                self._calls.remove(call)
+                name = getattr(call, "__qualname__", type(call).__name__)
+                self.faults.append(f"observer {name} failed and is not called any more: {error!r}")

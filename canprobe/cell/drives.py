@@ -1,4 +1,5 @@
-"""The six drives as one thing: TPDOs in, joint angles out; joint targets in, RPDOs out.
+"""The drives as one thing, TPDOs in and joint angles out, targets in and RPDOs out; and the sensor's frames, placed
+in time.
 
 The drives hold *motor* positions; the wrist's coupling is undone here and nowhere else.
 """
@@ -8,17 +9,99 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from math import copysign
 from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.position_track import STEADY, PositionTrack
+from canprobe.cell.controller import TactileSample
 from canprobe.errors import ProtocolError
 from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
-from canprobe.robot.puma260 import PumaModel, counts_to_joints, joints_to_counts
+from canprobe.protocol.tactile import FrameAssembler, TactileFrame
+from canprobe.robot.kinematics import PumaModel, counts_to_joints, joints_to_counts
+
+# The position of one motor as its TPDOs tell it: what it can have reached, and where it is when one is missing.
+
+STEADY = 5
+"""Equal reports after which a motor is at rest."""
+BASE_COUNTS = 8
+"""A millirad of a joint: what a report may be off by, whatever the motion."""
+CARRIED_CYCLES = 3
+"""Cycles for which a motion is carried on without a report."""
+_FORGET = 0.9
+"""Share of the largest step of the target that still counts one cycle later: a drive follows within twenty cycles."""
+
+
+class PositionTrack:
+    """Positions of one motor, counts, and its rate.
+
+    A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together, and
+    an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
+    tell of a motion that grows from nothing.
+
+    Attributes:
+        counts: the last position that was believed.
+        cycle: of that position; −1 before the first.
+        steady: reports in a row that differed by no more than ``BASE_COUNTS``.
+    """
+
+    __slots__ = ("_asked", "_last", "_rate", "_t_ns", "counts", "cycle", "steady")
+
+    def __init__(self) -> None:
+        self.counts = 0
+        self.cycle = -1
+        self.steady = 0
+        self._last = 0
+        self._t_ns = 0
+        self._rate = 0.0  # counts per ns
+        self._asked = 0.0  # counts per cycle
+
+    def aim(self, step_counts: float) -> None:
+        """The target moves on by this much in this cycle."""
+        faded = _FORGET * self._asked
+        self._asked = step_counts if step_counts > faded else faded
+
+    def take(self, counts: int, cycle: int, t_ns: int, *, guarded: bool) -> bool:
+        """Take a report.
+
+        Args:
+            counts: the position.
+            cycle: of the SYNC at which it was sampled.
+            t_ns: that SYNC's deadline.
+            guarded: the drive is enabled, so that it can only be where it can have gone.
+
+        Returns:
+            Whether it is believed.
+        """
+        self.steady = self.steady + 1 if abs(counts - self._last) <= BASE_COUNTS else 0
+        self._last = counts
+        if self.cycle >= 0:
+            step, passed_ns = counts - self.counts, t_ns - self._t_ns
+            moved: float = step
+            if guarded:
+                carried = self._rate * passed_ns
+                asked = (cycle - self.cycle) * self._asked
+                if abs(step - carried) > BASE_COUNTS + abs(carried) + asked:
+                    return False
+                moved = step if abs(step) <= asked else copysign(asked, step)
+            if passed_ns > 0:
+                self._rate = moved / passed_ns
+        self.counts, self.cycle, self._t_ns = counts, cycle, t_ns
+        return True
+
+    def position(self, cycle: int, t_ns: int) -> float:
+        """Where the motor is at a SYNC: as reported, or carried on by its rate."""
+        age = cycle - self.cycle
+        if age <= 0 or self.cycle < 0:
+            return float(self.counts)
+        passed_ns = (t_ns - self._t_ns) * min(age, CARRIED_CYCLES) / age
+        return self.counts + self._rate * passed_ns
+
+
+# The six drives as one thing: TPDOs in, joint angles out; joint targets in, RPDOs out.
 
 Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
@@ -299,3 +382,81 @@ def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[
 def _overlaid(data: bytes, part: bytes) -> bytes:
     """What two drives of one frame are told: each leaves zeros where the other's values are."""
     return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
+
+
+# The sensor as the cell sees it: whole frames, placed in time.
+
+JITTER_NS = 300_000
+"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
+LATEST_CYCLES = 4
+"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
+
+
+class TactileReceiver:
+    """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
+
+    Args:
+        assembler: puts the frames together.
+        cob_ids: of its PDOs.
+        sync_overflow: at which the SYNC counter starts again.
+
+    Attributes:
+        newest_cycle: trigger of the newest sample.
+        stale: frames dropped because they name no SYNC that they can have followed.
+    """
+
+    def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
+        self.assembler = assembler
+        self.cob_ids = tuple(cob_ids)
+        self.newest_cycle: int | None = None
+        self.stale = 0
+        self._overflow = sync_overflow
+        self._complete: list[TactileFrame] = []
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Take one tactile PDO."""
+        frame = self.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            self._complete.append(frame)
+
+    def take(
+        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
+    ) -> TactileSample | None:
+        """The frame that becomes usable in ``cycle``, or None.
+
+        Args:
+            cycle: the present cycle; its SYNC has not been answered by this frame.
+            sync_counter: counter of the present cycle's SYNC; 0 where it has none.
+            sync_times: times of the last SYNCs (ns), the present one last.
+            sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
+                SYNC before its header.
+        """
+        if not self._complete:
+            return None
+        sample, early = None, []
+        for frame in self._complete:
+            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
+            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
+                early.append(frame)
+            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
+                self.stale += 1
+            else:
+                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
+                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
+                self.newest_cycle = sample.cycle
+        self._complete = early
+        return sample
+
+    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
+        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
+        if not sync_stamps:
+            return False
+        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
+            return True
+        later = cycles_ago - LATEST_CYCLES
+        return later > 0 and sync_stamps[-later] <= frame.t_ns
+
+    def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
+        if sync_counter and frame.header.sync_counter:
+            return (sync_counter - frame.header.sync_counter) % self._overflow
+        return next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= frame.t_ns), len(sync_stamps))

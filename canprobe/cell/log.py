@@ -1,4 +1,4 @@
-"""The run's log: one row a cycle in memory, columns with units as arrays; all of them, or the last ones."""
+"""The run's log: one row a cycle in memory, columns with units as arrays; and the notes of what went wrong."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ import warnings
 from collections import deque
 from collections.abc import Iterable, MutableSequence, Sequence
 from copy import copy
-from itertools import chain
+from dataclasses import dataclass, field
+from itertools import chain, count, groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.errors import CanprobeError, NodeError
+
+# The run's log: one row a cycle in memory, columns with units as arrays; all of them, or the last ones.
+
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
 
 
-class _Kind:
+class _RowKind:
     """Rows with the same names: how their values lie in one block of float64, as the first whole row has them.
 
     Args:
@@ -71,9 +76,9 @@ class RunLog:
     """
 
     def __init__(self, kept: int | None = None) -> None:
-        self._rows: MutableSequence[tuple[_Kind, bytes | tuple[Any, ...]]]
+        self._rows: MutableSequence[tuple[_RowKind, bytes | tuple[Any, ...]]]
         self._rows = [] if kept is None else deque(maxlen=kept)
-        self._kinds: dict[tuple[str, ...], _Kind] = {}
+        self._kinds: dict[tuple[str, ...], _RowKind] = {}
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -83,7 +88,7 @@ class RunLog:
         names = tuple(row)
         kind = self._kinds.get(names)
         if kind is None:
-            kind = self._kinds[names] = _Kind(names)
+            kind = self._kinds[names] = _RowKind(names)
         self._rows.append((kind, kind.packed(row.values())))
 
     def arrays(self) -> dict[str, NDArray[np.float64]]:
@@ -91,9 +96,9 @@ class RunLog:
 
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
         """
-        packed: dict[_Kind, tuple[list[int], list[bytes]]] = {}
+        packed: dict[_RowKind, tuple[list[int], list[bytes]]] = {}
         loose: list[tuple[int, dict[str, Any]]] = []
-        kinds: dict[_Kind, None] = {}
+        kinds: dict[_RowKind, None] = {}
         for i, (kind, values) in enumerate(self._rows):
             kinds[kind] = None
             if isinstance(values, bytes):
@@ -143,3 +148,83 @@ class RunLog:
             )
             warnings.warn(told, stacklevel=3)
         return out
+
+
+# What went wrong in a run and was lived with: one line a kind, however often it happened.
+
+KINDS_KEPT = 100
+"""Kinds that are told apart; a node that says something else each time must not fill the memory."""
+OTHERS = "more of other kinds"
+
+
+@dataclass(slots=True)
+class _NoteKind:
+    """One thing that happens again and again."""
+
+    what: str
+    nodes: set[int] = field(default_factory=set)
+    times: int = 0
+    first_s: float | None = None
+    last_s: float | None = None
+
+    def __str__(self) -> str:
+        who = f"{nodes_text(self.nodes)}: " if self.nodes else ""
+        return f"{who}{self.what}" + self._how_often() + self._when()
+
+    def _how_often(self) -> str:
+        return f", {self.times} times" if self.times > 1 else ""
+
+    def _when(self) -> str:
+        if self.first_s is None or self.last_s is None:
+            return ""
+        if self.times == 1:
+            return f", at {self.first_s:.2f} s"
+        return f", first at {self.first_s:.2f} s, last at {self.last_s:.2f} s"
+
+
+class Notes:
+    """Counts what it is told by kind, in the order of the first of each. What is counted here in short stands frame by
+    frame in ``bus.log``."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[str, _NoteKind] = {}
+
+    def __len__(self) -> int:
+        """How many kinds there are."""
+        return len(self._kinds)
+
+    def add(self, what: str, *, node_id: int | None = None, t_s: float | None = None) -> None:
+        """It happened, once more.
+
+        Args:
+            what: names the kind; nothing in it may change from one time to the next.
+            node_id: the node that it happened to.
+            t_s: on the run's clock.
+        """
+        if what not in self._kinds and len(self._kinds) >= KINDS_KEPT:
+            what = OTHERS
+        kind = self._kinds.setdefault(what, _NoteKind(what))
+        kind.times += 1
+        if node_id is not None:
+            kind.nodes.add(node_id)
+        if t_s is not None:
+            kind.first_s = t_s if kind.first_s is None else kind.first_s
+            kind.last_s = t_s
+
+    def add_error(self, error: CanprobeError, then: str, t_s: float) -> None:
+        """The cell found an error, and ``then`` did something about it."""
+        reason, node_id = (error.reason, error.node_id) if isinstance(error, NodeError) else (str(error), None)
+        self.add(f"{reason}: {then}", node_id=node_id, t_s=t_s)
+
+    def lines(self) -> list[str]:
+        """A line for each kind."""
+        return [str(kind) for kind in self._kinds.values()]
+
+
+def nodes_text(node_ids: Iterable[int]) -> str:
+    """Nodes in words, neighbours joined: ``nodes 1-6, 16``."""
+    ids = sorted(node_ids)
+    steps = count()
+    runs = [list(run) for _, run in groupby(ids, key=lambda node_id: node_id - next(steps))]
+    parts = [part for run in runs for part in ([f"{run[0]}-{run[-1]}"] if len(run) > 2 else map(str, run))]
+    return f"node{'s' * (len(ids) > 1)} {', '.join(parts)}"

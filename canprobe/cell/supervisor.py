@@ -1,4 +1,4 @@
-"""Runs the table of conditions over a cell, cycle by cycle. Pure: no clock, no port, so a log can be supervised too."""
+"""Runs the table of conditions over a cell, guards its joints, and lifts the probe off where the task cannot."""
 
 from __future__ import annotations
 
@@ -9,17 +9,168 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.bus.port import ControllerState, PortCounters
 from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
-from canprobe.cell.hidden_force import HiddenForce
-from canprobe.cell.joint_guard import JointGuard
-from canprobe.cell.measurement import Command, Measurement, TactileSample
-from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Reaction, Seen, Vector
+from canprobe.cell.controller import Command, Measurement, TactileSample
+from canprobe.cell.drives import DriveGroup
+from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Limits, Reaction, Seen
 from canprobe.errors import CanprobeError
+from canprobe.robot.inverse import lifting_step
+from canprobe.robot.kinematics import PumaModel, forward_jacobian
 
 if TYPE_CHECKING:
-    from canprobe.touch.patch import Patch
+    from canprobe.touch.patch.image import Patch
+
+
+# How long the force has been more than what the array tells.
+
+
+class HiddenForce:
+    """Times an unbroken run of samples whose force is only a lower bound.
+
+    Attributes:
+        hidden_s: how long the run is, s; 0 outside one.
+    """
+
+    __slots__ = ("_since_ns", "hidden_s")
+
+    def __init__(self) -> None:
+        self.hidden_s = 0.0
+        self._since_ns: int | None = None
+
+    def add(self, hidden: bool, t_ns: int) -> None:
+        """Take one sample.
+
+        Args:
+            hidden: its force is only a lower bound, and nothing else tells the true one.
+            t_ns: when it was taken.
+        """
+        if not hidden:
+            self._since_ns, self.hidden_s = None, 0.0
+        elif self._since_ns is None:
+            self._since_ns = t_ns
+        else:
+            self.hidden_s = (t_ns - self._since_ns) * 1e-9
+
+
+# What the joints may be told, and what they can have done.
+
+Vector = NDArray[np.float64]
+MEASURED_SHARE = 1.5
+"""Measured motion above this share of the speed limit is no motion of the arm; SYNCs may be late by a period."""
+COUNTS = 2
+"""Encoder counts by which two readings may differ at rest."""
+_ROUNDING = 1e-9
+_NUMBERS = "fiu"
+"""Kinds of arrays that can be angles."""
+
+
+@dataclass(frozen=True, slots=True)
+class GuardedTarget:
+    """A joint target as it may be sent (6,), rad; or why it may not."""
+
+    q: Vector | None
+    limit: str | None = None
+
+
+def outside_workspace(tip: Vector, workspace: Vector) -> str | None:
+    """What is wrong with the tip's position (3,), m, in a box (2, 3), m; None where it is inside."""
+    below, above = tip < workspace[0], tip > workspace[1]
+    if not (below | above).any():
+        return None
+    axis = int(np.flatnonzero(below | above)[0])
+    border = workspace[int(above[axis]), axis]
+    return f"the probe's tip at {'xyz'[axis]} = {1e3 * tip[axis]:.1f} mm, workspace ends at {1e3 * border:.1f} mm"
+
+
+class JointGuard:
+    """Range, speed and workspace of the joint targets; speed of the measured joints.
+
+    Args:
+        limits: of the plan; without an arm nothing is guarded.
+
+    Attributes:
+        slowed: targets that were too far away for one cycle.
+    """
+
+    def __init__(self, limits: Limits) -> None:
+        self.slowed = 0
+        self._limits = limits
+        self._speed, self._count = _numbers(limits.joint_speed), _numbers(limits.count)
+        self._range = list(zip(_numbers(limits.joint_low), _numbers(limits.joint_high), strict=True))
+        self._target: list[float] | None = None
+        self._q: list[float] | None = None
+        self._t_ns = 0
+
+    def measure(self, measurement: Measurement) -> str | None:
+        """What a joint did since the last cycle that none can do; None where all is well or nothing new is known."""
+        if measurement.q is None or not self._speed or not self._count or any(measurement.q_age):
+            return None
+        before, self._q = self._q, measurement.q.tolist()
+        passed_s = (measurement.t_ns - self._t_ns + self._limits.period_ns) * 1e-9
+        self._t_ns = measurement.t_ns
+        if before is None:
+            return None
+        moved = [abs(q - was) for q, was in zip(self._q, before, strict=True)]
+        share = MEASURED_SHARE * passed_s
+        beyond = [
+            m - share * speed - COUNTS * count for m, speed, count in zip(moved, self._speed, self._count, strict=True)
+        ]
+        if max(beyond) <= 0.0:
+            return None
+        joint = beyond.index(max(beyond))
+        degrees = math.degrees(moved[joint])
+        return f"joint {joint + 1} reports a motion of {degrees:.1f} deg in one cycle, more than it can make"
+
+    def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
+        """The target that may be sent for ``q_target`` (6,), rad."""
+        limits = self._limits
+        if not self._range or not self._speed:
+            return GuardedTarget(q_target)
+        try:
+            given = np.asanyarray(q_target)
+        except (TypeError, ValueError):
+            given = np.array(None)
+        if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
+            return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected 6 angles, rad")
+        target = np.asarray(given, dtype=np.float64)
+        wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
+        if not all(map(math.isfinite, wanted)):
+            return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")
+        inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
+        if not all(inside):
+            joint = inside.index(False)
+            return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
+        if limits.workspace is not None and limits.T_base_tip_of is not None:
+            left = outside_workspace(limits.T_base_tip_of(target)[:3, 3], limits.workspace)
+            if left is not None:
+                return GuardedTarget(None, left)
+        return self._within_speed(q_target, wanted, measurement)
+
+    def _within_speed(self, q_target: Vector, wanted: list[float], measurement: Measurement) -> GuardedTarget:
+        last = self._target
+        if last is None and measurement.q is not None:
+            last = measurement.q.tolist()
+        if last is not None:
+            steps = [q - was for q, was in zip(wanted, last, strict=True)]
+            share = max([abs(step) / speed for step, speed in zip(steps, self._speed, strict=True)])
+            share /= self._limits.period_ns * 1e-9
+            if share > 1.0 + _ROUNDING:
+                self.slowed += 1
+                self._target = [was + step / share for was, step in zip(last, steps, strict=True)]
+                return GuardedTarget(np.array(self._target))
+        self._target = wanted
+        return GuardedTarget(q_target)
+
+
+def _numbers(values: Vector | None) -> list[float]:
+    """As plain floats: six of them are done with before numpy has begun."""
+    return [] if values is None else [float(v) for v in values]
+
+
+# Runs the table of conditions over a cell, cycle by cycle. Pure: no clock, no port, so a log can be supervised too.
 
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
 """Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
@@ -234,3 +385,135 @@ def touch_finding(contact: Contact) -> Finding | None:
         if error is not None:
             return Finding(condition, error)
     return None
+
+
+# Taking the probe off the object without its task: with the drives that still obey, a short way, back along the pole.
+#
+# A lost drive stands still, by its own quick stop or because nobody tells it anything else, and where it stands is
+# known. The others carry the tool's point away from the object on a straight line, its orientation left open. A drive
+# that tells a position it cannot have reached may be moving: then nothing is moved.
+
+WAY = 6e-3
+"""m: as far as a touch retreats, and further than the softest pad is pressed in."""
+SPEED = 20e-3
+"""m/s, the mean; it begins with twice as much, which then falls to zero."""
+ARRIVE_S = 0.02
+"""For the drives' lag at the end."""
+
+
+class WayBack:
+    """The way of the tool's point off the object, cycle by cycle: what the motors are told, of what the joints are.
+
+    Args:
+        model: the arm's geometry.
+        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        period_s: of the cycle.
+        free: motors (6,) that may turn.
+        targets: where the motors were sent last (6,), counts.
+    """
+
+    def __init__(
+        self, model: PumaModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+    ) -> None:
+        self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
+        self._free, self._targets = free, targets
+        self._away: Vector | None = None
+        self._t = 0.0
+
+    def step(self, measured: Vector) -> Vector | None:
+        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on.
+
+        Args:
+            measured: joint angles (6,), rad.
+        """
+        T, J = forward_jacobian(self._model, measured, self._flange_probe)
+        if self._away is None:
+            self._away = -T[:3, 2]
+        before, self._t = self._gone(self._t), self._t + self._period_s
+        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
+            return None
+        move = self._away * (self._gone(self._t) - before)
+        if move.any():
+            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
+            if counts is None:
+                return None
+            self._targets = self._targets + counts
+        q: Vector = self._model.joints_per_count @ self._targets
+        return q
+
+    @staticmethod
+    def cycles(period_s: float) -> int:
+        """How many there are at most."""
+        return math.ceil((WAY / SPEED + ARRIVE_S) / period_s) + 1
+
+    @staticmethod
+    def _gone(t: float) -> float:
+        """Way after ``t`` seconds, m."""
+        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)
+
+
+class LiftOff:
+    """One way back, cycle by cycle.
+
+    Args:
+        drives: the arm; those that do not obey are told to stop from now on.
+        model: the arm's geometry.
+        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
+        period_s: of the cycle.
+        obeys: whether the node of a drive does what it is told, as far as NMT and EMCY tell.
+    """
+
+    def __init__(
+        self,
+        drives: DriveGroup,
+        model: PumaModel,
+        flange_probe: Vector,
+        period_s: float,
+        obeys: Callable[[int], bool],
+    ) -> None:
+        self._drives, self._obeys = drives, obeys
+        self._free = self._obeying()
+        self._way = WayBack(model, flange_probe, period_s, self._free, drives.targets())
+        self._force_known_from: int | None = None
+        self._highest = 0.0
+
+    def _obeying(self) -> NDArray[np.bool_]:
+        """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
+        drives = self._drives
+        heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
+        return np.array([age == 0 and enabled and self._obeys(axis.node_id) for axis, age, enabled in heard])
+
+    @property
+    def possible(self) -> bool:
+        """Some drives obey, and none tells what cannot be."""
+        return bool(self._free.any()) and not self._drives.disbelieved
+
+    def begin(self) -> None:
+        """Tell the drives that do not obey to stop."""
+        axes = zip(self._drives.axes, self._free, strict=True)
+        self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
+
+    def step(self, measurement: Measurement) -> Vector | None:
+        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on."""
+        if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
+            return None
+        return self._way.step(measurement.q)
+
+    def command(self, supervisor: Supervisor) -> Command | None:
+        """What the drives are told in this cycle; None at the end, and where the force grows on the way back."""
+        measurement, force = supervisor.seen.measurement, supervisor.felt()
+        q = self.step(measurement)
+        if q is None:
+            return None
+        command, finding = supervisor.guard_target(Command(q))
+        if self._force_known_from is None:
+            self._force_known_from = measurement.cycle + supervisor.seen.limits.cycles_to_feel
+        if measurement.cycle < self._force_known_from:  # what is felt is from before the way back
+            self._highest = max(self._highest, force)
+        return None if finding is not None or supervisor.must_stop() or force > self._highest else command
+
+    def _still_obeyed(self) -> bool:
+        """A TPDO may be missing now and then; who has left operation does not come back."""
+        enabled = np.array(self._drives.enabled_ones())
+        late = np.array(self._drives.ages()) >= 3
+        return not bool((self._free & (~enabled | late)).any())

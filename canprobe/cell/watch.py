@@ -6,8 +6,17 @@ from collections import deque
 from dataclasses import dataclass
 
 from canprobe.errors import NodeError, ProtocolError
-from canprobe.protocol.emcy import NO_ERROR, Emcy, describe
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SYNC_ID, NmtState, unpack_heartbeat
+from canprobe.protocol.frames import (
+    EMCY_BASE,
+    HEARTBEAT_BASE,
+    NMT_ID,
+    NO_ERROR,
+    SYNC_ID,
+    Emcy,
+    NmtState,
+    describe,
+    unpack_heartbeat,
+)
 
 UNTOLD = 64
 """Alarms that are kept until somebody asks for the news."""

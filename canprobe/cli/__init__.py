@@ -15,8 +15,8 @@ import traceback
 from collections.abc import Sequence
 
 import canprobe
-from canprobe.bus.interrupts import Terminated
-from canprobe.cli.interrupts import termination_interrupts
+from canprobe.bus.scheduling import Terminated
+from canprobe.cli.output import termination_interrupts
 from canprobe.cli.parser import Parser, did_you_mean
 from canprobe.errors import CanprobeError
 

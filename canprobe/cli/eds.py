@@ -9,8 +9,8 @@ from canprobe.cli.output import print_json
 from canprobe.cli.parser import Commands, Parser, add_json, whole
 
 if TYPE_CHECKING:
-    from canprobe.eds.faults import Fault
     from canprobe.eds.reading import Reading
+    from canprobe.eds.sections import Fault
 
 _EXAMPLE = """\
 examples:
@@ -66,7 +66,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print the names of the files, or the path of one."""
-    from canprobe.eds import eds_names, eds_path
+    from canprobe.eds.packaged import eds_names, eds_path
 
     if args.action == "path":
         print(eds_path(args.name))
@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
 
 def run_check(args: argparse.Namespace) -> int:
     """Print what is wrong with a file; status 2 when it cannot be served."""
-    from canprobe.eds import check_eds
+    from canprobe.eds.packaged import check_eds
 
     reading = check_eds(args.file, args.node_id)
     if args.json:

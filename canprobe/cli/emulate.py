@@ -11,14 +11,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import left_by_ctrl_c
-from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_scene, node_id, node_ids, number_of_32_bits, whole
-from canprobe.cli.target import Target, add_realtime, real_target, target_of, with_realtime
+from canprobe.cli.output import left_by_ctrl_c, say
+from canprobe.cli.parser import (
+    Commands,
+    Parser,
+    Target,
+    add_bus,
+    add_realtime,
+    add_scene,
+    node_id,
+    node_ids,
+    number_of_32_bits,
+    real_target,
+    target_of,
+    whole,
+    with_realtime,
+)
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
-    from canprobe.scene import Scene
+    from canprobe.scene.model import Scene
 
 _EXAMPLE = """\
 examples:
@@ -98,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("emulate: name a SCENE, or else --eds FILE --node-id N, or --bus-yml FILE")
     serve = _scene_server(args) if args.scene is not None else _eds_server(args)
 
-    from canprobe.child import end_with_parent
+    from canprobe.session.children import end_with_parent
 
     with left_by_ctrl_c():
         if args.parent is not None:
@@ -108,7 +120,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
-    from canprobe.scene_loader import load_scene
+    from canprobe.scene.load import load_scene
 
     for option in ("node_id", "serial"):
         if getattr(args, option):
@@ -169,7 +181,7 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
 def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     """(file, node id) of each node without a scene."""
     if args.bus_yml is not None:
-        from canprobe.bridge.bus_yml import read_bus_yml
+        from canprobe.bridge.export import read_bus_yml
 
         if args.node_id or args.serial:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")

@@ -31,7 +31,7 @@ def run(args: argparse.Namespace) -> int:
     if not source.is_file():
         raise UsageError(f"{source}: no such log")
 
-    from canprobe.bus.logfile import convert_log
+    from canprobe.bus.disk import convert_log
 
     print(f"{args.to}: {convert_log(source, args.to)} frames")
     return 0

@@ -8,10 +8,9 @@ from __future__ import annotations
 import argparse
 import sys
 
-from canprobe.bus.interrupts import Terminated
+from canprobe.bus.scheduling import Terminated
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds
-from canprobe.cli.target import target_of
+from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, target_of
 
 _EXAMPLE = """\
 examples:
@@ -35,13 +34,13 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Show the cell ten times a second; with --json print it once, at the end."""
-    from canprobe.scene_loader import load_scene
+    from canprobe.scene.load import load_scene
 
     scene = load_scene(args.scene)
     target = target_of(args, scene)
 
     from canprobe import api
-    from canprobe.cell.monitor_text import lines, screen
+    from canprobe.cell.monitor import lines, screen
 
     on_terminal = sys.stdout.isatty() and not args.json
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0

@@ -1,11 +1,17 @@
-"""What commands print: JSON documents, tables, a progress bar."""
+"""What commands print: JSON documents, tables, a progress bar; and interrupts that leave a terminal in order."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import signal
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TextIO
+
+from canprobe.bus.scheduling import TERMINATIONS, Terminated, raise_terminated
+
+# What commands print: JSON documents, tables, a progress bar.
 
 Progress = Callable[[float, float], None]
 
@@ -64,3 +70,35 @@ def progress_bar(stream: TextIO | None = None, width: int = 40, unit: str = ".1f
         out.flush()
 
     return show
+
+
+# SIGTERM and SIGHUP as interrupts: every way of being told to stop takes the same safe way out.
+
+
+@contextlib.contextmanager
+def termination_interrupts() -> Iterator[None]:
+    """Within the block SIGTERM and SIGHUP raise `Terminated`; outside a main thread nothing changes."""
+    before = {number: signal.getsignal(number) for number in TERMINATIONS}
+    try:
+        for number, handler in before.items():
+            if handler != signal.SIG_IGN:  # as nohup has it
+                signal.signal(number, raise_terminated)
+    except ValueError:  # not the main thread: signals are not ours to receive
+        yield
+        return
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def left_by_ctrl_c() -> Iterator[None]:
+    """Ctrl-C is the normal way to leave the block; SIGTERM and SIGHUP go on to the caller, for status 143."""
+    try:
+        yield
+    except Terminated:
+        raise
+    except KeyboardInterrupt:
+        pass

@@ -9,13 +9,13 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from canprobe.bus.disk import whole_file
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
-from canprobe.whole_file import whole_file
 
 if TYPE_CHECKING:
-    from canprobe.planning import Plan
+    from canprobe.planning.model import Plan
 
 _EXAMPLE = """\
 files of --export:
@@ -67,7 +67,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def _draw(plan: Plan, path: Path) -> Path:
     try:
-        from canprobe.studies.plan_figure import draw_plan
+        from canprobe.results.figures import draw_plan
     except ImportError as error:
         raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
     if not path.suffix:
@@ -82,11 +82,11 @@ def _draw(plan: Plan, path: Path) -> Path:
 
 def run(args: argparse.Namespace) -> int:
     """Print the plan, or the files that were exported; a scene that does not fit raises PlanError with every reason."""
-    from canprobe.planning import make_plan, plan_text
-    from canprobe.planning.export import refused_dict
-    from canprobe.planning.open_keys import opened
-    from canprobe.scene_loader import load_scene
-    from canprobe.scene_resolve import resolve
+    from canprobe.planning.choices import opened
+    from canprobe.planning.make import make_plan
+    from canprobe.planning.report import plan_dict, plan_text, refused_dict
+    from canprobe.scene.load import load_scene
+    from canprobe.scene.resolve import resolve
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
@@ -106,7 +106,7 @@ def run(args: argparse.Namespace) -> int:
 
         files += export_plan(plan, args.out, args.export)
     if args.json:
-        print_json(plan.as_dict() | ({"files": [str(file) for file in files]} if files else {}))
+        print_json(plan_dict(plan) | ({"files": [str(file) for file in files]} if files else {}))
     elif files:
         print("\n".join(str(file) for file in files))
     else:
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _scene_beside(log: Path) -> str | None:
     """Name of the scene that ran, where the log is a run's."""
-    from canprobe.recorded import scene_of
+    from canprobe.recorded.reestimate import scene_of
 
     try:
         return scene_of(log, log if log.is_dir() else log.parent, None).name
@@ -126,7 +126,7 @@ def _scene_beside(log: Path) -> str | None:
 
 def _compare(plan: Plan, log: Path, as_json: bool) -> int:
     """Print what was measured on each bus; 3 where it is not what was planned."""
-    from canprobe.traffic_log import measure_traffic
+    from canprobe.results.summary import measure_traffic
 
     if (ran := _scene_beside(log)) not in (None, plan.scene.name):
         say(f"canprobe: {log} is a run of scene {ran}, set beside the plan of {plan.scene.name}")

@@ -44,7 +44,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Replay the log and print what the estimators say."""
-    from canprobe import recorded
+    from canprobe.recorded import reestimate as recorded
 
     if args.bridge:
         return _run_into(args)
@@ -60,8 +60,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _run_into(args: argparse.Namespace) -> int:
     """Feed the log to bridges, and print what the estimators and the bridges say."""
-    from canprobe.recorded_bridges import replay_into
-    from canprobe.results import bridge_lines
+    from canprobe.recorded.into_bridges import replay_into
+    from canprobe.results.summary import bridge_lines
 
     replayed = replay_into(args.log, args.bridge, scene=args.scene, method=args.method, say=say)
     if replayed.result is not None and args.out is not None:

@@ -17,12 +17,16 @@ from canprobe.cli.parser import (
     add_bus,
     add_force,
     add_json,
+    add_patient,
+    add_realtime,
     add_scene,
     folder_path,
     seconds,
+    target_of,
     whole,
+    with_patience,
+    with_realtime,
 )
-from canprobe.cli.target import add_patient, add_realtime, target_of, with_patience, with_realtime
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
@@ -63,11 +67,11 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
-    from canprobe.scene_loader import load_scene
+    from canprobe.scene.load import load_scene
 
     scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
     if args.tool is not None:
-        from canprobe.scene_tool import with_tool
+        from canprobe.scene.geometry import with_tool
 
         scene = with_tool(scene, args.tool)
     target = target_of(args, scene)
@@ -114,6 +118,6 @@ def run(args: argparse.Namespace) -> int:
 def _write_blf(folder: Path, *, wanted: bool) -> None:
     """The bus in the other form, where it was recorded."""
     if wanted and (folder / "bus.log").is_file():
-        from canprobe.bus.logfile import convert_log
+        from canprobe.bus.disk import convert_log
 
         convert_log(folder / "bus.log", folder / "bus.blf")

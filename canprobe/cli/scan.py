@@ -11,8 +11,17 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.output import print_json, print_table, say
-from canprobe.cli.parser import Commands, Parser, add_json, add_scene, channel, number_of_32_bits, whole, word
-from canprobe.cli.target import real_target
+from canprobe.cli.parser import (
+    Commands,
+    Parser,
+    add_json,
+    add_scene,
+    channel,
+    number_of_32_bits,
+    real_target,
+    whole,
+    word,
+)
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
@@ -88,7 +97,7 @@ def run(args: argparse.Namespace) -> int:
         return 0
     scene = None
     if args.scene is not None:
-        from canprobe.scene_loader import load_scene
+        from canprobe.scene.load import load_scene
 
         scene = load_scene(args.scene)
     done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store, say=say)

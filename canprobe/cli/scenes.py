@@ -23,7 +23,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged scene, and the folder of their files."""
-    from canprobe.scene_loader import packaged_scenes, scenes_folder
+    from canprobe.scene.load import packaged_scenes, scenes_folder
 
     scenes, folder = packaged_scenes(), scenes_folder()
     if args.json:

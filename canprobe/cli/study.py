@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from canprobe.bus.interrupts import interrupts_repeated
+from canprobe.bus.scheduling import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
 from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
 
@@ -47,7 +47,8 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run a study, print its table, write its files."""
-    from canprobe.studies.study import STUDIES, run_study
+    from canprobe.studies.harness import STUDIES
+    from canprobe.studies.sweep import run_study
 
     if args.list:
         if args.json:
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         args.complain("--seed: the runs on vcan0 hang on the machine's own time too and cannot be told again")
     if args.seed is not None:
         return _replay(args)
-    from canprobe.studies.study_files import as_document, text_of, write_study
+    from canprobe.studies.harness import as_document, text_of, write_study
     from canprobe.studies.sweep import open_sweep
 
     out = args.out or Path("runs") / f"study-{args.name}"

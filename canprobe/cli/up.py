@@ -9,14 +9,24 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from canprobe.cli.interrupts import left_by_ctrl_c
-from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bridge, add_bus, add_scene
-from canprobe.cli.target import Target, add_patient, add_realtime, target_of, with_patience, with_realtime
+from canprobe.cli.output import left_by_ctrl_c, say
+from canprobe.cli.parser import (
+    Commands,
+    Parser,
+    Target,
+    add_bridge,
+    add_bus,
+    add_patient,
+    add_realtime,
+    add_scene,
+    target_of,
+    with_patience,
+    with_realtime,
+)
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
-    from canprobe.scene import Scene
+    from canprobe.scene.model import Scene
 
 _EXAMPLE = """\
 examples:
@@ -48,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("up: --yes goes with --check-joints")
     if args.bridge and args.check_joints:
         raise UsageError("up: --check-joints feeds no --bridge")
-    from canprobe.scene_loader import load_scene
+    from canprobe.scene.load import load_scene
 
     scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
     target = target_of(args, scene)

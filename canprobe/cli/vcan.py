@@ -50,6 +50,6 @@ def run(args: argparse.Namespace) -> int:
     if not command:
         raise UsageError("vcan: COMMAND is missing; for example: canprobe vcan -- ip link show vcan0")
 
-    from canprobe.bus.vcan import run_with_vcan
+    from canprobe.vcan.launch import run_with_vcan
 
     return run_with_vcan(command, timeout_s=args.timeout, install=args.install, realtime=args.realtime)

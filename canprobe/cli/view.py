@@ -13,11 +13,9 @@ import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.interrupts import interrupts_held, interrupts_repeated
-from canprobe.cli.interrupts import left_by_ctrl_c
-from canprobe.cli.output import say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_force, seconds, whole
-from canprobe.cli.target import target_of
+from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
+from canprobe.cli.output import left_by_ctrl_c, say
+from canprobe.cli.parser import Commands, Parser, add_bus, add_force, seconds, target_of, whole
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
@@ -64,9 +62,8 @@ def run(args: argparse.Namespace) -> int:
     with contextlib.nullcontext() if args.html is not None else left_by_ctrl_c():  # a page is left, a file is not
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
-        from canprobe.bridge.view.page import write_page
+        from canprobe.bridge.view.browser import serve_run, write_page
         from canprobe.bridge.view.recorded import read_run
-        from canprobe.bridge.view.replay import serve_run
 
         recorded = read_run(folder)
         if args.html is not None:
@@ -80,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _is_scene(what: str) -> bool:
     """A packaged scene's name goes before a folder that is called like it; `./cylinder` is the folder."""
-    from canprobe.scene_loader import packaged_scenes
+    from canprobe.scene.load import packaged_scenes
 
     return not Path(what).is_dir() or what in dict(packaged_scenes())
 
@@ -90,8 +87,8 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from dataclasses import replace
 
     from canprobe import api
-    from canprobe.scene import BridgeSettings
-    from canprobe.scene_loader import load_scene
+    from canprobe.scene.load import load_scene
+    from canprobe.scene.model import BridgeSettings
 
     scene = load_scene(args.what)
     target = target_of(args, scene)
@@ -148,8 +145,8 @@ class _Browser:
 
 def _paced() -> AnyObserver:
     """An observer that lets virtual time pass no faster than the clock on the wall."""
-    from canprobe.bus.clock import MonotonicClock
-    from canprobe.cell.observe import Observation
+    from canprobe.bus.port import MonotonicClock
+    from canprobe.cell.cycle import Observation
 
     clock = MonotonicClock()
     offset_ns: int | None = None

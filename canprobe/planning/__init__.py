@@ -1,7 +1,5 @@
-"""Setup → plan: which nodes and PDOs a scene needs, whether they fit, what is left out and why."""
+"""Scene → plan: which nodes and PDOs a scene needs, whether they fit, what is left out and why.
 
-from canprobe.planning.make import make_plan
-from canprobe.planning.model import Plan, PlannedNode, PlannedPdo
-from canprobe.planning.text import plan_text
-
-__all__ = ["Plan", "PlannedNode", "PlannedPdo", "make_plan", "plan_text"]
+`make.make_plan` asks the others: `devices` what the EDS files allow, `traffic` what fits the bus, `motion` what the arm
+can do, `choices` what the scene has left open. The answer is a `model.Plan`; `report` writes it for people and tools.
+"""

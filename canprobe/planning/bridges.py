@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from canprobe.errors import UsageError
-from canprobe.scene_setup import Setup
+from canprobe.scene.setup import Setup
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ BRIDGES: Mapping[str, BridgeInfo] = {
         ("cyclonedds", "rosbags"),
         live=True,
     ),
-    "view": BridgeInfo("live 3-D view in a browser", "view.live", "view", ("viser",), live=True),
+    "view": BridgeInfo("live 3-D view in a browser", "view.browser", "view", ("viser",), live=True),
 }
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.scene import Scene
-from canprobe.scene_setup import Setup
-from canprobe.scene_values import with_choices
+from canprobe.scene.model import Scene
+from canprobe.scene.rules import with_choices
+from canprobe.scene.setup import Setup
 
 MASTER_NODE_ID = 127
 HEARTBEAT_PRODUCED_MS = 100
@@ -318,9 +318,3 @@ class Plan:
             | {base + node for base in services for node in self.node_ids}
             | {pdo.cob_id for pdo in self.pdos}
         )
-
-    def as_dict(self) -> dict[str, Any]:
-        """The plan as JSON types; COB-IDs and indices as numbers."""
-        from canprobe.planning.export import plan_dict
-
-        return plan_dict(self)

@@ -15,22 +15,171 @@ from array import array
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, lru_cache
+from struct import Struct
 
 import numpy as np
+from numpy.typing import NDArray
 
 from canprobe.errors import ProtocolError
-from canprobe.protocol.crc import CRC15
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.protocol.stuffing import (
-    COUNT_SHIFT,
-    START_OF_FRAME,
-    cut_into_words,
-    feed,
-    last_rows,
-    most_stuff_bits,
-    state_of,
-    word_rows,
-)
+
+# The three CRCs of CAN: bit by bit over integers, and tables for whole bytes where speed counts.
+#
+# Source: ISO 11898-1:2015, CRC sequence: generators of CRC-15 (classical), CRC-17 (FD, up to 16 bytes) and CRC-21 (FD,
+# more than 16 bytes). The FD registers start with their highest bit set; before 2015 (Bosch CAN FD 1.0) they began at
+# 0.
+
+
+@dataclass(frozen=True, slots=True)
+class Crc:
+    """One CRC: bits enter most significant first, nothing is reflected, nothing is added at the end.
+
+    Attributes:
+        width: bits of the register.
+        polynomial: generator without its highest power.
+        start: of the register.
+    """
+
+    width: int
+    polynomial: int
+    start: int = 0
+
+    def of(self, value: int, n_bits: int) -> int:
+        """CRC of the lowest `n_bits` of `value`, highest first."""
+        return self.add(self.start, value, n_bits)
+
+    def add(self, register: int, value: int, n_bits: int) -> int:
+        """The register after `n_bits` more."""
+        top, mask = self.width - 1, (1 << self.width) - 1
+        for place in range(n_bits - 1, -1, -1):
+            feedback = (register >> top ^ value >> place) & 1
+            register = register << 1 & mask
+            if feedback:
+                register ^= self.polynomial
+        return register
+
+    def byte_tables(self, places: int) -> tuple[tuple[int, ...], ...]:
+        """What each byte does to the register, when `places` − 1, …, 1, 0 bytes follow it: the CRC is linear."""
+        mask, shift = (1 << self.width) - 1, self.width - 8
+        last = tuple(self.add(0, byte, 8) for byte in range(256))
+        found = [last]
+        for _ in range(places - 1):
+            found.append(tuple((register << 8 & mask) ^ last[register >> shift] for register in found[-1]))
+        return tuple(reversed(found))
+
+
+CRC15 = Crc(15, 0x4599)
+CRC17 = Crc(17, 0x1685B, 1 << 16)
+CRC21 = Crc(21, 0x102899, 1 << 20)
+
+
+# Stuff bits: after five equal bits, stuff bits included, the opposite one is sent.
+#
+# A stuffing is one integer: stuff bits so far × 16 + state, the state being the last level and how often it was sent.
+
+RUN = 5
+_STATES = 10
+
+
+def _state(level: int, run: int) -> int:
+    return level * 5 + run - 1  # run 1..5: after the fifth the stuff bit has been sent at once, so 5 never stays
+
+
+def _step(state: int, bit: int) -> tuple[int, int]:
+    """State after one more bit, and the stuff bits that it caused."""
+    level, run = divmod(state, 5)
+    run = run + 2 if bit == level else 1
+    return (_state(bit, run), 0) if run < RUN else (_state(1 - bit, 1), 1)
+
+
+START_OF_FRAME = _state(0, 1)
+"""The stuffing after the first dominant bit."""
+
+
+def feed(stuffing: int, value: int, n_bits: int) -> int:
+    """The stuffing after the lowest `n_bits` of `value`, highest first."""
+    state, count = stuffing & 15, stuffing >> 4
+    for place in range(n_bits - 1, -1, -1):
+        state, stuffed = _step(state, value >> place & 1)
+        count += stuffed
+    return count << 4 | state
+
+
+COUNT_SHIFT = 6
+Rows = tuple[Sequence[int], ...]
+"""What some bits do, by what the bits before them did and by their value: stuff bits × 64 + state after them.
+
+Sums of ten such numbers and more keep their stuff bits apart from the states. The first row is that of a state alone.
+"""
+
+
+def state_of(stuffing: int) -> int:
+    """The row with which to go on after `feed`."""
+    return stuffing & 15
+
+
+@cache
+def byte_rows() -> Rows:
+    """Of 8 bits."""
+    return _aliased([array("H", row.tolist()) for row in _bits(8)])
+
+
+@cache
+def word_rows() -> Rows:
+    """Of 16 bits, highest first."""
+    first = _bits(8)
+    both = (first >> COUNT_SHIFT << COUNT_SHIFT)[:, :, None] + first[first & _STATE]
+    return _aliased([array("H", row.tobytes()) for row in both])
+
+
+@cache
+def last_rows() -> Rows:
+    """Of 15 bits that nothing follows: their stuff bits alone."""
+    first = _bits(8)
+    both = (first >> COUNT_SHIFT)[:, :, None] + (_bits(7) >> COUNT_SHIFT)[first & _STATE]
+    return _aliased([row.astype(np.uint8).tobytes() for row in both])
+
+
+_STATE = (1 << COUNT_SHIFT) - 1
+
+
+def _bits(n: int) -> NDArray[np.uint16]:
+    """By state and value."""
+    fed = np.array([[feed(state, value, n) for value in range(1 << n)] for state in range(_STATES)], np.uint16)
+    return (fed >> 4 << COUNT_SHIFT | fed & 15).astype(np.uint16)
+
+
+def _aliased(rows: Sequence[Sequence[int]]) -> Rows:
+    """Each row wherever its state is, whatever was counted before it."""
+    most = 16 // (RUN - 1)
+    return tuple(rows[min(at & _STATE, _STATES - 1)] for at in range((most << COUNT_SHIFT) + _STATES))
+
+
+@cache
+def cut_into_words(n_data: int) -> tuple[Callable[[bytes], tuple[int, ...]], tuple[Rows, ...]]:
+    """How data is cut into words, an odd byte last, and the rows of each."""
+    pairs, odd = divmod(n_data, 2)
+    return Struct(f">{pairs}H{odd}B").unpack, (word_rows(),) * pairs + (byte_rows(),) * odd
+
+
+def most_stuff_bits(pattern: str) -> int:
+    """The most stuff bits in a field that begins after a bit of the other level, over every choice of its free bits.
+
+    Args:
+        pattern: `0`, `1` and `x` for a free bit.
+    """
+    reached = {_state(1 - level, 1): 0 for level in (0, 1) if pattern[:1] in ("x", str(level))}
+    for symbol in pattern:
+        following: dict[int, int] = {}
+        for state, count in reached.items():
+            for bit in (0, 1) if symbol == "x" else (int(symbol),):
+                new, stuffed = _step(state, bit)
+                following[new] = max(following.get(new, 0), count + stuffed)
+        reached = following
+    return max(reached.values(), default=0)
+
+
+# How many bits a CAN frame takes on the wire: exact for given contents, and the best and worst that can be.
 
 ERROR_FLAG_BITS = 6
 ERROR_DELIMITER_BITS = 8

@@ -1,37 +1,443 @@
-"""Tactile frames: what they are on the wire, and their reassembly.
+"""Tactile frames: what they are on the wire, in PDO order, and their reassembly.
 
-The wire form is written down in `tactile_wire`, the rules of reassembly in `tactile_assembler`.
+Every frame begins with the same 8 bytes, little-endian:
+
+    byte 0  frame counter, +1 a frame, mod 256        byte 3     flags: bits 0..1 mode, 2 overload, 4..7 window
+    byte 1  SYNC counter of the trigger (0: none)     bytes 4..5 sample age in µs: trigger SYNC minus sample time
+    byte 2  window origin, row << 4 | column          bytes 6..7 CRC-16 over bytes 0..5 and all payload after
+
+In features mode byte 2 is the peak taxel instead: features have no window. The flags' window is the number of taxels
+along it, 0 for 8 and outside window mode; bit 3 is 0. Then follow, by mode, window: its taxels row by row, 8 to a
+payload, zeros behind the last one (of 8×8 taxels: 8 payloads, a row each); image: 32 payloads, the left then the right
+half of each of 16 rows; lowest byte = lowest column. Features: one payload, a 64-bit little-endian word from its least
+significant bit upward:
+
+    field   bits  scale         range, saturating          field   bits  scale          range, saturating
+    force   12    1/400 N       0..10.2375 N               var_rr  10    1/64 taxel²    0..15.98 taxel²
+    row     11    1/128 taxel   0..15.992                  var_rc  10    1/64 taxel²    −8..7.98 taxel² (signed)
+    col     11    1/128 taxel   0..15.992                  var_cc  10    1/64 taxel²    0..15.98 taxel²
+
+One step of the centroid is 12 µm on the pad and half a step the largest error inside the ranges.
 """
 
-from canprobe.protocol.tactile_assembler import FrameAssembler, TactileFrame
-from canprobe.protocol.tactile_wire import (
-    PDO_COUNT,
-    SIDE,
-    WINDOW,
-    WINDOWS,
-    Features,
-    TactileHeader,
-    TactileMode,
-    crc16_ccitt,
-    pack_frame,
-    pack_whole,
-    pdo_count,
-    window_words,
+from __future__ import annotations
+
+import binascii
+import math
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import ProtocolError
+
+# Tactile frames on the wire: header, contact features, checksum, payloads in PDO order.
+
+SIDE = 16  # taxels along the pad
+WINDOW = 8  # taxels along the window, where nothing else is said
+WINDOWS = (4, 6, 8, 10, 12)
+"""Taxels along the window that a sensor can be set to."""
+_FORM = struct.Struct("<BBBBHH")
+_OVERLOAD = 0x04
+_FORCE_SCALE, _CENTROID_SCALE, _MOMENT_SCALE = 400.0, 128.0, 64.0
+
+# bits, signed, scale, in the order of the wire
+_FEATURE_FIELDS = (
+    (12, False, _FORCE_SCALE),
+    (11, False, _CENTROID_SCALE),
+    (11, False, _CENTROID_SCALE),
+    (10, False, _MOMENT_SCALE),
+    (10, True, _MOMENT_SCALE),
+    (10, False, _MOMENT_SCALE),
 )
 
-__all__ = [
-    "PDO_COUNT",
-    "SIDE",
-    "WINDOW",
-    "WINDOWS",
-    "Features",
-    "FrameAssembler",
-    "TactileFrame",
-    "TactileHeader",
-    "TactileMode",
-    "crc16_ccitt",
-    "pack_frame",
-    "pack_whole",
-    "pdo_count",
-    "window_words",
-]
+
+class TactileMode(IntEnum):
+    """What the sensor sends, object 2000h."""
+
+    FEATURES = 0
+    WINDOW = 1
+    IMAGE = 2
+
+
+PDO_COUNT = {TactileMode.FEATURES: 2, TactileMode.WINDOW: 9, TactileMode.IMAGE: 33}
+"""PDOs of a frame, header included; with a window of 8×8 taxels."""
+
+
+def window_words(side: int) -> int:
+    """Payloads of 8 taxels that a window of side × side taxels fills."""
+    return -(-side * side // 8)
+
+
+def pdo_count(mode: TactileMode, window: int = WINDOW) -> int:
+    """PDOs of a frame, header included."""
+    return 1 + window_words(window) if mode is TactileMode.WINDOW else PDO_COUNT[mode]
+
+
+def crc16_ccitt(data: bytes, crc: int = 0) -> int:
+    """CRC-16 with the CCITT polynomial 1021h, initial value 0, not reflected: that of SDO block transfers.
+
+    Up to three flipped bits, and any burst of 16, are always found. Check value of b"123456789": 31C3h.
+    Source: CiA 301 (SDO block transfer); catalogued as CRC-16/XMODEM.
+    """
+    return binascii.crc_hqx(data, crc)
+
+
+@dataclass(frozen=True, slots=True)
+class TactileHeader:
+    """First payload of every tactile frame.
+
+    Attributes:
+        frame_counter: 0..255.
+        sync_counter: SYNC counter of the trigger, 1..240; 0 without a counter.
+        origin_row, origin_col: window's first taxel in the full pad; in features mode together the peak.
+        mode: what follows.
+        overload: a taxel reached full scale.
+        sample_age_us: trigger SYNC minus sample time, µs.
+        crc: over the six bytes before it and the payloads after; `pack_frame` computes it.
+        window: taxels along the window.
+    """
+
+    frame_counter: int
+    sync_counter: int
+    origin_row: int
+    origin_col: int
+    mode: TactileMode
+    overload: bool
+    sample_age_us: int
+    crc: int = 0
+    window: int = WINDOW
+
+    @property
+    def peak(self) -> int:
+        """Byte 2 as features mode reads it: the highest taxel, counts."""
+        return self.origin_row << 4 | self.origin_col
+
+    def pack(self) -> bytes:
+        """Pack into 8 bytes.
+
+        Raises:
+            ProtocolError: a field that does not fit.
+        """
+        return self._packed(self.crc)
+
+    def start(self) -> bytes:
+        """The 6 bytes before the CRC, which stand in front of what it is computed over.
+
+        Raises:
+            ProtocolError: a field that does not fit.
+        """
+        return self._packed(0)[:6]
+
+    def _packed(self, crc: int) -> bytes:
+        if not (0 <= self.origin_row < SIDE and 0 <= self.origin_col < SIDE):
+            raise ProtocolError(f"tactile header: window origin ({self.origin_row}, {self.origin_col}) is off the pad")
+        size = self.window << 4 if self.mode is TactileMode.WINDOW and self.window != WINDOW else 0
+        flags = self.mode | (_OVERLOAD if self.overload else 0) | size
+        peak = self.origin_row << 4 | self.origin_col
+        try:
+            return _FORM.pack(self.frame_counter, self.sync_counter, peak, flags, self.sample_age_us, crc)
+        except struct.error as error:
+            raise ProtocolError(f"tactile header: {error} in {self}") from None
+
+    @classmethod
+    def unpack(cls, data: bytes) -> TactileHeader:
+        """Unpack exactly 8 bytes.
+
+        Raises:
+            ProtocolError: another length, reserved flags or mode, a window that leaves the pad.
+        """
+        if len(data) != _FORM.size:
+            raise ProtocolError(f"tactile header: expected 8 bytes, got {len(data)}")
+        counter, sync, origin, flags, age, crc = _FORM.unpack(data)
+        if (read := _FLAGS.get(flags)) is None:
+            raise ProtocolError(f"tactile header: reserved flags {flags:#04x}")
+        header = cls(counter, sync, origin >> 4, origin & 0x0F, read[0], bool(flags & _OVERLOAD), age, crc, read[1])
+        _check_origin(header)
+        return header
+
+
+_FLAGS = {mode | overload: (mode, WINDOW) for mode in TactileMode for overload in (0, _OVERLOAD)} | {
+    TactileMode.WINDOW | overload | side << 4: (TactileMode.WINDOW, side)
+    for side in WINDOWS
+    if side != WINDOW
+    for overload in (0, _OVERLOAD)
+}
+"""What byte 3 can be: mode and taxels along the window."""
+
+
+_LAST_ORIGIN = {TactileMode.FEATURES: SIDE - 1, TactileMode.IMAGE: 0}
+
+
+def _check_origin(header: TactileHeader) -> None:
+    if header.window not in WINDOWS:
+        raise ProtocolError(f"tactile header: a window has {', '.join(map(str, WINDOWS))} taxels, not {header.window}")
+    limit = SIDE - header.window if header.mode is TactileMode.WINDOW else _LAST_ORIGIN[header.mode]
+    if header.origin_row > limit or header.origin_col > limit:
+        origin = (header.origin_row, header.origin_col)
+        raise ProtocolError(f"tactile header: {header.mode.name.lower()} cannot begin at taxel {origin}")
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Contact features computed by the sensor.
+
+    Attributes:
+        force_n: force over the pad, N.
+        row, col: centroid in taxels of the full pad, 0..15 (7.5 is the middle).
+        var_rr, var_rc, var_cc: central second moments, taxel².
+        peak: highest taxel, counts 0..255.
+    """
+
+    force_n: float
+    row: float
+    col: float
+    var_rr: float
+    var_rc: float
+    var_cc: float
+    peak: int = 0
+
+    def pack(self) -> bytes:
+        """The 8 bytes after the header; values beyond a range saturate at its end (module text).
+
+        Raises:
+            ProtocolError: a value that is not a number.
+        """
+        word = shift = 0
+        values = (self.force_n, self.row, self.col, self.var_rr, self.var_rc, self.var_cc)
+        for value, (bits, signed, scale) in zip(values, _FEATURE_FIELDS, strict=True):
+            if math.isnan(value):
+                raise ProtocolError(f"features: not a number in {self}")
+            lowest = -(1 << bits - 1) if signed else 0
+            code = round(min(max(value * scale, lowest), lowest + (1 << bits) - 1))
+            word |= (code & (1 << bits) - 1) << shift
+            shift += bits
+        return word.to_bytes(8, "little")
+
+    @classmethod
+    def unpack(cls, data: bytes, peak: int = 0) -> Features:
+        """Unpack exactly 8 bytes; the peak comes from the header.
+
+        Raises:
+            ProtocolError: another length.
+        """
+        if len(data) != 8:
+            raise ProtocolError(f"features: expected 8 bytes, got {len(data)}")
+        word, values = int.from_bytes(data, "little"), []
+        for bits, signed, scale in _FEATURE_FIELDS:
+            code = word & (1 << bits) - 1
+            word >>= bits
+            values.append((code - (1 << bits) if signed and code >> bits - 1 else code) / scale)
+        force_n, row, col, var_rr, var_rc, var_cc = values
+        return cls(force_n, row, col, var_rr, var_rc, var_cc, peak)
+
+
+def _payload_bytes(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
+    if isinstance(content, Features):
+        if header.mode is not TactileMode.FEATURES:
+            raise ProtocolError(f"features given to a frame of mode {header.mode.name}")
+        return content.pack()
+    side = header.window
+    if content.dtype != np.uint8 or content.shape not in ((SIDE, SIDE), (side, side)):
+        raise ProtocolError(f"taxels: expected uint8 (16, 16) or ({side}, {side}), got {content.dtype} {content.shape}")
+    if header.mode is TactileMode.WINDOW and content.shape == (SIDE, SIDE):
+        row, col = header.origin_row, header.origin_col
+        content = content[row : row + side, col : col + side]
+    if content.shape != {TactileMode.WINDOW: (side, side), TactileMode.IMAGE: (SIDE, SIDE)}.get(header.mode):
+        raise ProtocolError(f"taxels of shape {content.shape} given to a frame of mode {header.mode.name}")
+    data = content.tobytes()
+    return data + bytes(-len(data) % 8)
+
+
+def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> bytes:
+    """Pack a whole tactile frame into one string: its payloads of 8 bytes, in PDO order, with the CRC set.
+
+    Args:
+        header: its crc is ignored; in features mode its origin too (the peak of the features takes that byte).
+        content: taxels uint8, the full pad (16, 16), of which window mode sends its window, or that window; or
+            features.
+
+    Raises:
+        ProtocolError: content and mode do not match, or a field does not fit.
+    """
+    if isinstance(content, Features):
+        if not 0 <= content.peak <= 255:
+            raise ProtocolError(f"features: peak {content.peak} is not 0..255")
+        header = replace(header, origin_row=content.peak >> 4, origin_col=content.peak & 0x0F)
+    _check_origin(header)
+    body, start = _payload_bytes(header, content), header.start()
+    crc = crc16_ccitt(body, crc16_ccitt(start))
+    return start + crc.to_bytes(2, "little") + body
+
+
+def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
+    """As `pack_whole`, payload by payload."""
+    whole = pack_whole(header, content)
+    return [whole[i : i + 8] for i in range(0, len(whole), 8)]
+
+
+# Puts the PDOs of a tactile frame together again, or drops them: never half of one frame and half of another.
+
+
+@dataclass(frozen=True, slots=True)
+class TactileFrame:
+    """One complete, checked tactile frame.
+
+    Attributes:
+        header: as received.
+        taxels: uint8 (16, 16), full pad, counts; zero outside the window, all zero in features mode; read-only.
+        window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
+        features: contact features, in features mode only.
+        t_ns: arrival of the header.
+    """
+
+    header: TactileHeader
+    taxels: NDArray[np.uint8]
+    window: tuple[int, int, int, int]
+    features: Features | None
+    t_ns: int
+
+
+class FrameAssembler:
+    """Collects one sensor's PDOs; `push` returns a frame when its last PDO arrives and the CRC matches.
+
+    A frame opens at a header and takes each expected COB-ID exactly once, in any order. A new header, a duplicate or
+    the deadline before it is complete: torn, dropped.
+
+    Attributes:
+        frames: published.
+        torn: opened and dropped incomplete.
+        crc_errors: complete with a wrong CRC (corrupted, or mixed from two triggers where a header was lost).
+        duplicates: taxel PDOs that came twice, and complete frames with the counter of the frame before.
+        lost: frames of the sensor that were not published, from gaps of the frame counter (mod 256).
+        orphans: taxel PDOs without an open frame.
+        malformed: PDOs of a wrong length, headers that mean nothing, frames of another mode or window.
+    """
+
+    __slots__ = (
+        "_deadline_ns", "_last", "_missing", "_mode", "_opened_ns", "_parts", "_sizes", "_slots", "_window",
+        "crc_errors", "duplicates", "frames", "lost", "malformed", "orphans", "torn",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        cob_ids: Sequence[int],
+        mode: TactileMode,
+        deadline_ns: int,
+        sizes: Sequence[int] | None = None,
+        window: int = WINDOW,
+    ) -> None:
+        """Expect the given identifiers.
+
+        Args:
+            cob_ids: header first, then the payloads in PDO order.
+            mode: what the sensor is set to.
+            deadline_ns: longest time from header to last PDO; two cycles as a rule.
+            sizes: bytes of each PDO; 8 by default, up to 64 on CAN FD.
+            window: taxels along the window that the sensor is set to.
+
+        Raises:
+            ProtocolError: the PDOs do not add up to a frame of the mode, or an identifier is there twice.
+        """
+        self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
+        self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
+        needed = 8 * pdo_count(mode, window)
+        if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
+            raise ProtocolError(
+                f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "
+                f"got {cob_ids} with {self._sizes} bytes"
+            )
+        self._mode, self._window = mode, window
+        self._deadline_ns = deadline_ns
+        self._parts: list[bytes | None] = []
+        self._missing = 0  # 0: no frame is open
+        self._opened_ns = 0
+        self._last: int | None = None
+        self.frames = self.torn = self.crc_errors = self.duplicates = self.lost = self.orphans = self.malformed = 0
+
+    def push(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
+        """Take one received frame; identifiers of others are ignored. Never raises on bytes."""
+        slot = self._slots.get(can_id)
+        if slot is None:
+            return None
+        self.expire(t_ns)
+        if len(data) != self._sizes[slot]:
+            self.malformed += 1
+            self._tear()
+        elif slot == 0:
+            self._open(data, t_ns)
+        elif not self._missing:
+            self.orphans += 1
+        elif self._parts[slot] is not None:
+            self.duplicates += 1
+            self._tear()
+        else:
+            self._parts[slot] = data
+            self._missing -= 1
+            if not self._missing:
+                return self._close()
+        return None
+
+    def expire(self, t_ns: int) -> None:
+        """Drop the open frame if its deadline has passed."""
+        if self._missing and t_ns - self._opened_ns > self._deadline_ns:
+            self._tear()
+
+    def reset(self) -> None:
+        """Forget the open frame and the last counter (the sensor was restarted); counters stay."""
+        self._missing = 0
+        self._last = None
+
+    def _tear(self) -> None:
+        if self._missing:
+            self.torn += 1
+            self._missing = 0
+
+    def _open(self, data: bytes, t_ns: int) -> None:
+        self._tear()
+        self._parts = [None] * len(self._slots)
+        self._parts[0] = data
+        self._missing = len(self._slots) - 1
+        self._opened_ns = t_ns
+
+    def _close(self) -> TactileFrame | None:
+        start, *rest = self._parts
+        assert start is not None
+        body = b"".join(rest)  # type: ignore[arg-type]  # complete: no None is left
+        try:
+            header = TactileHeader.unpack(start)
+        except ProtocolError:
+            self.malformed += 1
+            return None
+        if crc16_ccitt(body, crc16_ccitt(start[:6])) != header.crc:
+            self.crc_errors += 1
+            return None
+        if header.mode is not self._mode or (header.mode is TactileMode.WINDOW and header.window != self._window):
+            self.malformed += 1
+            return None
+        if header.frame_counter == self._last:
+            self.duplicates += 1
+            return None
+        if self._last is not None:
+            self.lost += (header.frame_counter - self._last - 1) % 256
+        self._last = header.frame_counter
+        self.frames += 1
+        return _build(header, body, self._opened_ns)
+
+
+def _build(header: TactileHeader, body: bytes, t_ns: int) -> TactileFrame:
+    taxels = np.zeros((SIDE, SIDE), np.uint8)
+    window, features = (0, 0, 0, 0), None
+    if header.mode is TactileMode.FEATURES:
+        features = Features.unpack(body, header.peak)
+    else:
+        side = header.window if header.mode is TactileMode.WINDOW else SIDE
+        row, col = header.origin_row, header.origin_col
+        counts = np.frombuffer(body, np.uint8, side * side).reshape(side, side)
+        taxels[row : row + side, col : col + side] = counts
+        window = (row, col, side, side)
+    taxels.flags.writeable = False
+    return TactileFrame(header, taxels, window, features, t_ns)

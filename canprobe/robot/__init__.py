@@ -1,1 +1,1 @@
-"""PUMA 260: geometry, kinematics, inverse kinematics, damped inverse velocity. Pure functions."""
+"""PUMA 260: geometry, kinematics, inverse kinematics, dynamics, tool calibration. Pure functions."""

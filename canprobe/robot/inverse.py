@@ -1,4 +1,4 @@
-"""Closed-form inverse kinematics: eight branches, angles placed inside the joint ranges, singularities named.
+"""From poses and velocities of the tool to the joints: inverse kinematics in closed form, and steps by the Jacobian.
 
 Two shoulder solutions (the arm reaches forward or over its back), two elbow solutions, two wrist solutions.
 The elbow offset a3 and the forearm d4 act as one link of length hypot(a3, d4), turned by atan2(d4, a3).
@@ -8,14 +8,18 @@ Source: Paul & Zhang, "Computationally efficient kinematics for manipulators wit
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from math import atan2, ceil, cos, degrees, hypot, inf, pi, sin, sqrt
 
 import numpy as np
 import numpy.typing as npt
+from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.robot.puma260 import Array, PumaModel
+from canprobe.robot.kinematics import ELBOW_FORM, Array, PumaModel, forward
+
+# Closed-form inverse kinematics: eight branches, angles placed inside the joint ranges, singularities named.
 
 _TURN = 2 * pi
 
@@ -175,3 +179,168 @@ def singularities(model: PumaModel, q: npt.ArrayLike, *, tolerance: float = 0.05
     reach = a2 * cos(q2) + a3 * cos(q2 + q3) - d4 * sin(q2 + q3)
     measures = {"shoulder": reach / a2, "elbow": sin(q3 + atan2(d4, a3)), "wrist": sin(q5)}
     return tuple(name for name, value in measures.items() if abs(value) < tolerance)
+
+
+# Poses that put a spherical probe on a surface point, and the joint angles for them: start poses of a scene.
+
+
+def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: float, x_hint: npt.ArrayLike) -> Array:
+    """Probe frame above a surface point, pole (z) against the outward normal.
+
+    Args:
+        point: (3,) surface point, base frame, m.
+        normal: (3,) outward normal of the surface, any length.
+        centre_height_m: distance of the probe's centre from the point along the normal, m
+            (probe radius + clearance, or radius - depth).
+        x_hint: (3,) direction that the frame's x axis follows as far as the pole allows.
+
+    Returns:
+        (4, 4) T_base_probe, m.
+
+    Raises:
+        ValueError: for a hint parallel to the normal.
+    """
+    n = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
+    hint = np.asarray(x_hint, dtype=float)
+    x = hint - (hint @ n) * n
+    size = float(np.linalg.norm(x))
+    if size < 1e-9 * float(np.linalg.norm(hint)) or size == 0.0:
+        raise ValueError(f"x_hint {hint.tolist()} is parallel to the normal {n.tolist()}")
+    T_base_probe = np.eye(4)
+    T_base_probe[:3, 0] = x / size
+    T_base_probe[:3, 1] = np.cross(-n, x / size)
+    T_base_probe[:3, 2] = -n
+    T_base_probe[:3, 3] = np.asarray(point, dtype=float) + centre_height_m * n
+    return T_base_probe
+
+
+def start_posture(
+    model: PumaModel,
+    point: npt.ArrayLike,
+    normal: npt.ArrayLike,
+    *,
+    radius_m: float,
+    T_flange_probe: Array,
+    clearance_m: float = 0.0,
+    yaw_rad: float | None = None,
+    q_near: npt.ArrayLike = ELBOW_FORM,
+) -> Array:
+    """Joint angles that hold the probe over a surface point, pole against the normal, nearest to a known posture.
+
+    The turn about the normal is free: by default it is what ``q_near`` has (joint 6 moves least); with ``yaw_rad``
+    the probe's x axis points at that angle from base x, in the horizontal plane, counted about base z.
+
+    Args:
+        model: the arm.
+        point: (3,) surface point, base frame, m.
+        normal: (3,) outward normal there.
+        radius_m: probe radius, m.
+        T_flange_probe: (4, 4) probe centre in the flange frame, m.
+        clearance_m: gap between probe and surface, m; negative presses.
+        yaw_rad: optional heading of the probe's x axis, rad.
+        q_near: (6,) rad.
+
+    Returns:
+        (6,) joint angles, rad, within the limits.
+
+    Raises:
+        PlanError: when no branch reaches the pose within the limits.
+    """
+    if yaw_rad is None:
+        x_hint = (forward(model, q_near) @ T_flange_probe)[:3, 0]
+    else:
+        x_hint = np.array((math.cos(yaw_rad), math.sin(yaw_rad), 0.0))
+    T_base_probe = probe_pose(point, normal, radius_m + clearance_m, x_hint)
+    return inverse_near(model, T_base_probe @ np.linalg.inv(T_flange_probe), q_near)
+
+
+# Damped least-squares inverse of the Jacobian, damped only near singular poses.
+
+
+def damped_step(
+    J: Array,
+    twist: Array,
+    *,
+    qd_max: Array | None = None,
+    damping: float = 0.05,
+    threshold: float = 0.08,
+    length_m: float = 0.2,
+) -> Array:
+    """Joint rates for a tool twist.
+
+    Away from singular poses this is the exact inverse. Where the smallest singular value s falls below the threshold
+    the squared damping rises as ``damping^2 (1 - (s/threshold)^2)``, on all directions alike, so that rates stay
+    bounded and continuous. Rates beyond ``qd_max`` are scaled together: the direction of motion is kept.
+
+    Args:
+        J: (6, 6) geometric Jacobian, linear rows first.
+        twist: (6,) linear m/s then angular rad/s (or a displacement: the map is linear up to the limits).
+        qd_max: (6,) limits in the unit of the result; none if omitted.
+        damping: largest damping, dimensionless (linear rows are divided by ``length_m``).
+        threshold: singular value below which damping starts, dimensionless.
+        length_m: characteristic length of the arm that makes linear and angular rows comparable, m.
+
+    Returns:
+        (6,) joint rates, rad/s.
+
+    Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor).
+    """
+    scale = np.array((1 / length_m,) * 3 + (1.0,) * 3)
+    scaled = J * scale[:, None]
+    qd = _regular_step(scaled, scale * twist, threshold)
+    if qd is None:
+        U, s, Vt = np.linalg.svd(scaled)
+        ratio = float(s[-1]) / threshold
+        lambda2 = damping**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+        qd = Vt.T @ ((U.T @ (scale * twist)) * (s / (s * s + lambda2)))
+    if qd_max is not None:
+        qd = qd / max(1.0, float(np.max(np.abs(qd) / qd_max)))
+    return qd
+
+
+def _regular_step(J: Array, twist: Array, threshold: float) -> Array | None:
+    """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
+    try:
+        inverse = np.linalg.inv(J)
+    except np.linalg.LinAlgError:
+        return None
+    if float(np.vdot(inverse, inverse)) * threshold**2 >= 1.0:
+        return None
+    step: Array = inverse @ twist
+    return step
+
+
+# Moving the tool with the motors that are left: what the others would have done is shared among them.
+
+WORST_GAIN = 30.0
+"""Joint motion per motion of the tool, rad/m, beyond which the motors that are left are badly placed for it."""
+_EXACT = 1e-6
+
+
+def lifting_step(J: Array, joints_per_count: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
+    """Motor steps that move the tool's point, its orientation left open, while some motors stand still.
+
+    Of all steps the one with the least joint motion. The motors' coupling in the wrist is in it: a motor that stands
+    still is not a joint that stands still.
+
+    Args:
+        J: (3, 6) velocity of the point per joint rate, m/rad, base frame.
+        joints_per_count: (6, 6) joint angles of motor counts, rad.
+        move: (3,) of the point, m, base frame.
+        free: (6,) motors that may turn.
+
+    Returns:
+        (6,) counts; None where the free motors cannot make this move, or only by turning far.
+
+    Source: least-norm solution of an underdetermined system (Golub and Van Loan, Matrix Computations, 5.6).
+    """
+    turns = joints_per_count[:, free]
+    scale = 1.0 / np.linalg.norm(turns, axis=0)  # counts of a motor for one rad of joints
+    shares, *_ = np.linalg.lstsq(J @ turns * scale, move, rcond=None)
+    counts = np.zeros(len(free))
+    counts[free] = scale * shares
+    dq = joints_per_count @ counts
+    size = float(np.linalg.norm(move))
+    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq) > WORST_GAIN * size:
+        return None
+    return counts

@@ -18,15 +18,17 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
-from canprobe.studies.ground import FROBENIUS, Array, Ground, make_ground
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import SIGMA_COLUMNS, measuring_facts, sigma_values
+from canprobe.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
+from canprobe.studies.bound import FROBENIUS, Array, Ground, make_ground
+from canprobe.studies.harness import SIGMA_COLUMNS, Column, StudyResult, measuring_facts, sigma_values
 from canprobe.studies.sweep import Sweep
-from canprobe.touch.bound import cramer_rao
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimators import Estimator, make_estimator
-from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.estimate.fit import make_estimator
+from canprobe.touch.estimate.likelihood import cramer_rao
+from canprobe.touch.estimate.online import Estimator
+from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 
 STEP_M, FRAME_US, SHARE = 0.125e-3, 5000.0, 8
 """Path between two frames, time between them, frames between two answers of the loop."""
@@ -39,7 +41,7 @@ WAVES = 5
 Noise = tuple[float, float]
 Place = tuple[str, float]
 REFERENCE = ("chen1996", 160, 10)
-MODEL = ("touch", "studies/estimators.py", "studies/ground.py")
+MODEL = ("touch", "studies/estimators.py", "studies/bound.py")
 COLUMNS = (
     Column("surface", "surface"),
     Column("method", "method"),
@@ -103,8 +105,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
 
     def draw(path: Path) -> None:
-        from canprobe.studies.estimators_figure import draw_estimators
-
         draw_estimators(rows, path)
 
     return StudyResult("estimators", COLUMNS, rows, findings(rows), facts, draw)
@@ -234,3 +234,75 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
             f"({ml['answer_us']:.0f} µs), its error {filtered['error_percent'] / ml['error_percent']:.2f} × that of ml."
         )
     return said
+
+
+# The picture of study `estimators`.
+
+BUDGET_MS = 5.0
+
+
+def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Error over the time of a frame with an answer: a row of panels a surface, a column a noise level."""
+    surfaces = list(dict.fromkeys(r["surface"] for r in rows))
+    noises = list(dict.fromkeys((r["sigma_point_um"], r["sigma_normal_mrad"]) for r in rows))
+    title = (
+        "Error of local curvature against the time of one tactile frame with an answer\n"
+        "marker size: window of 40, 80, 160, 320 samples (5–40 mm of path); no marker: not observed\n"
+        "dotted: Cramér–Rao bound of each window, and of all 480 samples (the memory of recursive fades)"
+    )
+    with picture(path, title, 1.1 + 2.7 * len(surfaces)) as figure:
+        grid = figure.subplots(len(surfaces), len(noises), squeeze=False, sharex=True, sharey=True)
+        for surface, line in zip(surfaces, grid, strict=True):
+            of_surface = [r for r in rows if r["surface"] == surface]
+            for (point, normal), axes in zip(noises, line, strict=True):
+                _draw_panel(axes, [r for r in of_surface if r["sigma_point_um"] == point])
+                axes.set_title(f"{surface}, σ {point:.0f} µm, {normal:.1f} mrad")
+            line[0].set_ylabel("RMS error of K (%)")
+        for axes in grid[-1]:
+            axes.set_xlabel("time of a frame with an answer (ms)")
+        legend(figure)
+
+
+def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
+    ends: list[tuple[float, float, str]] = []
+    for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
+        line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]
+        x = [(r["add_us"] + r["answer_us"]) * 1e-3 for r in line]
+        y = [r["error_percent"] for r in line]
+        axes.plot(x, y, color=METHOD_COLOURS[method], alpha=0.8)
+        sizes = [12.0 * r["window_samples"] / 40 for r in line]
+        axes.scatter(x, y, s=sizes, color=METHOD_COLOURS[method], label=method, zorder=3, linewidths=0)
+        if lag is not None and x and math.isfinite(y[-1]):
+            ends.append((y[-1], x[-1], str(lag)))
+    _name_lags(axes, sorted(ends))
+    for r in rows:
+        if r["method"] == "ml":
+            _draw_bound(axes, r["bound_percent"], str(r["window_samples"]))
+    _draw_bound(axes, next(r["bound_percent"] for r in rows if r["method"] == "recursive"), "all 480")
+    axes.axvspan(BUDGET_MS, 1e3, color=SHADE, linewidth=0, zorder=0)
+    axes.axvline(BUDGET_MS, color=INK, label="budget of a tactile frame, 5 ms")
+    log_scale(axes, "xy")
+    axes.set_xlim(0.2, 200.0)
+
+
+def _name_lags(axes: Axes, ends: Sequence[tuple[float, float, str]]) -> None:
+    """A name at the end of each line; one for those that end together."""
+    together: list[list[tuple[float, float, str]]] = []
+    for end in ends:
+        if together and end[0] < 1.25 * together[-1][-1][0]:
+            together[-1].append(end)
+        else:
+            together.append([end])
+    for lines in together:
+        y = math.sqrt(lines[0][0] * lines[-1][0])
+        text = "lag " + ", ".join(sorted((lag for *_, lag in lines), key=int))
+        at = (max(x for _, x, _ in lines), y)
+        axes.annotate(text, at, textcoords="offset points", xytext=(7, -2), fontsize="small")
+
+
+def _draw_bound(axes: Axes, percent: float, text: str) -> None:
+    axes.axhline(percent, color=INK, linewidth=0.8, linestyle=":", label="Cramér–Rao bound")
+    axes.annotate(
+        text, (0.0, percent), xycoords=("axes fraction", "data"), textcoords="offset points", xytext=(3, 2),
+        fontsize="small",
+    )  # fmt: skip

@@ -1,4 +1,5 @@
-"""What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
+"""What a run of the fault campaign may not have done, and who watches it: forces, motion and power after the stop,
+the log.
 
 The force is judged where the cell presses, as it truly is in the plant and against the limit of the run's own scene
 (`limits.force_max_n`, 3 N here, 5 N by default). Two criteria hold at once, whatever the fault: it may not stay above
@@ -34,22 +35,25 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
+from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
-from canprobe.cell.limits import limits_of
 from canprobe.cell.supervision import Limits
-from canprobe.cell.tasks.probing import Phase
-from canprobe.emulator.node import SlaveNode
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.emulator.plant.plant import Plant
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.results import summarise
-from canprobe.robot.kinematics import forward_jacobian
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import ServoSettings
-from canprobe.scene_geometry import T_flange_probe
-from canprobe.session import Session
+from canprobe.protocol.frames import Frame
+from canprobe.results.summary import summarise
+from canprobe.robot.kinematics import MODELS, forward_jacobian
+from canprobe.scene.geometry import T_flange_probe
+from canprobe.scene.model import ServoSettings
+from canprobe.session.session import Session
+from canprobe.tasks.probing import Phase
 from canprobe.touch.contact import indentation_from_force
+
+# What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
 
 Vector = NDArray[np.float64]
 RELEASE_NS = 100_000_000
@@ -195,3 +199,61 @@ def score_log(session: Session, steps: int) -> list[str]:
         return [*failures, f"log: {error}"]
     frames = sum(counter.frames for counter in session.traffic.values())
     return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]
+
+
+# Who looks at the plant of a fault campaign's run, and who stands in for those that are not needed in it.
+
+LONGEST_S = 15.0
+"""Virtual time after which a run hangs: nominal runs take two seconds, every time-out in them less than ten."""
+
+
+class HangError(Exception):
+    """The run did not come to its end."""
+
+
+class Silent:
+    """In the place of a participant that is not needed."""
+
+    name = "silent"
+    next_deadline_ns: int | None = None
+    listens: frozenset[int] = frozenset()
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        """Nothing to say."""
+        return ()
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """Nothing to hear."""
+        return ()
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """Nothing to do."""
+        return ()
+
+
+class Witness(Silent):
+    """Looks at the plant every so often, also where the master sends no SYNC any more.
+
+    Args:
+        plant: of the run.
+        period_ns: between two looks.
+
+    Attributes:
+        rows: (t_ns, force in N) of each look.
+    """
+
+    name = "witness"
+
+    def __init__(self, plant: Plant, period_ns: int) -> None:
+        self.rows: list[tuple[int, float]] = []
+        self.next_deadline_ns = period_ns
+        self._plant, self._period_ns = plant, period_ns
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """Look."""
+        self.next_deadline_ns = t_ns + self._period_ns
+        self._plant.advance(t_ns)
+        self.rows.append((t_ns, float(self._plant.truth()["force"])))
+        if t_ns > LONGEST_S * 1e9:
+            raise HangError(f"not at its end after {LONGEST_S:g} s")
+        return ()

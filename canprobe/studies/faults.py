@@ -9,19 +9,445 @@ after the stop, where it does not end, where the log is not whole, or where anyt
 
 from __future__ import annotations
 
+import tempfile
+import traceback
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
+from random import Random
+from types import MappingProxyType
 from typing import Any
 
-from canprobe.emulator.faults import FaultKind
-from canprobe.studies.fault_cases import PHASES
-from canprobe.studies.fault_runs import draw_case, run_seed
-from canprobe.studies.fault_scenes import FORCE_MAX_N
-from canprobe.studies.study import Column, Say, StudyResult
-from canprobe.studies.study_files import measuring_facts
+import numpy as np
+from matplotlib.ticker import MaxNLocator
+
+from canprobe.bus.port import VirtualClock
+from canprobe.cell.assembly import limits_of
+from canprobe.cell.controller import Measurement
+from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.errors import CanprobeError, SafetyStop
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import Plan
+from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
+from canprobe.scene.load import load_scene
+from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
+from canprobe.session.session import Session
+from canprobe.studies.fault_scores import (
+    HangError,
+    Peak,
+    Silent,
+    Witness,
+    peak_of,
+    score_force,
+    score_log,
+    score_rest,
+    score_summary,
+)
+from canprobe.studies.harness import Column, Say, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.probing import Phase
+
+# The scenes of the fault campaign: each as short as it can be with all its phases, planned once in a process.
+
+FORCE_MAX_N = 3.0
+_CLEARANCE_MM = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """One kind of run.
+
+    Attributes:
+        share: of the runs.
+        scene: packaged scene that it is made of.
+        rate_hz: of SYNC and sensor.
+        duration_s: of the task itself.
+        mode: of the sensor; None where the scene has none.
+        speed_share: of the joints' speed limits, enough for the task: beyond it a drive takes a target for wrong.
+    """
+
+    share: float
+    scene: str
+    rate_hz: float
+    duration_s: float
+    mode: str | None
+    speed_share: float = 0.1
+
+
+SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
+    {
+        "listen": Scenario(0.1, "listen", 100.0, 0.2, "features"),
+        "free": Scenario(0.15, "free", 100.0, 0.3, None),
+        "press, features": Scenario(0.5, "press", 100.0, 0.1, "features"),
+        "press, window": Scenario(0.1, "press", 200.0, 0.1, "window"),
+        "cylinder": Scenario(0.15, "cylinder", 200.0, 0.2, "window", 0.35),
+    }
+)
+"""A lower rate than 400 Hz makes a run cheaper and the cell slower to react: reaction times are counted in cycles."""
+
+
+@cache
+def scenario_scene(name: str, timed: bool) -> Scene:
+    """The scene of a scenario; on a bus where frames take their time, or none at all."""
+    scenario = SCENARIOS[name]
+    scene = load_scene(scenario.scene)
+    task = replace(scene.task, duration_s=scenario.duration_s, clearance_mm=_CLEARANCE_MM)
+    scene = replace(
+        scene,
+        task=task,
+        bus=replace(scene.bus, timed=timed),
+        cycle=replace(scene.cycle, rate_hz=scenario.rate_hz),
+        limits=replace(scene.limits, force_max_n=FORCE_MAX_N, joint_speed_share=scenario.speed_share),
+    )
+    if scene.shape is not None:
+        scene = replace(scene, shape=replace(scene.shape, also=()))
+    if scene.sensor is not None:
+        scene = replace(scene, sensor=replace(scene.sensor, rate_hz=scenario.rate_hz, mode=scenario.mode))  # type: ignore[arg-type]
+    return scene
+
+
+@cache
+def scenario_plan(name: str, timed: bool) -> Plan:
+    """Its plan: the same for all seeds."""
+    return make_plan(resolve(scenario_scene(name, timed)))
+
+
+def seeded_plan(name: str, timed: bool, seed: int) -> Plan:
+    """The plan of one run."""
+    plan = scenario_plan(name, timed)
+    setup = plan.setup
+    scene = replace(setup.scene, scene=replace(setup.scene.scene, seed=seed))
+    return replace(plan, setup=replace(setup, scene=scene, seed=seed))
+
+
+# The picture of the fault campaign: what came of each kind of fault, and the true force over all runs.
+
+COLOURS = {
+    "completed": (GREEN, ""),
+    "stopped for safety": (AMBER, "//"),
+    "bus or node failure": (BLUE, "\\\\"),
+    "bring-up refused": (GREY, "xx"),
+}
+"""Colour and hatch."""
+BIN_N, FEW = 0.05, 20
+
+
+def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw to ``path``."""
+    failed = sum(bool(one["failures"]) for one in runs)
+    title = f"{len(runs)} runs with random faults of nodes and links, {failed} failed; in brackets: runs with the fault"
+    of_kind = {kind.value: [one["outcome"] for one in runs if kind.value in one["kinds"]] for kind in FaultKind}
+    found = {f"{kind} ({len(ends)})": ends for kind, ends in of_kind.items() if ends}
+    forces = [one["force_max_n"] for one in runs if one["force_bound_n"] is not None]
+    with picture(path, title, 4.6) as figure:
+        sides = parts(figure, 1, 2)
+        left, right = (part.subplots() for part in sides)
+        start = np.zeros(len(found))
+        for outcome, (colour, hatch) in COLOURS.items():
+            shares = np.array([ends.count(outcome) / len(ends) for ends in found.values()])
+            if shares.any():
+                left.barh(list(found), shares, left=start, color=colour, hatch=hatch, edgecolor="white", label=outcome)
+            start += shares
+        left.invert_yaxis()
+        left.grid(visible=False, axis="y")
+        left.set(xlabel="share of the runs with this fault", xlim=(0, 1))
+        if forces:
+            low, high = BIN_N * np.floor(min(forces) / BIN_N), max(*forces, FORCE_MAX_N) + BIN_N
+            counts, *_ = right.hist(forces, np.arange(low, high + BIN_N, BIN_N).tolist(), color=BLUE)
+            if np.max(counts) > FEW:
+                log_scale(right, "y")
+                right.set_ylim(bottom=0.8)
+            else:
+                right.yaxis.set_major_locator(MaxNLocator(integer=True))
+        right.axvline(FORCE_MAX_N, color=ORANGE, label=f"limit {FORCE_MAX_N:g} N")
+        right.set(xlabel="highest true force of a run that presses (N)", ylabel="runs")
+        for part in sides:
+            legend(part)
+
+
+def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Draw how long the master took to end, by what happened to it, to ``path``."""
+    kinds = list(dict.fromkeys(row["fault"] for row in rows))
+    with picture(path, "How long the master took to end, by what happened on vcan0", 1.6 + 0.25 * len(kinds)) as figure:
+        axes = figure.subplots()
+        for colour, mark, label, failed in ((BLUE, "o", "as it should be", False), (ORANGE, "X", "failed", True)):
+            some = [row for row in rows if bool(row["failures"]) == failed]
+            places = [kinds.index(row["fault"]) for row in some]
+            axes.plot([row["ended_s"] for row in some], places, mark, color=colour, label=label)
+        axes.set_yticks(range(len(kinds)), kinds)
+        axes.set(xlabel="from the fault to the end of the master (s)", xlim=(0, None), ylim=(len(kinds) - 0.5, -0.5))
+        legend(figure)
+
+
+# What a seed of the fault campaign stands for: a scenario, and one to three faults at random times in its phases.
+
+PHASES = ("bring-up", "approach", "scan", "retreat", "stop")
+"""`listen` knows no approach and no retreat, `free` no retreat; what it has before its motion is the enabling."""
+FILES_EVERY = 8
+"""One run in so many writes its frames down, and is scored on that."""
+SENSOR_SHARE = 0.3
+Windows = Mapping[str, tuple[int, int]]
+"""Phase → when it begins and ends in a run without faults, ns."""
+_KINDS = tuple(FaultKind)
+_BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
+"""A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; one that is corrupted here stands for
+what goes wrong behind it: in a controller's memory, a driver, a gateway."""
+_NEED_TIME = (FaultKind.BABBLE, FaultKind.DELAY, FaultKind.REORDER)
+"""Kinds whose effect is that of frames in each other's way, or of their order."""
+
+
+@dataclass(frozen=True, slots=True)
+class FaultCase:
+    """One run.
+
+    Attributes:
+        seed: of everything random in the run.
+        scenario: one of `SCENARIOS`.
+        phase: in which the first fault begins.
+        faults: what happens.
+        timed: frames take their time on the wire.
+        files: the frames are written down.
+    """
+
+    seed: int
+    scenario: str
+    phase: str
+    faults: tuple[Fault, ...]
+    timed: bool = False
+    files: bool = True
+
+
+def draw_case_within(seed: int, windows_of: Callable[[str, bool], Windows]) -> FaultCase:
+    """The case of a seed.
+
+    Args:
+        seed: which.
+        windows_of: the windows of a scenario, timed or not.
+    """
+    rng = Random(f"fault campaign {seed}")
+    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
+    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
+    known = tuple(windows_of(scenario, True))
+    phases = [rng.choice(known) for _ in range(number)]
+    kinds = [rng.choice(_KINDS) for _ in range(number)]
+    # an untimed bus configures all nodes at one instant: no fault could begin within it
+    timed = "bring-up" in phases or any(kind in _NEED_TIME for kind in kinds) or rng.random() < 0.1
+    windows = windows_of(scenario, timed)
+    nodes = scenario_plan(scenario, timed).node_ids
+    drawn = zip(kinds, phases, strict=True)
+    faults = tuple(_draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
+    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
+
+
+def _draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tuple[int, int]) -> Fault:
+    amount = rng.uniform(2e5, 2e6) if kind is FaultKind.BABBLE else 10 ** rng.uniform(5.0, 7.5)
+    return Fault(
+        kind,
+        node_id=nodes[-1] if rng.random() < SENSOR_SHARE else rng.choice(nodes),
+        start_ns=rng.randrange(*window),
+        duration_ns=int(10 ** rng.uniform(6.0, 8.7)),
+        share=rng.choice((1.0, 1.0, 0.5, 0.1)),
+        incoming=kind is FaultKind.DEAF or (kind in _BOTH_WAYS and rng.random() < 0.4),
+        amount_ns=int(amount),
+        seed=rng.randrange(2**32),
+    )
+
+
+# One run of the fault campaign: drawn from a seed, carried out in lockstep, watched by a witness, and scored.
+
+AFTER_S = 0.3
+"""Time after the end of the run, and of its last fault, for which nothing may move."""
+SETTLED_S = 0.1
+"""Time after which everything must be at rest."""
+LOOK_NS = 5_000_000
+BRING_UP_NS = 100_000_000
+"""Before the first SYNC: reset, configuration and start; before that the master only listens."""
+STOP_NS = 20_000_000
+"""Faults may begin for so long after the end too: on an untimed bus the nodes are let go at once."""
+
+
+@cache
+def phase_windows(scenario: str, timed: bool) -> Windows:
+    """When each phase that a scenario has begins and ends in a run without faults, ns."""
+    run = _Run(FaultCase(0, scenario, "", (), timed, files=False)).result(None)
+    first, begun, end = run["first_sync_ns"], run["begun"], run["end_ns"]
+    task = begun.get(Phase.SETTLE, begun[Phase.SCAN])
+    marks: dict[str, int | None] = {
+        "bring-up": first - BRING_UP_NS,
+        "approach": first if task - first > 2 * run["period_ns"] else None,
+        "scan": task,
+        "retreat": begun.get(Phase.RETREAT),
+        "stop": begun[Phase.DONE],
+    }
+    there = [(name, t_ns) for name in PHASES if (t_ns := marks[name]) is not None]
+    ends = [t_ns for _, t_ns in there[1:]] + [end + STOP_NS]
+    return {name: (t_ns, end_ns) for (name, t_ns), end_ns in zip(there, ends, strict=True)}
+
+
+@cache
+def peak(scenario: str) -> Peak | None:
+    """What the probe of a scenario can reach until the cell reacts; None where nothing presses."""
+    run = _Run(FaultCase(0, scenario, "", (), timed=False, files=False))
+    run.result(None)
+    return peak_of(run.session)
+
+
+def draw_case(seed: int) -> FaultCase:
+    """The case of a seed."""
+    return draw_case_within(seed, phase_windows)
+
+
+def run_seed(seed: int) -> dict[str, Any]:
+    """Draw, carry out and score the case of a seed."""
+    case = draw_case(seed)
+    run = carry_out(case)
+    return {
+        "seed": seed,
+        "scenario": case.scenario,
+        "timed": case.timed,
+        "phase": case.phase,
+        "kinds": sorted({fault.kind.value for fault in case.faults}),
+        "faults": [str(fault) for fault in case.faults],
+        "hits": run["hits"],
+        "outcome": run["outcome"],
+        "reason": run["reason"],
+        "force_max_n": run["force_max_n"],
+        "force_bound_n": run["force_bound_n"],
+        "above_ms": run["above_ns"] * 1e-6,
+        "moved_rad": run["moved_rad"],
+        "end_s": run["end_ns"] * 1e-9,
+        "failures": run["failures"],
+    }
+
+
+def carry_out(case: FaultCase) -> dict[str, Any]:
+    """Run a case to its end and a while beyond it; what came of it, with every failure in words."""
+    reach = peak(case.scenario)
+    wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
+    bound = reach.force(len(case.faults), wrong) if reach is not None else None
+    if not case.files:
+        return _Run(case).result(bound)
+    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
+        return _Run(case, Path(folder)).result(bound)
+
+
+class _Run:
+    """One case being carried out."""
+
+    def __init__(self, case: FaultCase, folder: Path | None = None) -> None:
+        self.case = case
+        self.plan = seeded_plan(case.scenario, case.timed, case.seed)
+        self.session = Session(self.plan, folder)
+        self.session.joins = self._join
+        self.task = make_task(self.plan)
+        self.limits = limits_of(self.plan)
+        self.emulated: list[SlaveNode] = []
+        self.nodes: list[FaultyNode] = []
+        self.witness: Witness | None = None
+        self.failures: list[str] = []
+        self.steps = self.stepped_ns = 0
+        self.begun: dict[Phase, int] = {}
+
+    def _join(self, participant: Any) -> Any:
+        if not hasattr(participant, "node_id"):
+            return Silent()  # the witness sees what the recorder of the truth would, and more
+        self.emulated.append(participant)
+        if self.witness is None:
+            self._watch()
+        if all(fault.node_id != participant.node_id for fault in self.case.faults):
+            return participant
+        sensor = self.session.scene.sensor
+        ids: Sequence[int] = ()
+        if sensor is not None and participant.node_id == sensor.node_id:
+            ids = [pdo.cob_id for pdo in self.plan.pdos_of(sensor.node_id, "tpdo")]
+        node = FaultyNode(participant, self.case.faults, ids)
+        self.nodes.append(node)
+        return node
+
+    def _watch(self) -> None:
+        session = self.session
+        assert session.world is not None and session.lockstep is not None
+        self.witness = Witness(session.world.plant, LOOK_NS)
+        session.lockstep.attach(self.witness)
+        if session.out is None:
+            session.lockstep.recorder = None  # nothing is counted that nobody looks at
+
+    def result(self, bound_n: float | None) -> dict[str, Any]:
+        """Carry it out; without a bound (N) the force is not scored."""
+        outcome, reason = self._drive()
+        session = self.session
+        assert session.world is not None and session.lockstep is not None and self.witness is not None
+        clock = session.lockstep.clock
+        end_ns = clock.now_ns()
+        session.lockstep.recorder = None  # the log is closed
+        self.failures += score_log(session, self.steps) + score_summary(session, self.task, reason)
+        moved = self._rest(clock, end_ns) if outcome != "hang" else 0.0
+        force_max, above_ns, failures = score_force(self.witness.rows, self.limits, bound_n)
+        self.failures += failures
+        return {
+            "outcome": outcome,
+            "reason": reason,
+            "hits": sum(node.hits for node in self.nodes),
+            "force_max_n": force_max,
+            "force_bound_n": bound_n,
+            "above_ns": above_ns,
+            "moved_rad": moved,
+            "end_ns": end_ns,
+            "failures": self.failures,
+            "period_ns": self.limits.period_ns,
+            "begun": self.begun,
+            "first_sync_ns": session.cell.cycle.t_first_ns if session.opened and session.cell.cycle else None,
+        }
+
+    def _drive(self) -> tuple[str, str]:
+        try:
+            with self.session:
+                self.session.run(self.task, progress=self._count)
+        except SafetyStop as stop:
+            return "stopped for safety", str(stop)
+        except CanprobeError as error:
+            return ("bus or node failure" if self.session.opened else "bring-up refused"), str(error)
+        except HangError as hang:
+            self.failures.append(f"hang: {hang}")
+            return "hang", str(hang)
+        except Exception as error:  # whatever else it is, it is a failure of ours, and the campaign goes on
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self.failures.append(f"crash: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})")
+            return "crash", str(error)
+        self.begun.setdefault(Phase.DONE, self.stepped_ns)
+        return "completed", ""
+
+    def _count(self, _: Measurement) -> None:
+        assert self.session.lockstep is not None
+        self.steps += 1
+        self.stepped_ns = self.session.lockstep.clock.now_ns()
+        self.begun.setdefault(getattr(self.task, "phase", Phase.SCAN), self.stepped_ns)
+
+    def _rest(self, clock: VirtualClock, end_ns: int) -> float:
+        """Let time go on without a master; how far a joint moves once everything must be at rest (rad)."""
+        assert self.session.world is not None
+        if self.session.scene.arm is None:
+            return 0.0
+        plant = self.session.world.plant
+        over_ns = max(end_ns, *(fault.end_ns for fault in self.case.faults), 0)
+        try:
+            clock.sleep_until_ns(end_ns + int(SETTLED_S * 1e9))
+            before = np.array(plant.truth()["q"])
+            clock.sleep_until_ns(over_ns + int(AFTER_S * 1e9))
+        except CanprobeError as error:
+            self.failures.append(f"crash after the end: {error}")
+            return 0.0
+        moved = float(np.abs(plant.truth()["q"] - before).max())
+        self.failures += score_rest(moved, self.emulated)
+        return moved
+
+
+# Study `faults`: ten thousand short touches in lockstep, each with faults drawn from its seed, each scored.
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 8, 20
 OUTCOMES = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
@@ -125,6 +551,4 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
 
 
 def _draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
-    from canprobe.studies.faults_figure import draw_faults
-
     draw_faults(runs, path)

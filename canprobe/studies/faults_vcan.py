@@ -7,17 +7,289 @@ their own, which outlives the master: they must stop by themselves. Nodes whose 
 
 from __future__ import annotations
 
+import json
+import os
+import signal
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import cache
 from pathlib import Path
 from random import Random
 from typing import Any
 
+from canprobe.bus.disk import read_candump
+from canprobe.bus.interfaces import open_port
+from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.port import MonotonicClock, Port
+from canprobe.bus.sdo_client import hold_dialogues, upload
 from canprobe.bus.socketcan import check_interface
-from canprobe.studies.fault_processes import CHANNEL, HOLD_S, PATIENCE, ProcessCase, ProcessFault, carry_out
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.errors import CanprobeError
+from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
+from canprobe.scene.load import dump_scene
+from canprobe.scene.model import Scene
+from canprobe.session.children import EmulatorChild
+from canprobe.session.session import resolve_scene
+from canprobe.studies.faults import scenario_scene
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
+
+# One run of the fault campaign on a real vcan0: master and emulated nodes are processes, and one of them is killed.
+
+CHANNEL = "vcan0"
+SCENARIO, HOLD_S = "press, features", 3.0
+PATIENCE = {"missed_syncs": 20, "late_cycles_max_percent": 100}
+"""Of drives and master: a guest stands still for tens of milliseconds, which is no fault of the cell."""
+PATIENCE_S = 60.0
+REACTION_S = 2.0
+"""After the fault, until drives that are left alone must have stopped; theirs are 0.2 s, the rest is the guest's."""
+STALL_S = 1.0
+APART_S = 0.3
+"""Between two looks at the positions."""
+MOST_COUNTS = 8
+_TPDO1 = 0x181
+
+
+class ProcessFault(Enum):
+    """What happens."""
+
+    MASTER_KILLED = "master killed"
+    MASTER_STALLED = "master stalled"
+    NODES_KILLED = "nodes killed"
+    LINK_DOWN = "link down"
+    LINK_DOWN_UP = "link down and up"
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessCase:
+    """One run.
+
+    Attributes:
+        seed: names it.
+        fault: what happens.
+        after_s: since the drives were enabled.
+    """
+
+    seed: int
+    fault: ProcessFault
+    after_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessRun:
+    """What came of it.
+
+    Attributes:
+        status: of the master, None where it had to be killed.
+        ended_s: from the fault to its end.
+        drives: how the drives were found afterwards.
+        failures: in words.
+    """
+
+    status: int | None
+    ended_s: float
+    drives: str
+    failures: tuple[str, ...]
+
+
+@cache
+def served_scene() -> Scene:
+    """A press whose nodes are a process of their own, which outlives the master."""
+    scene = resolve_scene(scenario_scene(SCENARIO, True), interface="socketcan", channel=CHANNEL, duration_s=HOLD_S)
+    assert scene.arm is not None
+    limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
+    return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)
+
+
+def carry_out(case: ProcessCase, folder: Path) -> ProcessRun:
+    """Bring the cell up, let the fault happen, and look at what is left."""
+    scene = served_scene()
+    child = EmulatorChild(scene, None, CHANNEL)
+    run = _Run(case, child, folder)
+    try:
+        return run.result(scene)
+    finally:
+        link("up")
+        run.close()
+        child.end()
+
+
+class _Run:
+    """One case being carried out."""
+
+    def __init__(self, case: ProcessCase, child: EmulatorChild, folder: Path) -> None:
+        self.case, self.child, self.folder = case, child, folder
+        self.clock = MonotonicClock()
+        self.master: subprocess.Popen[bytes] | None = None
+        self.failures: list[str] = []
+
+    def result(self, scene: Scene) -> ProcessRun:
+        port = self._open()
+        try:
+            self.child.start()
+            self.child.await_boot_ups(port)
+            self.master = self._start_master(scene)
+            if not self._await_enabled(port):
+                return ProcessRun(self.master.poll(), 0.0, "", ("the drives were never enabled",))
+            self._sleep(self.case.after_s)
+        finally:
+            port.close()
+        fault_ns = self.clock.now_ns()
+        self._let_happen()
+        status = self._await_end()
+        ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
+        self._sleep(REACTION_S - ended_s)
+        link("up")
+        drives = self._look()
+        self._score(status)
+        return ProcessRun(status, ended_s, drives, tuple(self.failures))
+
+    def close(self) -> None:
+        """Leave no master behind."""
+        if self.master is not None and self.master.poll() is None:
+            self.master.kill()
+            self.master.wait()
+
+    def _open(self) -> Port:
+        return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
+
+    def _sleep(self, seconds: float) -> None:
+        self.clock.sleep_until_ns(self.clock.now_ns() + max(0, round(seconds * 1e9)))
+
+    def _start_master(self, scene: Scene) -> subprocess.Popen[bytes]:
+        assert scene.arm is not None and scene.sensor is not None
+        real = replace(
+            scene,
+            scene=replace(scene.scene, figures=False),
+            arm=replace(scene.arm, emulated=False),
+            sensor=replace(scene.sensor, emulated=False),
+        )
+        path = self.folder / "scene.toml"
+        path.write_text(dump_scene(real), encoding="utf-8")
+        command = [sys.executable, "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
+        with (self.folder / "stderr").open("wb") as errors:
+            return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors)
+
+    def _await_enabled(self, port: Port) -> bool:
+        """Until the first drive tells that operation is enabled."""
+        assert self.master is not None
+        deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
+        while self.clock.now_ns() < deadline_ns and self.master.poll() is None:
+            port.wait(self.clock.now_ns() + 50_000_000)
+            for can_id, data, _ in port.drain():
+                word = int.from_bytes(data[:2], "little")
+                if can_id == _TPDO1 and state_of(word) is DriveState.OPERATION_ENABLED:
+                    return True
+        return False
+
+    def _let_happen(self) -> None:
+        assert self.master is not None
+        match self.case.fault:
+            case ProcessFault.MASTER_KILLED:
+                self.master.kill()
+            case ProcessFault.MASTER_STALLED:
+                self.master.send_signal(signal.SIGSTOP)
+                self._sleep(STALL_S)
+                self.master.send_signal(signal.SIGCONT)
+            case ProcessFault.NODES_KILLED:
+                os.kill(self.child.pid, signal.SIGKILL)
+            case ProcessFault.LINK_DOWN:
+                link("down")
+            case ProcessFault.LINK_DOWN_UP:
+                link("down")
+                link("up")
+
+    def _await_end(self) -> int | None:
+        assert self.master is not None
+        try:
+            return self.master.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
+            return None
+
+    # what is left
+
+    def _look(self) -> str:
+        """Ask the drives, where their process is still there."""
+        if not Path(f"/proc/{self.child.pid}").exists() or not self._answers():
+            if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
+                self.failures.append("the nodes ended with a master that is not their parent")
+            return "gone"
+        before, first = self._ask(0x6064), self._ask(0x6041)
+        self._sleep(APART_S)
+        after = self._ask(0x6064)
+        states = {node_id: state_of(word) for node_id, word in first.items()}
+        for node_id, state in states.items():
+            if state in POWERED_STATES:
+                self.failures.append(f"node {node_id} is {state.name} after the stop")
+            if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
+                self.failures.append(f"node {node_id} moves after the stop")
+        codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
+        return ", ".join(sorted({_told(state, codes.get(node_id)) for node_id, state in states.items()}))
+
+    def _answers(self) -> bool:
+        try:
+            return bool(self._ask(0x6041))
+        except CanprobeError:
+            return False
+
+    def _ask(self, index: int) -> dict[int, int]:
+        """An object of each drive; empty where one does not answer."""
+        arm = served_scene().arm
+        assert arm is not None
+        port = self._open()
+        answers: dict[int, int] = {}
+        try:
+            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in arm.node_ids}
+            hold_dialogues(PumpedNetwork(port), dialogues, timeout_s=1.0, retries=1)
+        finally:
+            port.close()
+        return answers if len(answers) == len(arm.node_ids) else {}
+
+    def _score(self, status: int | None) -> None:
+        killed = self.case.fault is ProcessFault.MASTER_KILLED
+        if status is not None and not killed and status not in (1, 3):
+            self.failures.append(f"the master ended with status {status}, expected 1 or 3")
+        errors = (self.folder / "stderr").read_text(encoding="utf-8", errors="replace")
+        if "Traceback" in errors:
+            self.failures.append(f"crash: {errors.strip().splitlines()[-1]}")
+        out = self.folder / "run"
+        try:
+            frames = sum(1 for _ in read_candump(out / "bus.log", whole=True))
+            if not frames:
+                self.failures.append("log: bus.log is empty")
+            if not killed and json.loads((out / "summary.json").read_text(encoding="utf-8"))["completed"]:
+                self.failures.append("the summary says that the run was completed")
+        except (CanprobeError, OSError, ValueError) as error:
+            self.failures.append(f"log: {error}")
+
+
+def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
+    from canopen.sdo.exceptions import SdoCommunicationError
+
+    try:
+        keep(node_id, int.from_bytes((yield from upload(index, 0)), "little"))
+    except SdoCommunicationError:
+        return
+
+
+def _told(state: DriveState, code: int | None) -> str:
+    return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
+
+
+def _signed(value: int) -> int:
+    return value - (1 << 32) if value >> 31 else value
+
+
+def link(state: str) -> None:
+    """Take the interface down or up."""
+    subprocess.run(["ip", "link", "set", CHANNEL, state], check=True, capture_output=True)
+
+
+# Study `faults` on a real vcan0: processes are killed or stalled, the interface goes down and comes back.
 
 RUNS = 40
 COLUMNS = (
@@ -80,6 +352,6 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    from canprobe.studies.faults_figure import draw_ends
+    from canprobe.studies.faults import draw_ends
 
     draw_ends(rows, path)

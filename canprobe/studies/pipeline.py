@@ -20,24 +20,35 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.cell.build import make_task
-from canprobe.cell.scoring import RUN_IN_M, curvature_tensor
-from canprobe.cell.tasks.shape import ShapeRecord
-from canprobe.planning import make_plan
-from canprobe.scene_loader import load_scene
-from canprobe.scene_resolve import resolve
-from canprobe.session import Session, resolve_scene
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.planning.make import make_plan
+from canprobe.results.picture import BLUE, GREY, INK, SHADE, legend, log_scale, picture
+from canprobe.results.scores import RUN_IN_M, curvature_tensor
+from canprobe.scene.load import load_scene
+from canprobe.scene.resolve import resolve
+from canprobe.session.session import Session, resolve_scene
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
-from canprobe.touch._arrays import Array
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.shape import ShapeRecord
 from canprobe.touch.contact import ContactSample
+from canprobe.touch.linear_algebra import Array
 
 SCENES = ("cylinder", "sphere", "plane", "saddle", "ellipsoid", "bowl", "torus", "wave", "fillet")
 ASKED = (0.90, 0.99)
 CALIBRATION, VERIFICATION = range(2), range(102, 107)
 DURATION_S = 10.0
-MODEL = ("touch", "robot", "protocol", "planning", "cell", "emulator", "scenes", "studies/pipeline.py")
+MODEL = (
+    "touch",
+    "robot",
+    "protocol",
+    "planning",
+    "cell",
+    "session",
+    "tasks",
+    "emulator",
+    "scenes",
+    "studies/pipeline.py",
+)
 CHI2_95_OF_3, TWO_SIDED_95 = 7.815, 1.96
 ENTRIES = ("K11", "K12", "K22")
 COLUMNS = (
@@ -76,8 +87,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     ]
 
     def draw(path: Path) -> None:
-        from canprobe.studies.pipeline_figure import draw_pipeline
-
         draw_pipeline(rows, path)
 
     facts = measuring_facts(quick, sum(map(len, groups.values())), MODEL)
@@ -174,3 +183,42 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
         elif row["within"] != "yes":
             said.append(f"  {row['scene']}, {row['seeds']} seeds: {100 * row['coverage']:.1f} %, {row['within']} that.")
     return said
+
+
+# The picture of study `pipeline`.
+
+COLOURS = {"calibration": GREY, "verification": BLUE}
+ENTRY_MARKS = {"K11": "o", "K12": "s", "K22": "D"}
+
+
+def draw_pipeline(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Coverage, and z of each entry, by scene."""
+    scenes = list(dict.fromkeys(r["scene"] for r in rows))
+    groups = list(dict.fromkeys(r["seeds"] for r in rows))
+    title = (
+        "The online estimator with the whole sensor pipeline on: share of its 95 % regions that hold the truth,\n"
+        "and errors of the entries of K over their stated standard deviation (RMS); shade: as it should be"
+    )
+    with picture(path, title, 4.4) as figure:
+        left, right = figure.subplots(1, 2)
+        left.axhspan(0.90, 0.99, color=SHADE, linewidth=0, zorder=0)
+        left.axhline(0.95, color=INK, linewidth=0.8)
+        right.axhline(1.0, color=INK, linewidth=0.8)
+        for j, group in enumerate(groups):
+            mine = [r for r in rows if r["seeds"] == group]
+            x = np.array([scenes.index(r["scene"]) for r in mine]) + 0.3 * (j - 0.5 * (len(groups) - 1))
+            name = f"{group} seeds"
+            left.scatter(x, [r["coverage"] for r in mine], s=30, color=COLOURS[group], label=name, zorder=3)
+            for i, (entry, mark) in enumerate(ENTRY_MARKS.items()):
+                y = [r[f"z_rms_{entry}"] for r in mine]
+                label = f"{entry}, {name}"
+                right.scatter(x + 0.07 * (i - 1), y, s=18, marker=mark, color=COLOURS[group], label=label, zorder=3)
+        left.set_ylim(min(0.88, *(r["coverage"] - 0.02 for r in rows)), 1.01)
+        log_scale(right, "y")
+        left.set(title="coverage", ylabel="share of regions")
+        right.set(title="error over stated σ", ylabel="RMS of z")
+        for axes in (left, right):
+            axes.set_xticks(range(len(scenes)), scenes, rotation=30, ha="right", rotation_mode="anchor")
+            axes.set_xlim(-0.6, len(scenes) - 0.4)
+            axes.grid(visible=False, axis="x")
+        legend(figure)

@@ -2,28 +2,162 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import canopen
 import numpy as np
+from numpy.typing import NDArray
 
-from canprobe.bus.clock import MonotonicClock
-from canprobe.bus.open import open_port
-from canprobe.bus.priority import MASTER_PRIORITY, realtime
-from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Controller, Measurement
-from canprobe.child import EmulatorChild
+from canprobe.bus.disk import read_candump
+from canprobe.bus.interfaces import open_port
+from canprobe.bus.port import Clock, MonotonicClock
+from canprobe.bus.scheduling import MASTER_PRIORITY, realtime
+from canprobe.cell.bringup import NodeSetup
+from canprobe.cell.configuration import make_setups
+from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.errors import CanprobeError
-from canprobe.planning import make_plan
-from canprobe.scene import Scene, TactileModeName
-from canprobe.scene_loader import load_scene
-from canprobe.scene_resolve import resolve
-from canprobe.session import Session, resolve_scene
-from canprobe.studies.cycle_times import CycleTimes, answer_latencies, processor_seconds, share_of, woken
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import Plan
+from canprobe.protocol.frames import SYNC_ID, SyncCounter
+from canprobe.scene.load import load_scene
+from canprobe.scene.model import Scene, TactileModeName
+from canprobe.scene.resolve import resolve
+from canprobe.session.children import EmulatorChild
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
+
+# What a cycle on a real interface took: lateness of SYNC, computing time, and how late the last TPDO was in.
+
+Times = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True)
+class CycleTimes:
+    """One run.
+
+    Attributes:
+        period_ns: of SYNC, as asked.
+        lateness_ns: of each SYNC behind its deadline (n,), ns.
+        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
+        compute_ns: the same with the controller's work once the RPDOs are out (m,), ns.
+        latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        overruns: cycles woken more than half a period late.
+        missed: TPDOs that a cycle did without.
+        seconds: from the first SYNC to the last.
+        processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
+    """
+
+    period_ns: int
+    lateness_ns: Times
+    response_ns: Times
+    compute_ns: Times
+    latency_ns: Times
+    overruns: int
+    missed: int
+    seconds: float
+    processor_share: float | None
+
+    @classmethod
+    def of_wakes(
+        cls,
+        period_ns: int,
+        lateness: Sequence[int],
+        seconds: float,
+        *,
+        missed: int = 0,
+        processor_share: float | None = None,
+    ) -> CycleTimes:
+        """Of a loop of which no more is known than how late it woke each time, ns."""
+        nothing = np.zeros(0, np.int64)
+        return cls(
+            period_ns=period_ns,
+            lateness_ns=np.array(lateness, np.int64),
+            response_ns=nothing,
+            compute_ns=nothing,
+            latency_ns=nothing,
+            overruns=sum(late > period_ns // 2 for late in lateness),
+            missed=missed,
+            seconds=seconds,
+            processor_share=processor_share,
+        )
+
+    @property
+    def cycles(self) -> int:
+        """Cycles that were begun."""
+        return len(self.lateness_ns)
+
+    @property
+    def rate_hz(self) -> float:
+        """Cycles a second, as held."""
+        return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
+
+
+def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
+    """Wake at so many deadlines, a period apart, and add how late each was (ns); missed ones are passed over.
+
+    Yields:
+        The deadline, ns, or the last one that has passed by then.
+    """
+    deadline_ns = clock.now_ns() + period_ns
+    for _ in range(cycles):
+        clock.sleep_until_ns(deadline_ns)
+        lateness.append(clock.now_ns() - deadline_ns)
+        deadline_ns += lateness[-1] // period_ns * period_ns
+        yield deadline_ns
+        deadline_ns += period_ns
+
+
+def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -> Times:
+    """From each SYNC of a candump log to the last of the TPDOs that answer it within a period.
+
+    Args:
+        path: of the log.
+        feedback_ids: COB-IDs of the TPDOs.
+        period_ns: of SYNC.
+
+    Returns:
+        One number for each SYNC that all of them answered (k,), ns, to the log's microsecond.
+    """
+    syncs: list[int] = []
+    arrivals: dict[int, list[int]] = {can_id: [] for can_id in feedback_ids}
+    for t_ns, _, can_id, _ in read_candump(path):
+        if can_id == SYNC_ID:
+            syncs.append(t_ns)
+        elif can_id in arrivals:
+            arrivals[can_id].append(t_ns)
+    if not syncs or not arrivals:
+        return np.zeros(0, np.int64)
+    begins = np.array(sorted(syncs), np.int64)
+    last = np.full(len(begins), -1, np.int64)
+    complete = np.ones(len(begins), bool)
+    for times in arrivals.values():
+        stamps = np.array([*sorted(times), np.iinfo(np.int64).max], np.int64)
+        delays = stamps[np.searchsorted(stamps, begins)] - begins
+        complete &= delays < period_ns
+        last = np.maximum(last, delays)
+    return last[complete]
+
+
+def processor_seconds() -> float:
+    """Processor time of this process so far, s."""
+    times = os.times()
+    return times.user + times.system
+
+
+def share_of(used_before_s: float, passed_s: float) -> float | None:
+    """Processor share since `processor_seconds` gave `used_before_s`; None in a guest, which counts whole ticks."""
+    if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
+        return None
+    return (processor_seconds() - used_before_s) / passed_s
+
+
+# The cases of study `realtime`: one run each on a real SocketCAN interface, emulated nodes in their own process.
 
 CHANNEL = "vcan0"
 PATIENCE = {"missed_syncs": 250, "late_cycles_max_percent": 100}
@@ -50,9 +184,7 @@ def measure_scan(seconds: float) -> Measured:
 
 
 def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
-    """The cycle of `plain_canopen` with the same nodes."""
-    from canprobe.studies.plain_canopen import run_plain
-
+    """The cycle of `run_plain` with the same nodes."""
     scene = holding_scene("window", rate_hz)
     with served(CHANNEL, in_realtime=True), realtime(MASTER_PRIORITY, _unheard):
         times = run_plain(make_plan(resolve(scene)), CHANNEL, seconds)
@@ -171,3 +303,109 @@ def _times(session: Session, folder: Path, used_s: float) -> CycleTimes:
         seconds=seconds,
         processor_share=share_of(used_s, seconds),
     )
+
+
+# The same cycle written plainly with canopen-python: its Network, its threads, its PDO objects. A yardstick only.
+#
+# SYNC, wait for six TPDOs, read statusword, position and torque, write the targets, transmit six RPDOs; the sensor's
+# PDOs are read where they are there. Nothing is computed: the targets are where the joints stood.
+
+_ENABLING = (6, 7, 15)
+_CYCLES_A_STEP = 20
+_WAIT_SHARE = 0.6
+"""Of the period, the longest wait for TPDOs, as canprobe's own cycle waits."""
+
+
+def run_plain(plan: Plan, channel: str, seconds: float) -> CycleTimes:
+    """Bring the nodes of a plan up, cycle for some time, stop them.
+
+    Args:
+        plan: with drives 1–6; its nodes are served on `channel`.
+        channel: a SocketCAN interface.
+        seconds: length of the timed part.
+    """
+    network = canopen.Network()
+    network.connect(interface="socketcan", channel=channel)
+    try:
+        nodes = [_configured(network, setup) for setup in make_setups(plan)]
+        with _operational(network):
+            cycle = _PlainCycle(network, plan, nodes)
+            for word in _ENABLING:
+                cycle.run(word, _CYCLES_A_STEP)
+            return cycle.times(seconds)
+    finally:
+        network.disconnect()
+
+
+def _configured(network: canopen.Network, setup: NodeSetup) -> Any:
+    node: Any = network.add_node(setup.node_id, setup.dictionary)
+    for write in setup.writes:
+        variable = setup.dictionary.get_variable(write.index, write.subindex)
+        assert variable is not None
+        node.sdo.download(write.index, write.subindex, variable.encode_raw(write.value))
+    node.tpdo.read()
+    node.rpdo.read()
+    return node
+
+
+@contextmanager
+def _operational(network: canopen.Network) -> Iterator[None]:
+    network.nmt.send_command(1)
+    try:
+        yield
+    finally:
+        network.nmt.send_command(0x80)
+
+
+class _PlainCycle:
+    def __init__(self, network: canopen.Network, plan: Plan, nodes: Sequence[Any]) -> None:
+        drive_ids = {node.node_id for node in plan.nodes if node.kind == "drive"}
+        self._network, self._plan = network, plan
+        self._drives = [node for node in nodes if node.id in drive_ids]
+        self._maps = [m for node in nodes if node.id not in drive_ids for m in node.tpdo.values() if m.enabled]
+        self._sync = SyncCounter(plan.sync.overflow)
+        self._held: dict[int, int] = {}
+        self.missed = 0
+        self._clock = MonotonicClock()
+
+    def run(self, word: int, cycles: int) -> list[int]:
+        """Cycle; returns the lateness of each SYNC, ns."""
+        period_ns = self._plan.sync.period_ns
+        lateness: list[int] = []
+        for deadline_ns in woken(self._clock, period_ns, cycles, lateness):
+            self._once(word, deadline_ns + int(_WAIT_SHARE * period_ns))
+        return lateness
+
+    def _once(self, word: int, until_ns: int) -> None:
+        maps = [drive.tpdo[1] for drive in self._drives]
+        for tpdo in maps:
+            tpdo.is_received = False
+        self._network.sync.transmit(self._sync.next())
+        for tpdo in maps:
+            with tpdo.receive_condition:
+                while not tpdo.is_received and (left_ns := until_ns - self._clock.now_ns()) > 0:
+                    tpdo.receive_condition.wait(left_ns * 1e-9)
+            self.missed += not tpdo.is_received
+        for drive, tpdo in zip(self._drives, maps, strict=True):
+            _, position, *_ = [variable.raw for variable in tpdo]
+            self._held.setdefault(drive.id, position)
+            controlword, target = list(drive.rpdo[1])
+            controlword.raw = word
+            target.raw = self._held[drive.id]
+            drive.rpdo[1].transmit()
+        for tpdo in self._maps:
+            for variable in tpdo:
+                _ = variable.raw
+
+    def times(self, seconds: float) -> CycleTimes:
+        """Cycle for some time."""
+        period_ns, clock = self._plan.sync.period_ns, self._clock
+        self.missed = 0
+        begin_ns, used_s = clock.now_ns(), processor_seconds()
+        lateness: list[int] = []
+        while (left_ns := seconds * 1e9 - (clock.now_ns() - begin_ns)) > 0:
+            lateness += self.run(_ENABLING[-1], min(200, int(left_ns / period_ns) + 1))
+        passed_s = (clock.now_ns() - begin_ns) * 1e-9
+        return CycleTimes.of_wakes(
+            period_ns, lateness, passed_s, missed=self.missed, processor_share=share_of(used_s, passed_s)
+        )

@@ -17,12 +17,24 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from canprobe.studies.bound import AT, MODEL, measure_rows
-from canprobe.studies.bound_cases import LONGEST_M, NOISES, REGION, SIZES_M, Case, all_cases, quick_cases
-from canprobe.studies.bound_scores import CASE_RATIO, LARGEST_BIAS, METHODS
-from canprobe.studies.ground import SURFACES
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
+from canprobe.studies.bound import (
+    AT,
+    CASE_RATIO,
+    LARGEST_BIAS,
+    LONGEST_M,
+    METHODS,
+    MODEL,
+    NOISES,
+    REGION,
+    SIZES_M,
+    SURFACES,
+    Case,
+    all_cases,
+    measure_rows,
+    quick_cases,
+)
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 
 FIRST_SEED, SEEDS = 1_000_000, 20
@@ -62,8 +74,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     rows = [row for limit in LEVELS for row in levels_of(limit, measured)]
 
     def draw(path: Path) -> None:
-        from canprobe.studies.region_figure import draw_region
-
         draw_region(measured, path)
 
     return StudyResult(
@@ -132,3 +142,42 @@ def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         + (" (as in use)" if math.isclose(value, REGION[limit]) else f"; in use is {REGION[limit]:.4g}")
         for limit, value in chosen(rows).items()
     ]
+
+
+# The picture of study `region`.
+
+NAMES = {
+    "path": "path / radius",
+    "bound": "bound / size of K",
+    "κσ": "κσₚ (rad)",
+    "cubic": "cubic terms / bound",
+    "spread": "noise / spread",
+}
+CLIP = 3.0
+
+
+def draw_region(measured: Sequence[Mapping[str, Any]], path: Path) -> None:
+    """Error over bound and coverage of every case against each limit: a column of panels a limit."""
+    title = (
+        "How far out the Cramér–Rao bound means something: each case against each limit; line: the limit chosen\n"
+        f"shade: as it should be; an error above {CLIP:g} bounds: at the edge"
+    )
+    with picture(path, title, 5.2) as figure:
+        grid = figure.subplots(2, len(NAMES), sharey="row", sharex="col")
+        for column, (limit, name) in zip(grid.T, NAMES.items(), strict=True):
+            shown = ((column[0], "ratio", (0.0, 1.25), CLIP), (column[1], "coverage", (0.90, 1.0), 1.0))
+            for axes, key, band, top in shown:
+                axes.axhspan(*band, color=SHADE, linewidth=0, zorder=0)
+                axes.axvline(REGION[limit], color=INK, linewidth=0.9)
+                for method, marker in (("ml", "o"), ("recursive", "x")):
+                    mine = [r for r in measured if r["method"] == method and r[key] is not None]
+                    axes.scatter(
+                        [max(r[AT + limit], 1e-4) for r in mine], [min(r[key], top) for r in mine],
+                        s=16, marker=marker, color=METHOD_COLOURS[method], alpha=0.7, linewidths=1.0, label=method,
+                        zorder=3,
+                    )  # fmt: skip
+                log_scale(axes, "x")
+            column[1].set_xlabel(name)
+        grid[0][0].set_ylabel("error / bound")
+        grid[1][0].set_ylabel("coverage of 95 % regions")
+        legend(figure)

@@ -16,13 +16,13 @@ import numpy as np
 
 from canprobe.api import ROWS_OF_UP
 from canprobe.bus.socketcan import check_interface
-from canprobe.cell.measurement import Command, Measurement
-from canprobe.child import EmulatorChild
-from canprobe.scene_loader import load_scene
-from canprobe.session import Session, resolve_scene
+from canprobe.cell.controller import Command, Measurement
+from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
+from canprobe.scene.load import load_scene
+from canprobe.session.children import EmulatorChild
+from canprobe.session.session import Session, resolve_scene
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import CHANNEL, PATIENCE, patient, served, with_real_nodes
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
 from canprobe.studies.sweep import Sweep
 
 HOUR_S = 3600.0
@@ -175,8 +175,29 @@ def _growth(samples: Sequence[Sample], name: str) -> float:
 
 def _drawer(samples: Sequence[Sample]) -> Callable[[Path], None]:
     def draw(path: Path) -> None:
-        from canprobe.studies.soak_figure import draw_soak
-
         draw_soak(samples, path)
 
     return draw
+
+
+# The picture of study `soak`: memory, answer latency and overruns over time.
+
+
+def draw_soak(samples: Sequence[Sample], path: Path) -> None:
+    """Three panels over the same time axis."""
+    with picture(path, f"The cell held for {samples[-1].t_s:.0f} s on vcan0", 6.6) as figure:
+        panels = parts(figure, 3, 1)
+        memory, latency, lost = (part.subplots() for part in panels)
+        minutes = [s.t_s / 60 for s in samples]
+        memory.plot(minutes, [s.master_mib for s in samples], color=BLUE, label="master")
+        memory.plot(minutes, [s.nodes_mib for s in samples], "--", color=ORANGE, label="emulated nodes")
+        memory.set_ylabel("resident\nmemory (MiB)")
+        latency.plot(minutes, [s.latency_us for s in samples], ".-", color=BLUE)
+        latency.set_ylabel("SYNC →\nlast TPDO (µs)")
+        lost.plot(minutes, [s.overruns for s in samples], color=BLUE, label="overruns")
+        lost.plot(minutes, [s.missed_pdos for s in samples], "--", color=ORANGE, label="PDOs missed")
+        lost.set_ylabel("number so far")
+        for axes, part in zip((memory, latency, lost), panels, strict=True):
+            axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])
+            axes.set_xlabel("time (min)")
+            legend(part)

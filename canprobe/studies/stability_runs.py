@@ -1,4 +1,4 @@
-"""One cell of the stability map: a short touch in lockstep, watched by a witness, and how it ended.
+"""One cell of the stability map: what the linear loop predicts, a short touch in lockstep, and how it ended.
 
 `stable`: carried out to its end. `stopped`: let go and stopped, with the reason. `refused`: by the plan, with the
 reason. `hunting`: carried out, but the force did not settle. `failed`: what must never be (a hang, a NaN, an exception
@@ -8,32 +8,203 @@ of ours, a force above the limit for longer than the stated reaction time and th
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
 
-from canprobe.cell.build import make_task
+from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.limits import limits_of
 from canprobe.cell.supervision import Limits
-from canprobe.cell.tasks.calibration import array_calibration
-from canprobe.cell.tasks.sensing import ContactSensing
-from canprobe.cell.tasks.touch import TouchTask
-from canprobe.emulator.plant.arm import natural_frequency
+from canprobe.emulator.faults import WrappedNode
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.errors import CanprobeError, PlanError, SafetyStop
+from canprobe.protocol.frames import Frame
 from canprobe.robot.inverse import inverse_near
-from canprobe.robot.kinematics import forward
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
-from canprobe.scene_geometry import T_flange_probe, true_object
-from canprobe.scene_loader import load_scene
-from canprobe.session import Session, resolve_scene
-from canprobe.studies.fault_scores import RELEASE_NS
-from canprobe.studies.fault_witness import HangError, Witness
-from canprobe.studies.late_node import LateNode
-from canprobe.studies.stability_loop import ForceLoop
+from canprobe.robot.kinematics import MODELS, forward
+from canprobe.scene.geometry import T_flange_probe, true_object
+from canprobe.scene.load import load_scene
+from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
+from canprobe.session.session import Session, resolve_scene
+from canprobe.studies.fault_scores import RELEASE_NS, HangError, Witness
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.sensing import ContactSensing
+from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
+from canprobe.touch.patch.array_model import array_calibration
+
+# A node whose PDOs come late, attached to a lockstep bus in the node's place: the delay of a bus or a gateway.
+
+
+class LateNode(WrappedNode):
+    """Holds back some frames to and from a node, in their order; all others pass at once.
+
+    Args:
+        node: the node.
+        late_ids: COB-IDs that come late, both ways.
+        late_ns: by how much.
+    """
+
+    def __init__(self, node: SlaveNode, late_ids: Container[int], late_ns: int) -> None:
+        super().__init__(node)
+        self._late_ids, self._late_ns = late_ids, late_ns
+        self._in: deque[tuple[int, Frame]] = deque()
+        self._out: deque[tuple[int, Frame]] = deque()
+
+    @property
+    def next_deadline_ns(self) -> int | None:
+        """The node's, or that of the next late frame."""
+        due = [queue[0][0] for queue in (self._in, self._out) if queue]
+        own = self.node.next_deadline_ns
+        return min(due if own is None else [*due, own], default=None)
+
+    def start(self, t_ns: int) -> Sequence[Frame]:
+        """Power on."""
+        return self._sent(self.node.start(t_ns), t_ns)
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """A frame from the bus, now or later."""
+        if can_id in self._late_ids:
+            self._in.append((t_ns + self._late_ns, (can_id, data)))
+            return ()
+        return self._sent(self.node.receive(can_id, data, t_ns), t_ns)
+
+    def advance(self, t_ns: int) -> Sequence[Frame]:
+        """What is due."""
+        ready: list[Frame] = []
+        while self._out and self._out[0][0] <= t_ns:
+            ready.append(self._out.popleft()[1])
+        while self._in and self._in[0][0] <= t_ns:
+            _, frame = self._in.popleft()
+            ready += self._sent(self.node.receive(*frame, t_ns), t_ns)
+        own = self.node.next_deadline_ns
+        if own is not None and own <= t_ns:
+            ready += self._sent(self.node.advance(t_ns), t_ns)
+        return ready
+
+    def _sent(self, frames: Sequence[Frame], t_ns: int) -> list[Frame]:
+        now: list[Frame] = []
+        for frame in frames:
+            if frame[0] in self._late_ids:
+                self._out.append((t_ns + self._late_ns, frame))
+            else:
+                now.append(frame)
+        return now
+
+
+# The force loop as a linear sampled system, and the eigenvalues that tell whether it settles.
+#
+# Along the contact's normal, about the wanted indentation, all is linear: measured force and wanted force become depths
+# by the same law, so the depth that is measured is the true one times `g`, the true slope of √F over the depth divided
+# by the one that the controller reckons with. With heights outward, 0 on the object, `a` of the servo's surface model
+# and `p` of the probe's tip less the wanted indentation:
+#
+#     a ← (1 − H) a + H (1 − g) p of the sample's instant,   H = 1 − exp(−2π height_hz dt)
+#
+# `p` follows `a` as the cycle has it: a target is latched at the SYNC after the cycle that made it and reached by a
+# ramp at the next, with the second-order drive behind; an image is sampled at a trigger, sent at the next one and taken
+# in a cycle later. Frames that are late by more than a period make both later by whole cycles. The state's map over one
+# period of the sensor is one matrix. Stops being true where contact is lost, at encoder counts and joint limits, where
+# the array is saturated, and while the stiffness is still being felt. Damping of the layer (Hunt–Crossley) is left out.
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class ForceLoop:
+    """What decides whether the force settles.
+
+    Attributes:
+        depth_ratio: g, measured over true depth.
+        period_s: of the cycle.
+        sample_cycles: cycles between two tactile images.
+        height_hz: bandwidth of the surface's height correction, the force gain.
+        late_s: by how much targets and tactile frames come late on the bus.
+        omega: undamped frequency of the drives, rad/s.
+        damping: their damping ratio.
+    """
+
+    depth_ratio: float
+    period_s: float
+    sample_cycles: int
+    height_hz: float
+    late_s: float
+    omega: float
+    damping: float = 1.0
+
+    @property
+    def late_cycles(self) -> int:
+        """Whole cycles by which late frames delay what they say."""
+        return math.floor(self.late_s / self.period_s + 1e-9)
+
+
+@lru_cache(maxsize=64)
+def drive_step(period_s: float, omega: float, damping: float) -> Array:
+    """Map (3, 4) of position, rate, reference and the target that is latched to the first three a cycle later."""
+    rates = np.zeros((4, 4))  # of position, rate, reference, slope
+    rates[0, 1] = 1.0
+    rates[1, :3] = -omega * omega, -2.0 * damping * omega, omega * omega
+    rates[2, 3] = 1.0
+    ramp = np.eye(4)
+    ramp[3] = 0.0, 0.0, -1.0 / period_s, 1.0 / period_s
+    step: Array = (expm(rates * period_s) @ ramp)[:3]
+    step.flags.writeable = False
+    return step
+
+
+def sample_map(loop: ForceLoop) -> Array:
+    """Map of the whole state over one period of the sensor.
+
+    The state at a SYNC: position, rate, reference, a, the last targets, newest first, and the positions at the SYNCs
+    before, newest first.
+    """
+    drive = drive_step(loop.period_s, loop.omega, loop.damping)
+    delay = 1 + loop.late_cycles
+    oldest = delay + loop.sample_cycles
+    size = 4 + delay + oldest
+    share = 1.0 - math.exp(-2.0 * math.pi * loop.height_hz * loop.sample_cycles * loop.period_s)
+    whole = np.eye(size)
+    for cycle in range(loop.sample_cycles):
+        sense = np.eye(size)
+        if (cycle - delay) % loop.sample_cycles == 0:
+            sense[3, 3] = 1.0 - share
+            sense[3, 4 + delay + oldest - 1] = share * (1.0 - loop.depth_ratio)
+        move = np.zeros((size, size))
+        move[:3, :3] = drive[:, :3]
+        move[:3, 4 + delay - 1] = drive[:, 3]  # the target that is latched now
+        move[3, 3] = move[4, 3] = 1.0  # this cycle's target is a
+        for i in range(1, delay):
+            move[4 + i, 4 + i - 1] = 1.0
+        move[4 + delay, 0] = 1.0
+        for i in range(1, oldest):
+            move[4 + delay + i, 4 + delay + i - 1] = 1.0
+        whole = move @ sense @ whole
+    return whole
+
+
+def spectral_radius(loop: ForceLoop) -> float:
+    """Largest modulus of the eigenvalues over one period of the sensor; below 1 the force settles."""
+    return float(np.abs(np.linalg.eigvals(sample_map(loop))).max())
+
+
+def steepest_ratio(loop: ForceLoop, most: float = 1e6) -> float:
+    """The largest `depth_ratio` up to which the loop settles, by bisection of its logarithm; inf beyond `most`."""
+    low, high = 1.0, most
+    if spectral_radius(replace(loop, depth_ratio=most)) < 1.0:
+        return math.inf
+    while high / low > 1.0 + 1e-4:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if spectral_radius(replace(loop, depth_ratio=middle)) < 1.0 else (low, middle)
+    return low
+
+
+# One cell of the stability map: a short touch in lockstep, watched by a witness, and how it ended.
 
 LOOK_NS = 1_250_000
 HUNTING = 0.2

@@ -1,6 +1,6 @@
 """Study `workprec`: what the dynamic plant's integrators cost and how wrong they are, over steps and stiffness.
 
-Each cell integrates the same sliding contact (`workprec_trial`) and is compared with scipy's Radau at rtol 1e-10, at
+Each cell integrates the same sliding contact (`trial`) and is compared with scipy's Radau at rtol 1e-10, at
 which nothing is held. `held` cells keep mass matrix, bias and contact geometry over a cycle of 2.5 ms, as the plant
 does; the others evaluate them in every call. Where both have the same error, holding costs nothing. Cost is processor
 time a cycle, the best of several repeats, the first one apart. Errors are RMS over the cycles' ends:
@@ -13,22 +13,157 @@ The whole cell, of which the plant is a part, is measured by `workprec_cell`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
 
-from canprobe.emulator.plant.dynamic_arm import Stepping
-from canprobe.scene_setup import Dynamics
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping, make_equations
+from canprobe.emulator.plant.plant import Plant, PlantState
+from canprobe.emulator.plant.probe import depth_for_force
+from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
+from canprobe.robot.inverse import inverse_near, probe_pose, start_posture
+from canprobe.robot.kinematics import UPENN, counts_per_radian, counts_to_joints, joints_to_counts, tool_z_offset
+from canprobe.scene.setup import Dynamics
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.studies.workprec_cell import run_cell
-from canprobe.studies.workprec_trial import Array, integrated, observed, reference, stands
+from canprobe.touch.objects import make_object
+
+# The motion that study `workprec` integrates: a sliding contact on the cylinder, and its reference solution.
+#
+# The probe starts at rest in contact and is led over the cylinder at 25 mm/s at the indentation of 2 N, by one straight
+# ramp a cycle, as the cell does. Drives, links, friction and contact are all on.
+
+Array = npt.NDArray[np.float64]
+
+CYCLE_NS = 2_500_000
+SPEED_M_S, FORCE_N = 0.025, 2.0
+NUDGE_COUNTS, AT_REST_COUNTS_S = 5.0, 20.0
+_POINT, _TOOL, _RADIUS = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0), 0.036
+
+
+@cache
+def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
+    """The plant and its drives' targets.
+
+    Args:
+        stiffness_n_m3: of the layer.
+        cycles: of 2.5 ms.
+
+    Returns:
+        The configuration, and (cycles + 1, 6) whole counts at the ends of the cycles.
+    """
+    pose = np.eye(4)
+    pose[:3, 3] = _POINT
+    shape = make_object("cylinder", T_base_object=pose, radius=_RADIUS)
+    depth = depth_for_force(FORCE_N, (1.0 / _RADIUS, 0.0), 0.040, stiffness_n_m3)
+    q = start_posture(UPENN, _POINT, (0, 0, 1), radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
+    config = PlantConfig(
+        UPENN, q, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=TaxelConfig()
+    )
+    targets = []
+    for k in range(cycles + 1):
+        turn = SPEED_M_S * k * CYCLE_NS * 1e-9 / _RADIUS
+        normal = np.array((0.0, math.sin(turn), math.cos(turn)))
+        point = _POINT + _RADIUS * (normal - (0.0, 0.0, 1.0))
+        q = inverse_near(UPENN, probe_pose(point, normal, 0.040 - depth, (1, 0, 0)) @ np.linalg.inv(_TOOL), q)
+        targets.append(np.rint(joints_to_counts(UPENN, q)))
+    counts = np.array(targets)
+    start = counts_to_joints(UPENN, counts[0])  # a posture that the encoders can hold
+    return PlantConfig(
+        UPENN, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=config.taxels
+    ), counts
+
+
+def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: bool) -> Array | None:
+    """(cycles, 12) motor counts and rates at the ends of the cycles; None where the integration broke down."""
+    config, targets = trial(stiffness_n_m3, cycles)
+    arm = DynamicArm(UPENN, config.q0, make_equations(config, held=held), stepping)
+    seen: list[Any] = []
+    with np.errstate(all="ignore"):
+        for k in range(cycles):
+            for i in range(6):
+                arm.set_ramp(i, float(targets[k, i]), float(targets[k + 1, i]), k * CYCLE_NS, (k + 1) * CYCLE_NS)
+            arm.advance((k + 1) * CYCLE_NS)
+            try:
+                seen.append([x for part in arm.motors() for x in part])
+            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+                return None
+    found = np.array(seen)
+    return found if np.all(np.isfinite(found)) and np.abs(found).max() < 1e9 else None
+
+
+def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
+    """Whether the arm comes to rest in contact after a nudge of one motor, as it does in truth.
+
+    Args:
+        stiffness_n_m3: of the layer.
+        cycles: of 2.5 ms.
+        stepping: how it is integrated.
+    """
+    config, _ = trial(stiffness_n_m3, 1)
+    arm = DynamicArm(UPENN, config.q0, make_equations(config), stepping)
+    start, fastest = arm.motor_counts(0), []
+    arm.set_ramp(0, start, start + NUDGE_COUNTS, 0, CYCLE_NS)
+    with np.errstate(all="ignore"):
+        for k in range(cycles):
+            arm.advance((k + 1) * CYCLE_NS)
+            try:
+                fastest.append(max(map(abs, arm.motors()[1])))
+            except (ArithmeticError, ValueError, np.linalg.LinAlgError):
+                return False
+    return bool(max(fastest[-cycles // 4 :]) < AT_REST_COUNTS_S)  # false for NaN too
+
+
+def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
+    """The same by scipy's Radau, cycle by cycle, nothing held."""
+    from scipy.integrate import solve_ivp
+
+    config, targets = trial(stiffness_n_m3, cycles)
+    equations, scale = make_equations(config, held=False), counts_per_radian(UPENN)
+    h, seen = CYCLE_NS * 1e-9, []
+    y = equations.resting(targets[0] / scale)
+    for k in range(cycles):
+        slope = (targets[k + 1] - targets[k]) / scale / h
+        equations.loops.set_reference(k * h, (targets[k] / scale).tolist(), slope.tolist())
+        solved = solve_ivp(
+            equations.rate, (k * h, (k + 1) * h), y, "Radau", rtol=rtol, atol=1e-2 * rtol, jac=equations.jacobian
+        )
+        y = solved.y[:, -1]
+        seen.append(np.concatenate((y[:6] * scale, y[6:12] * scale)))
+    return np.array(seen)
+
+
+def observed(stiffness_n_m3: float, cycles: int, states: Array) -> dict[str, Array]:
+    """What the states mean: force (n,) N, probe centre (n, 3) m, taxel pressures (n, 256) Pa.
+
+    Args:
+        stiffness_n_m3: of the layer.
+        cycles: of the trial.
+        states: (n, 12) counts and rates.
+    """
+    plant = Plant(trial(stiffness_n_m3, cycles)[0])
+    at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
+    truths = [plant.truth(state) for state in at]
+    return {
+        "force": np.array([t["force"] for t in truths]),
+        "centre": np.array([t["probe_centre"] for t in truths]),
+        "taxels": np.array([plant.pressure(state).ravel() for state in at]),
+    }
+
+
+# Study `workprec`: what the dynamic plant's integrators cost and how wrong they are, over steps and stiffness.
 
 STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
 """K/h of the layer, N/m³: foam, the default pad, steel, and a hundred times that. At 2 N: 3.3, 9.4, 30, 300 kN/m."""
@@ -44,8 +179,7 @@ FREE_METHODS, FREE_STEPS_US = ("rk4", "rosenbrock"), (1250.0, 312.5, 78.125)
 """Where the dynamics are not held: what tells the error of holding them."""
 ENOUGH = {"force": 1.0, "position": 2.9, "taxels": 0.29}
 """Errors below which nothing is gained: 1 % of the force, and what encoders (10 µm) and ADC round off, RMS."""
-MODEL = ("robot", "touch/objects.py", "touch/placed.py", "emulator/plant", "studies/workprec.py",
-         "studies/workprec_trial.py")  # fmt: skip
+MODEL = ("robot", "touch/objects.py", "touch/shapes.py", "emulator/plant", "studies/workprec.py")
 COLUMNS = (
     Column("stiffness_n_m3", "K/h N/m³", ".3g"),
     Column("held", "held"),
@@ -103,8 +237,6 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         rows.append(row | {"verdict": verdict(row)})
 
     def draw(path: Path) -> None:
-        from canprobe.studies.workprec_figure import draw_workprec
-
         draw_workprec(rows, floors, default_choice(), path)
 
     facts = measuring_facts(quick, 0, MODEL)
@@ -269,3 +401,69 @@ def _named(row: dict[str, Any] | None) -> str:
         )
     )
     return f"{row['method']} at {row['step_us']:.0f} µs, {how}, {row['cost_us']:.0f} µs a cycle{wrong}"
+
+
+# The picture of study `workprec`.
+
+COLOURS = {
+    "semi-implicit": AMBER,
+    "rk4": ORANGE,
+    "implicit": GREY,
+    "rosenbrock": BLUE,
+    "exponential": PINK,
+    "adaptive": GREEN,
+}
+MEASURES = (
+    ("force_percent", "force error (%)", "force"),
+    ("position_um", "position error (µm)", "position"),
+    ("taxel_counts", "taxel error (counts)", "taxels"),
+)
+
+
+def draw_workprec(
+    rows: Sequence[dict[str, Any]], floors: Mapping[float, dict[str, float]], default: dict[str, Any], path: Path
+) -> None:
+    """Error against cost: a row of panels a measure, a column a stiffness."""
+    title = (
+        "Dynamic plant: error against processor time a cycle of 2.5 ms, each dot a step size\n"
+        "solid: mass matrix, bias and contact geometry held over a cycle; dotted: evaluated in every call\n"
+        "ring: the default; open: rattles against a contact of 10 MN/m; shade: accurate enough"
+    )
+    with picture(path, title, 8.2) as figure:
+        grid = figure.subplots(len(MEASURES), len(floors), squeeze=False, sharex=True, sharey="row")
+        for line, (key, label, name) in zip(grid, MEASURES, strict=True):
+            known = [r for r in rows if r[key] is not None]
+            for axes, (stiffness, floor) in zip(line, floors.items(), strict=True):
+                _draw(axes, [r for r in known if r["stiffness_n_m3"] == stiffness], key, floor[key], default)
+                axes.axhspan(1e-12, ENOUGH[name], color=SHADE, linewidth=0, zorder=0)
+                log_scale(axes, "xy")
+            line[0].set_ylabel(label)
+            seen = [ENOUGH[name], *(max(r[key], floors[r["stiffness_n_m3"]][key]) for r in known)]
+            line[0].set_ylim(max(0.3 * min(seen), 1e-7), min(3.0 * max(seen), 1e3))
+        for axes, stiffness in zip(grid[0], floors, strict=True):
+            axes.set_title(f"K/h {stiffness:.3g} N/m³")
+        for axes in grid[-1]:
+            axes.set_xlabel("processor time a cycle (µs)")
+        legend(figure)
+
+
+def _draw(axes: Axes, rows: Sequence[dict[str, Any]], key: str, floor: float, default: dict[str, Any]) -> None:
+    """One panel; nothing below the reference's own error."""
+    for method, colour in COLOURS.items():
+        for held, line in ((True, "-"), (False, ":")):
+            mine = [r for r in rows if r["method"] == method and r["held"] is held]
+            axes.plot(
+                [r["cost_us"] for r in mine], [max(r[key], floor) for r in mine], line, color=colour,
+                label=method if held else None,
+            )  # fmt: skip
+            for stands in (True, False):
+                dots = [r for r in mine if r["stands"] is stands]
+                axes.plot(
+                    [r["cost_us"] for r in dots], [max(r[key], floor) for r in dots], "o", color=colour, markersize=4.5,
+                    markerfacecolor=colour if stands else "white",
+                )  # fmt: skip
+    chosen = [r for r in rows if all(r[name] == value for name, value in default.items())]
+    axes.plot(
+        [r["cost_us"] for r in chosen], [max(r[key], floor) for r in chosen], "o", markersize=12,
+        markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.4,
+    )  # fmt: skip

@@ -21,18 +21,20 @@ from time import process_time
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
 
 from canprobe.api import run as run_scene
-from canprobe.cell.tasks.probing import Phase
 from canprobe.errors import PlanError, SafetyStop
-from canprobe.planning import make_plan
-from canprobe.scene import PlantSettings, Scene
-from canprobe.scene_loader import load_scene
-from canprobe.scene_resolve import resolve
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import measuring_facts
+from canprobe.planning.make import make_plan
+from canprobe.results.picture import FAINT, INK, METHOD_COLOURS, legend, log_scale, picture
+from canprobe.scene.load import load_scene
+from canprobe.scene.model import PlantSettings, Scene
+from canprobe.scene.resolve import resolve
+from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
-from canprobe.touch.estimators import METHODS
+from canprobe.tasks.probing import Phase
+from canprobe.touch.estimate.fit import METHODS
 
 RATES_HZ = (100.0, 200.0, 400.0, 500.0, 1000.0, 2000.0)
 MODES = ("features", "window", "image")
@@ -117,8 +119,6 @@ def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
     ]
 
     def draw(path: Path) -> None:
-        from canprobe.studies.workprec_cell_figure import draw_cell
-
         draw_cell(rows, path)
 
     return StudyResult("workprec_cell", COLUMNS, rows, findings(rows), measuring_facts(quick, 1), draw)
@@ -301,3 +301,78 @@ def _told(row: Row) -> str:
         f"{what}: {row['cost_ms_per_s']:.0f} ms a second for {row['curvature_percent']:.1f} % of curvature, "
         f"{row['normal_deg']:.2f}° of normal, {row['force_percent']:.1f} % of force"
     )
+
+
+# The picture of the whole cell's half of study `workprec`.
+
+MARKS = {"features": "^", "window": "o", "image": "s"}
+SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
+PANELS = (
+    ("curvature_percent", "curvature error (%)"),
+    ("normal_deg", "normal error (deg)"),
+    ("force_percent", "force error (%)"),
+)
+
+
+def draw_cell(rows: Sequence[Row], path: Path) -> None:
+    """Error against cost: a row of panels a measure, a column a fidelity."""
+    title = (
+        "Whole cell: error against processor time a second of the scan, master, bus, nodes and plant in one process\n"
+        f"ring: the default; star: the knee; not drawn: {_left_out(rows)}"
+    )
+    with picture(path, title, 9.6) as figure:
+        grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")
+        for (key, label), line in zip(PANELS, grid, strict=True):
+            for fidelity, axes in zip(FIDELITIES, line, strict=True):
+                _draw(axes, rows, key, fidelity)
+            line[0].set_ylabel(label)
+        for fidelity, top, bottom in zip(FIDELITIES, grid[0], grid[-1], strict=True):
+            top.set_title(f"{fidelity} plant")
+            bottom.set_xlabel("processor time a second (ms)")
+        legend(figure, _keys(rows))
+
+
+def _left_out(rows: Sequence[Row]) -> str:
+    refused = sum(r["ended"] == "refused" for r in rows)
+    stopped = sum(r["ended"] == "stopped" for r in rows)
+    return f"{refused} settings that the plan refuses, {stopped} scans that were stopped for safety"
+
+
+def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:
+    mine = [r for r in rows if r["fidelity"] == fidelity and r.get(key) is not None]
+    for r in mine:
+        filled = {CLASSICAL: METHOD_COLOURS[r["method"]], FASTER: FAINT}.get(r["bus"], "none")
+        axes.scatter(
+            r["cost_ms_per_s"], r[key], s=SIZES.get(r["rate_hz"], 110.0), marker=MARKS[r["mode"]],
+            facecolor=filled, edgecolor=METHOD_COLOURS[r["method"]], linewidth=1.2,
+        )  # fmt: skip
+    knee, default = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
+    for chosen, mark, size in ((default, "o", 260.0), (knee, "*", 420.0)):
+        if chosen is not None and chosen.get(key) is not None:
+            axes.scatter(
+                chosen["cost_ms_per_s"], chosen[key], s=size, marker=mark, facecolor="none", edgecolor=INK,
+                linewidth=1.4,
+            )  # fmt: skip
+    axes.margins(0.12)
+    log_scale(axes, "xy")
+
+
+def _keys(rows: Sequence[Row]) -> list[Line2D]:
+    """Colours, marks and sizes that occur."""
+
+    def dot(label: str, colour: str, mark: str, size: float, fill: str | None = None) -> Line2D:
+        face = colour if fill is None else fill
+        return Line2D(
+            [], [], linestyle="none", marker=mark, color=colour, markerfacecolor=face, markersize=size, label=label
+        )
+
+    done = [r for r in rows if r["ended"] == "done"]
+    found = [dot(m, c, "o", 7.0) for m, c in METHOD_COLOURS.items() if any(r["method"] == m for r in done)]
+    found += [dot(m, INK, mark, 7.0) for m, mark in MARKS.items() if any(r["mode"] == m for r in done)]
+    rates = sorted({r["rate_hz"] for r in done})
+    found += [dot(f"{rate:.0f} Hz", INK, "o", SIZES.get(rate, 110.0) ** 0.5) for rate in rates]
+    if any(r["bus"] == FD for r in done):
+        found.append(dot("CAN FD", INK, "o", 7.0, "white"))
+    if any(r["bus"] == FASTER for r in done):
+        found.append(dot("8 Mbit/s, no CAN", INK, "o", 7.0, FAINT))
+    return found

@@ -1,4 +1,5 @@
-"""Contact of a spherical probe with an object: places, normals and rates.
+"""Contact of a spherical probe with an object: places, normals and rates, and what a touch at rest tells of the
+layer.
 
 Signs. Body f is the probe ("finger"), body o the object. `n_f`, `n_o` are OUTWARD unit normals, `n_f = -n_o` (14).
 K is a shape operator, here as a 3x3 tensor on the tangent plane, positive for convex, so that a point moving over a
@@ -22,8 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, positive
-from canprobe.touch.frames import cross, homogeneous, inverse_transform, tangent_rotation
+from canprobe.touch.linear_algebra import Array, positive
+
+# Contact of a spherical probe with an object: places, normals and rates.
 
 
 class Doubt(Enum):
@@ -48,7 +50,7 @@ class ContactSample:
         force_n: contact force, N.
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
-        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch_image`); None for none.
+        moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); None for none.
         doubts: about the image; estimators give the contact less weight and say so.
     """
 
@@ -87,11 +89,6 @@ def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple
     sine = math.hypot(x, y)
     scale = radius if sine < 1e-12 and z > 0.0 else radius * math.atan2(sine, z) / max(sine, 1e-300)
     return x * scale, y * scale
-
-
-def probe_contact_frame(direction: Array, radius: float) -> Array:
-    """T (4, 4) from the probe's contact frame (z = inward normal of the probe) to the probe frame."""
-    return homogeneous(tangent_rotation(-direction), radius * direction)
 
 
 def contact_on_object(T_base_probe: Array, direction: Array, radius: float, depth: float) -> tuple[Array, Array]:
@@ -143,81 +140,6 @@ def contact_sample(
     return ContactSample(t_s, point, normal, T_base_probe, arm, force_n, moments=moments, doubts=doubts)
 
 
-def point_in_object(T_base_object: Array, p_base: Array) -> Array:
-    """The contact point in the object's frame (21), (22)."""
-    T = inverse_transform(T_base_object)
-    result: Array = T[:3, :3] @ p_base + T[:3, 3]
-    return result
-
-
-def contact_orientation_in_object(
-    T_base_object: Array, T_base_probe: Array, T_probe_cf: Array, R_cf_co: Array
-) -> Array:
-    """Axes of the object's contact frame in the object's frame, `R_o_c = R_bᵀ R_s R_cf R_cf_co` (23)."""
-    result: Array = T_base_object[:3, :3].T @ T_base_probe[:3, :3] @ T_probe_cf[:3, :3] @ R_cf_co
-    return result
-
-
-def facing_rotation(spin: float = 0.0) -> Array:
-    """R (3, 3) from the object's to the probe's contact frame: z opposed, x turned by `spin` rad."""
-    c, s = math.cos(spin), math.sin(spin)
-    return np.array([[c, s, 0.0], [s, -c, 0.0], [0.0, 0.0, -1.0]])
-
-
-def material_velocity(origin: Array, origin_velocity: Array, omega: Array, point: Array) -> Array:
-    """V: velocity of the point of a rigid body that is now at `point`."""
-    return origin_velocity + cross(omega, point - origin)
-
-
-def velocity_over_object(v_f: Array, V_f: Array, V_o: Array) -> Array:
-    """v_o = v_f + V_f − V_o (17)–(19): how the contact point moves over the object."""
-    return v_f + V_f - V_o
-
-
-def normal_rate_residual(  # noqa: PLR0917 - the equation's own symbols in its order
-    K_o: Array, v_o: Array, K_f: Array, v_f: Array, omega_f: Array, omega_o: Array, n_o: Array
-) -> Array:
-    """`K_o v_o + K_f v_f − (ω_f − ω_o) × n_o` (16): zero in a motion that keeps contact.
-
-    Args:
-        K_o, K_f: (3, 3) shape operators as tensors.
-        v_o, v_f: (3,) velocities of the contact point over the object and over the probe, m/s.
-        omega_f, omega_o: (3,) rad/s.
-        n_o: (3,) outward unit normal of the object.
-    """
-    result: Array = K_o @ v_o + K_f @ v_f - cross(omega_f - omega_o, n_o)
-    return result
-
-
-def contact_velocities(K_o: Array, K_f: Array, V_rel: Array, omega_rel: Array, n_o: Array) -> tuple[Array, Array]:
-    """How the contact moves over both bodies when the motion is given: (16) and (19) solved together.
-
-    Args:
-        K_o, K_f: (3, 3) shape operators as tensors.
-        V_rel: (3,) V_f − V_o, m/s; its normal part must be 0 for contact to last.
-        omega_rel: (3,) ω_f − ω_o, rad/s; its part along the normal drops out.
-        n_o: (3,) outward unit normal of the object.
-
-    Returns:
-        v_o, v_f (3,) m/s.
-
-    Raises:
-        UsageError: where K_o + K_f is singular on the tangent plane (surfaces that fit into each other).
-    """
-    P = tangent_rotation(-n_o)[:, :2]
-    slide = V_rel - n_o * float(n_o @ V_rel)
-    relative = P.T @ (K_o + K_f) @ P
-    if abs(float(np.linalg.det(relative))) <= 1e-12 * float(np.abs(relative).max()) ** 2:
-        raise UsageError("K_o + K_f: expected surfaces that touch at a point, got a singular relative curvature")
-    v_f = P @ np.linalg.solve(relative, P.T @ (cross(omega_rel, n_o) - K_o @ slide))
-    return v_f + slide, v_f
-
-
-def sphere_tensor(radius: float, normal: Array) -> Array:
-    """Shape operator (3, 3) of a sphere at the point with this unit normal, 1/m."""
-    return (np.eye(3) - np.outer(normal, normal)) / radius
-
-
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:
     """Indentation of the elastic layer under a force.
 
@@ -241,3 +163,164 @@ def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, k
     if min(1.0 / radius + k1, 1.0 / radius + k2) <= 0.0:
         raise UsageError(f"kappa: expected above {-1.0 / radius:.4g} per m (the probe's own curvature), got {k1}, {k2}")
     return math.sqrt(max(force, 0.0) * 2.0 * math.sqrt(ab) / (math.pi * stiffness_n_m3))
+
+
+# The layer's compliance from a touch: how the force grows while the probe is pushed into an object that stands still.
+#
+# On a Winkler layer `F = π k δ² / (2 √(AB))`, so the root of the force is a straight line over the push, whatever the
+# curvatures: its slope b is what the servo needs, `δ = √F / b`; with the curvatures known it gives `k = 2 √(AB) b² /
+# π`. Stops being true where the patch is cut by the pad's edge or the object slides away.
+
+SIGMA_ROOT = 0.03
+"""Noise of √F, √N: a force of 1 N known to 6 %, its slow errors (hysteresis, creep) included."""
+MOST_SCATTER = 3.3
+"""RMS distance from the line over the noise above which it is none."""
+LEAST_FORCE_N = 0.1
+"""Below it threshold and noise of the array bend the line."""
+SAMPLES_OF_A_PUSH = 6
+
+
+class PushFit:
+    """Straight line of √F over the push, from running means (Welford): constant time and memory.
+
+    Both have errors, and on a stiff contact a micrometre of the push is a large force. The line is that of the root on
+    the push as it was measured, which errors make flatter: it is to tell the force where the encoders say the probe is.
+
+    Example: `fit.add(push, force)` for every tactile frame of a touch; `fit.slope` once `fit.certain(0.1)`.
+
+    Args:
+        push_sigma: standard deviation of a push, m, independent from sample to sample.
+    """
+
+    def __init__(self, push_sigma: float = 0.0) -> None:
+        self._push_variance = push_sigma * push_sigma
+        self._n = 0
+        self._push = self._root = 0.0  # means
+        self._spread = self._joint = self._root_spread = 0.0  # sums of products about them
+
+    def add(self, push: float, force: float) -> None:
+        """Take one sample.
+
+        Args:
+            push: way of the probe towards the object along its normal, from any zero, m.
+            force: N; too small a one is left out.
+        """
+        if not (force >= LEAST_FORCE_N and math.isfinite(push)):
+            return
+        root = math.sqrt(force)
+        self._n += 1
+        from_mean = push - self._push
+        self._push += from_mean / self._n
+        root_from_mean = root - self._root
+        self._root += root_from_mean / self._n
+        self._spread += from_mean * (push - self._push)
+        self._joint += from_mean * (root - self._root)
+        self._root_spread += root_from_mean * (root - self._root)
+
+    @property
+    def slope(self) -> float:
+        """b, √N per m; NaN where there is none yet."""
+        return self._joint / self._spread if self._determined else math.nan
+
+    @property
+    def start(self) -> float:
+        """Push at which the line has no force any more, m: where the touch began; NaN where there is no slope yet."""
+        return self._push - self._root / self.slope if self._determined else math.nan
+
+    @property
+    def sigma(self) -> float:
+        """Its standard deviation, √N per m; infinite where there is no slope."""
+        return self._noise / math.sqrt(self._spread) if self._determined else math.inf
+
+    def certain(self, share: float) -> bool:
+        """Whether the slope is positive, known to this share of itself (1σ), and the samples lie on the line.
+
+        A sensor that sends nonsense has a slope too; its samples are off the line.
+        """
+        return self.slope > 0.0 and self.sigma < share * self.slope and self.scatter < MOST_SCATTER * self._noise
+
+    @property
+    def scatter(self) -> float:
+        """RMS distance of √F from the line, √N; infinite where there is no slope."""
+        if not self._determined:
+            return math.inf
+        return math.sqrt(max(self._root_spread - self._joint**2 / self._spread, 0.0) / (self._n - 2))
+
+    @property
+    def _noise(self) -> float:
+        """Of a sample about the line, √N: that of the root and that of the push, seen along the slope."""
+        return math.sqrt(SIGMA_ROOT**2 + self.slope**2 * self._push_variance)
+
+    @property
+    def _determined(self) -> bool:
+        return self._n >= SAMPLES_OF_A_PUSH and self._spread > 0.0
+
+
+def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float:
+    """K/h of the layer (N/m³) from the slope of √F over the indentation on an object of known curvature.
+
+    Args:
+        slope: b, √N per m.
+        radius: R_p of the probe, m.
+        kappa: (2,) principal curvatures of the object, 1/m; above −1/R_p.
+
+    Source: the inverse of `canprobe.touch.contact.indentation_from_force`.
+    """
+    k1, k2 = (float(k) for k in np.asarray(kappa, dtype=np.float64))
+    return 2.0 * math.sqrt(0.25 * (1.0 / radius + k1) * (1.0 / radius + k2)) * slope * slope / math.pi
+
+
+# What the samples of a touch at rest say against going on: a force that swings, an array that cannot show it.
+
+MOST_SPREAD = 0.2
+"""Standard deviation of the force over the target above which it has not settled: twice that of a 40 kN/m contact."""
+MOST_SATURATED = 0.75
+"""Share of saturated samples above which the measured force is only a lower bound of the true one.
+
+That alone is no reason: up to 40 kN/m the bound is near enough. Where √F did not grow on a line either, it is not.
+"""
+SAMPLES_AT_REST = 10
+
+
+class AtRest:
+    """Spread and saturation from running means (Welford): constant time and memory."""
+
+    def __init__(self) -> None:
+        self._n = self._saturated = 0
+        self._mean = self._spread = 0.0
+
+    def add(self, force: float, saturated: bool) -> None:
+        """Take one sample.
+
+        Args:
+            force: N.
+            saturated: a taxel is at its largest count.
+        """
+        self._n += 1
+        self._saturated += saturated
+        from_mean = force - self._mean
+        self._mean += from_mean / self._n
+        self._spread += from_mean * (force - self._mean)
+
+    def doubt(self, target: float, felt: bool) -> str | None:
+        """Why the force is not the wanted one; None where all is well, or nobody can tell.
+
+        Args:
+            target: N.
+            felt: the touch told its stiffness, see `canprobe.touch.contact`.
+        """
+        if self._n < SAMPLES_AT_REST:
+            return None
+        if not felt and self._saturated > MOST_SATURATED * self._n:
+            return (
+                f"the array is saturated in {100.0 * self._saturated / self._n:.0f} % of the samples and no stiffness "
+                f"was felt: the true force is above the {self._mean:.1f} N measured; raise sensor.full_scale_kpa or "
+                "lower task.force_n"
+            )
+        sigma = math.sqrt(self._spread / (self._n - 1))
+        if sigma > MOST_SPREAD * target:
+            return (
+                f"the force does not settle: {self._mean:.1f} ± {sigma:.1f} N where {target:.1f} N are wanted; the "
+                "contact is too stiff for the arm's encoder counts, or servo.surface_height_hz too high"
+            )
+        return None

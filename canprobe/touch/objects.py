@@ -1,6 +1,6 @@
 """True object geometry: the touchable surfaces by name (``make_object``), and those of first and second degree.
 
-What they share, frames and signs included, is told in ``placed``.
+What they share, frames and signs included, is told in ``shapes``.
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from types import MappingProxyType
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.touch.bowl import Bowl
-from canprobe.touch.placed import (
+from canprobe.touch.shapes import (
     Array,
+    Bowl,
     ClosestPoint,
+    Fillet,
     Foot,
     Nearest,
     ObjectShape,
     PlacedShape,
+    Torus,
     Touches,
+    Wave,
     osculating_matrix,
     require_positive,
     tangent_of,
 )
-from canprobe.touch.profiles import Fillet, Wave
-from canprobe.touch.torus import Torus
 
 __all__ = [
     "OBJECT_PARAMETERS",

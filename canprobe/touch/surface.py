@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
-from canprobe.touch._arrays import Array, checked, read_only
-from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.touch.linear_algebra import Array, checked, homogeneous, read_only, tangent_rotation
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -19,12 +19,12 @@ import can
 import canopen
 import pytest
 
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.eds import eds_path, load_eds
-from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.node import SlaveNode
-from canprobe.emulator.tactile import make_tactile_node
+from canprobe.bus.port import VirtualClock
+from canprobe.eds.packaged import eds_path, load_eds
+from canprobe.emulator.array import make_tactile_node
+from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.node.slave_node import SlaveNode
 
 CYCLE_NS = 2_500_000
 UPLOAD = 0x601, bytes.fromhex("4000100000000000")

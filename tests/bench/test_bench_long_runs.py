@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimators import make_estimator
+from canprobe.touch.estimate.fit import make_estimator
 from canprobe.touch.surface import SurfaceMatrix
 
 SIGMA_POINT, SIGMA_NORMAL = 2e-5, 1e-3

@@ -8,13 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from canprobe.cell.tasks.calibration import array_calibration
-from canprobe.cell.tasks.patch_fits import moment_model
 from canprobe.touch.contact import ContactSample
-from canprobe.touch.estimators import make_estimator
-from canprobe.touch.patch_curvature import PatchCurvature
-from canprobe.touch.patch_fusion import patch_estimate, with_patch
-from canprobe.touch.patch_image import MomentImage
+from canprobe.touch.estimate.fit import make_estimator
+from canprobe.touch.patch.array_model import array_calibration, moment_model
+from canprobe.touch.patch.curvature import PatchCurvature, patch_estimate, with_patch
+from canprobe.touch.patch.moments import MomentImage
 
 MODEL = moment_model(array_calibration(100e3), 1.27e8, windowed=True)
 MOMENTS = MODEL.moments((0.0, 0.0, 27.8), 2.0)

@@ -7,16 +7,12 @@ import numpy as np
 import pytest
 
 from canprobe.emulator.plant.config import PlantConfig
-from canprobe.emulator.plant.contact import depth_for_force
+from canprobe.emulator.plant.plant import Plant
+from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.emulator.plant.world import Plant
-from canprobe.robot.damped import damped_step
-from canprobe.robot.dynamics import RigidBody
-from canprobe.robot.inertia import puma260_inertia
-from canprobe.robot.inverse import inverse_near
-from canprobe.robot.kinematics import forward, forward_jacobian, tool_z_offset
-from canprobe.robot.puma260 import ELBOW_FORM, UPENN
-from canprobe.robot.touching import start_posture
+from canprobe.robot.dynamics import RigidBody, puma260_inertia
+from canprobe.robot.inverse import damped_step, inverse_near, start_posture
+from canprobe.robot.kinematics import ELBOW_FORM, UPENN, forward, forward_jacobian, tool_z_offset
 from canprobe.touch.objects import make_object
 
 POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)

@@ -14,12 +14,12 @@ import numpy as np
 import pytest
 from timed_buses import Scripted
 
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import VirtualClock
 from canprobe.bus.timed import TimedBus
-from canprobe.eds import load_eds
-from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.tactile import make_tactile_node
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.array import make_tactile_node
+from canprobe.emulator.drive.drive import make_drive_node
 
 CYCLE_NS = 2_500_000
 ROUNDS, TURNS = 11, 300

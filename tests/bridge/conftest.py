@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.api import Observation
-from canprobe.results import RunResult
-from canprobe.scene_loader import parse_scene
-from canprobe.scene_writer import dump_scene
+from canprobe.cell.cycle import Observation
+from canprobe.results.summary import RunResult
+from canprobe.scene.load import dump_scene, parse_scene
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ import canprobe
 from canprobe.cli import main
 from canprobe.errors import SceneError, UsageError
 from canprobe.planning.bridges import BRIDGES, BridgeInfo, check_bridges
-from canprobe.planning.export import plan_dict
-from canprobe.planning.text import plan_text
-from canprobe.scene import BridgeName
-from canprobe.scene_loader import dump_scene, parse_scene
+from canprobe.planning.report import plan_dict, plan_text
+from canprobe.scene.load import dump_scene, parse_scene
+from canprobe.scene.model import BridgeName
 
 FREE = dump_scene(canprobe.load_scene("free"))
 
@@ -88,7 +87,7 @@ def test_a_missing_extra_is_named_with_its_pip_line(monkeypatch):
 
 def test_a_run_without_a_bridge_imports_none():
     program = (
-        "import sys, canprobe, canprobe.api, canprobe.session, canprobe.cell.observe\n"
+        "import sys, canprobe, canprobe.api, canprobe.session, canprobe.cell.cycle\n"
         "canprobe.run(canprobe.load_scene('free'), files=False, duration_s=0.05)\n"
         "wrong = [m for m in sys.modules if m.split('.')[0] in ('rosbags', 'mcap', 'foxglove', 'cyclonedds', 'pandas')"
         " or m.startswith('canprobe.bridge.')]\n"

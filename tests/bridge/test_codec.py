@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.bridge.codec import pack_observation, unpack_observation
-from canprobe.bridge.source import SampleSource
-from canprobe.cell.measurement import Command, Measurement, TactileSample
-from canprobe.cell.observe import Observation
+from canprobe.bridge.process import pack_observation, unpack_observation
+from canprobe.bridge.worker import SampleSource
+from canprobe.cell.controller import Command, Measurement, TactileSample
+from canprobe.cell.cycle import Observation
 from canprobe.protocol.tactile import Features, TactileFrame, TactileHeader, TactileMode
 
 WINDOW = TactileFrame(

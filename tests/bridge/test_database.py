@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.bridge.database import FORMATS, write_database
-from canprobe.bridge.signals import describe_frames, identifier
-from canprobe.bus.candump import read_candump
+from canprobe.bridge.database import FORMATS, describe_frames, identifier, write_database
+from canprobe.bus.disk import read_candump
 from canprobe.errors import UsageError
 from canprobe.protocol.pdo import PdoEntry
-from canprobe.robot.puma260 import MODELS
-from canprobe.scene_loader import load_scene
+from canprobe.robot.kinematics import MODELS
+from canprobe.scene.load import load_scene
 
 
 @pytest.fixture(params=FORMATS)

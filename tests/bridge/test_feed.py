@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.bridge import feed as feed_module
-from canprobe.bridge.feed import Feed, read_records
+from canprobe.bridge import process as feed_module
+from canprobe.bridge.process import Feed, read_records
 
 
 @pytest.fixture

@@ -21,12 +21,11 @@ from websockets.exceptions import InvalidHandshake
 from websockets.sync.client import connect
 
 import canprobe
+from canprobe.bridge.messages import TOPICS
 from canprobe.bridge.process import END_TIMEOUT_S, BridgeProcess
-from canprobe.bridge.topics import TOPICS
-from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.port import MonotonicClock
 from canprobe.errors import UsageError
-from canprobe.scene_loader import parse_scene
-from canprobe.scene_writer import dump_scene
+from canprobe.scene.load import dump_scene, parse_scene
 
 PROTOCOL = "foxglove.sdk.v1"
 

@@ -16,13 +16,12 @@ from undrawn import undrawn_run
 
 import canprobe
 import canprobe.errors
-from canprobe.bridge.cdr import Encoder
-from canprobe.bridge.messages import Messages
+from canprobe.bridge.messages import Encoder, Messages
 from canprobe.bridge.sample import CanFrame, Sample
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
 from canprobe.cli import main
-from canprobe.eds import eds_path
-from canprobe.recorded_bridges import replay_into
+from canprobe.eds.packaged import eds_path
+from canprobe.recorded.into_bridges import replay_into
 
 RADIUS = 0.036
 

@@ -15,9 +15,9 @@ from waiting import wait_for_size
 import canprobe
 from canprobe.bridge import process as process_module
 from canprobe.bridge.process import BridgeProcess
-from canprobe.cell.observe import Observation
+from canprobe.cell.cycle import Observation
 from canprobe.errors import UsageError
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def pid_of(bridge):
 
 
 def run_cell(plan, *observers):
-    from canprobe.cell.build import make_task
+    from canprobe.tasks.from_plan import make_task
 
     session = Session(plan.scene, None, observers=observers)
     with session:
@@ -101,8 +101,8 @@ def test_one_that_cannot_begin_stops_the_run_before_anything_is_sent(tmp_path):
 
 def test_samples_count_what_was_dropped_before_them(plan):
     """What the viewer is shown of losses: the number travels with the next sample."""
-    from canprobe.bridge.codec import pack_observation, unpack_observation
-    from canprobe.bridge.source import SampleSource
+    from canprobe.bridge.process import pack_observation, unpack_observation
+    from canprobe.bridge.worker import SampleSource
 
     sample = SampleSource(plan).sample(unpack_observation(pack_observation(Observation(0, None, None, []), 17)))
     assert sample.dropped == 17

@@ -11,18 +11,12 @@ from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import Policy
 
 import canprobe
-from canprobe.bridge.cdr import Encoder, encode_can_frame
-from canprobe.bridge.codec import pack_observation, unpack_observation
-from canprobe.bridge.limits import refuse
-from canprobe.bridge.messages import Messages
-from canprobe.bridge.process import BridgeProcess
-from canprobe.bridge.ros2_dds import EMPTY, FLOAT64, FORCE, SPEED, STATUS, STOP, Ros2Node
-from canprobe.bridge.ros2_types import DdsTypes, dds_name
+from canprobe.bridge.messages import JOINT_STATES, TAXELS, TF_STATIC, TOPICS, Encoder, Messages, encode_can_frame
+from canprobe.bridge.process import BridgeProcess, pack_observation, unpack_observation
+from canprobe.bridge.ros2_dds import EMPTY, FLOAT64, FORCE, SPEED, STATUS, STOP, DdsTypes, Ros2Node, dds_name, refuse
 from canprobe.bridge.sample import CanFrame
-from canprobe.bridge.source import SampleSource
-from canprobe.bridge.topics import JOINT_STATES, TAXELS, TF_STATIC, TOPICS
-from canprobe.scene_loader import parse_scene
-from canprobe.scene_writer import dump_scene
+from canprobe.bridge.worker import SampleSource
+from canprobe.scene.load import dump_scene, parse_scene
 
 DOMAIN = 90 + os.getpid() % 100  # of this test alone; 232 is the highest
 

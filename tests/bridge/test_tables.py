@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import UsageError
-from canprobe.tables import load_table, npz_to_parquet, parquet_to_npz, to_frame, unit_of, write_parquet
+from canprobe.results.files import load_table, npz_to_parquet, parquet_to_npz, to_frame, unit_of, write_parquet
 
 
 @pytest.fixture

@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from canprobe.bridge.transforms import flange_transform, link_transforms, quaternion_of
-from canprobe.robot.kinematics import forward
-from canprobe.robot.puma260 import MODELS
+from canprobe.bridge.sample import flange_transform, link_transforms, quaternion_of
+from canprobe.robot.kinematics import MODELS, forward
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)

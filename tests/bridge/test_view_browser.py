@@ -24,7 +24,7 @@ from zstandard import ZstdDecompressor
 import canprobe
 from canprobe.bridge.process import BridgeProcess
 from canprobe.cli import main
-from canprobe.scene import BridgeSettings
+from canprobe.scene.model import BridgeSettings
 
 ROOT = Path(__file__).parents[2]
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)

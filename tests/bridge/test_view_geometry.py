@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 from canprobe.bridge.sample import SurfacePatch
-from canprobe.bridge.view import arm, colours, meshes, objects, patch, taxels
-from canprobe.emulator.plant.field import pad_coordinates
-from canprobe.robot.kinematics import chain, forward, tool_z_offset
-from canprobe.robot.puma260 import MODELS
-from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.bridge.view import bodies as arm
+from canprobe.bridge.view import bodies as objects
+from canprobe.bridge.view import bodies as patch
+from canprobe.bridge.view import bodies as taxels
+from canprobe.bridge.view import meshes
+from canprobe.bridge.view import meshes as colours
+from canprobe.emulator.plant.taxels import pad_coordinates
+from canprobe.robot.kinematics import MODELS, chain, forward, tool_z_offset
+from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 
 MODEL = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS.keys())
@@ -157,7 +161,7 @@ def test_taxels_lie_where_the_plant_has_them():
         assert (u / pitch + 7.5, v / pitch + 7.5) == pytest.approx((k % 16, k // 16), abs=1e-9)
         up = (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y))  # where the quaternion takes z
         assert up == pytest.approx(direction, abs=1e-12)
-    assert np.linalg.norm(places, axis=1) == pytest.approx(radius + taxels.LIFT_M)
+    assert np.linalg.norm(places, axis=1) == pytest.approx(radius + taxels.TAXEL_LIFT_M)
 
 
 def test_the_image_has_u_to_the_right_and_v_upward():
@@ -223,7 +227,7 @@ def test_the_patch_of_a_ball_lies_on_the_ball():
     shape = patch.patch_shape(sphere_patch(), xy)
     r = np.hypot(*xy.T)
     exact = 0.05 - np.sqrt(0.05**2 - r**2)
-    assert np.abs(shape.surface[:, 2] + patch.LIFT_M - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
+    assert np.abs(shape.surface[:, 2] + patch.PATCH_LIFT_M - exact).max() < patch.RADIUS_M**4 / (6 * 0.05**3)
     mesh = meshes.Mesh(shape.surface, patch.disc_faces())
     assert (normals(mesh)[:, 2] < 0).all()  # z is the inward normal
     assert np.linalg.norm(normals(mesh), axis=1).sum() / 2 == pytest.approx(math.pi * patch.RADIUS_M**2, rel=0.04)

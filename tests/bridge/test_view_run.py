@@ -14,19 +14,28 @@ from msgspec import msgpack
 from zstandard import ZstdDecompressor
 
 import canprobe
-from canprobe.bridge.codec import pack_observation, unpack_observation
+from canprobe.bridge.process import pack_observation, unpack_observation
 from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
-from canprobe.bridge.source import SampleSource
-from canprobe.bridge.view.curves import curves_of, kappa_sigmas, row_of
-from canprobe.bridge.view.moments import SILENT_NS, Follower, Moment, curvature_error, curvature_sigma, true_kappa
+from canprobe.bridge.view.browser import trail_of
+from canprobe.bridge.view.instants import (
+    SILENT_NS,
+    Follower,
+    Moment,
+    curvature_error,
+    curvature_sigma,
+    curves_of,
+    kappa_sigmas,
+    row_of,
+    true_kappa,
+)
+from canprobe.bridge.view.path import GAP_M, LIFT_M, Trail, error_scale
 from canprobe.bridge.view.recorded import read_run
-from canprobe.bridge.view.replay import trail_of
-from canprobe.bridge.view.trail import GAP_M, LIFT_M, Trail, error_scale
-from canprobe.bus.candump import read_candump
+from canprobe.bridge.worker import SampleSource
+from canprobe.bus.disk import read_candump
 from canprobe.errors import CanprobeError
 from canprobe.protocol.frames import SYNC_ID
-from canprobe.scene_geometry import true_object
-from canprobe.touch.frames import homogeneous, tangent_rotation
+from canprobe.scene.geometry import true_object
+from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.objects import make_object
 
 
@@ -247,8 +256,7 @@ def test_the_page_holds_the_whole_run(page, run):
 
 
 def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
-    from canprobe.robot.kinematics import forward
-    from canprobe.robot.puma260 import MODELS
+    from canprobe.robot.kinematics import MODELS, forward
 
     places = [
         m["position"]

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from canprobe.bus.clock import MonotonicClock, VirtualClock
+from canprobe.bus.port import MonotonicClock, VirtualClock
 
 
 def test_virtual_time_stands_still_and_jumps() -> None:

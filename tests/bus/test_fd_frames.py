@@ -9,9 +9,9 @@ import uuid
 import can
 import pytest
 
-from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.interfaces import open_port
 from canprobe.bus.mmsg import BatchedSocket, PlainSocket
-from canprobe.bus.open import open_port
+from canprobe.bus.port import MonotonicClock
 from canprobe.errors import InterfaceError
 
 LONG = bytes(range(64))

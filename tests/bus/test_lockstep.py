@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from timed_buses import Scripted
 
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, Frame
+from canprobe.bus.port import VirtualClock
 from canprobe.errors import BusError, InterfaceError
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
 MS = 1_000_000
 

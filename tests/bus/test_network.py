@@ -10,11 +10,11 @@ from canopen.nmt import NmtError
 from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import RTR_FLAG, Frame
+from canprobe.bus.port import VirtualClock
 from canprobe.errors import UsageError
+from canprobe.protocol.frames import RTR_FLAG, Frame
 
 MS = 1_000_000
 LONG = bytes(range(256)) * 3 + b"end"

@@ -14,10 +14,8 @@ import uuid
 
 import pytest
 
-from canprobe.bus.clock import MonotonicClock
-from canprobe.bus.configured import configured_bus
-from canprobe.bus.echoes import Echoes
-from canprobe.bus.open import open_port
+from canprobe.bus.interfaces import Echoes, configured_bus, open_port
+from canprobe.bus.port import MonotonicClock
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, UsageError
 
@@ -172,8 +170,8 @@ def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monk
     from argparse import Namespace
     from dataclasses import replace
 
-    from canprobe.cli.target import Target, target_of
-    from canprobe.scene_loader import load_scene
+    from canprobe.cli.parser import Target, target_of
+    from canprobe.scene.load import load_scene
 
     monkeypatch.setenv("CAN_INTERFACE", "pcan")
     monkeypatch.setenv("CAN_CHANNEL", "PCAN_USBBUS1")
@@ -197,8 +195,8 @@ def test_channels_of_a_scene_with_two_buses(bare):
     from argparse import Namespace
     from dataclasses import replace
 
-    from canprobe.cli.target import Target, target_of
-    from canprobe.scene_loader import load_scene
+    from canprobe.cli.parser import Target, target_of
+    from canprobe.scene.load import load_scene
 
     scene = load_scene("press")
     scene = replace(scene, sensor=replace(scene.sensor, channel="can1"))

@@ -8,13 +8,12 @@ from collections.abc import Callable, Iterator
 import can
 import pytest
 
-from canprobe.bus.clock import MonotonicClock, VirtualClock
+from canprobe.bus.interfaces import PythonCanPort, open_port
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.open import open_port
-from canprobe.bus.port import EFF_FLAG, RTR_FLAG, ControllerState, Port, Reports, TimedFrame
-from canprobe.bus.pythoncan import PythonCanPort
+from canprobe.bus.port import ControllerState, MonotonicClock, Port, Reports, TimedFrame, VirtualClock
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import BusError, InterfaceError, UsageError
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 
 HOUR_NS = 3600 * 10**9
 BITRATE = 1_000_000

@@ -13,13 +13,13 @@ from collections.abc import Iterator, Sequence
 
 import pytest
 
-from canprobe.bus.clock import MonotonicClock
-from canprobe.bus.guest_setup import make_link, remove_link, set_link
+from canprobe.bus.interfaces import PythonCanPort
 from canprobe.bus.mmsg import Row
-from canprobe.bus.port import EFF_FLAG, ERR_FLAG, ControllerState, Frame, Reports, TimedFrame
-from canprobe.bus.pythoncan import PythonCanPort
+from canprobe.bus.port import ERR_FLAG, ControllerState, MonotonicClock, Reports, TimedFrame
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
+from canprobe.protocol.frames import EFF_FLAG, Frame
+from canprobe.vcan.guest_setup import make_link, remove_link, set_link
 
 pytestmark = pytest.mark.vcan
 

@@ -9,10 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from timed_buses import BIT, INTERMISSION, Scripted, Source, make_bus
 
-from canprobe.bus.port import Frame
 from canprobe.errors import BusError
 from canprobe.protocol.frame_bits import exact_bits, worst_case_bits
-from canprobe.protocol.timing import Message, worst_case_response
+from canprobe.protocol.frames import Frame
+from canprobe.protocol.response_times import Message, worst_case_response
 
 
 def ends(*frames: Frame, at: int = 0) -> list[int]:

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from timed_buses import BIT, INTERMISSION, Scripted, Source, make_bus
+from wire_faults import Babbler, ErrorsAt
 
-from canprobe.bus.babbler import Babbler
-from canprobe.bus.fault_confinement import ErrorCounters
+from canprobe.bus.controllers import ErrorCounters
 from canprobe.bus.port import ControllerState
-from canprobe.bus.wire_errors import BitErrors, ErrorsAt
+from canprobe.bus.timed import BitErrors
 from canprobe.protocol.frame_bits import exact_bits
-from canprobe.protocol.timing import Errors, Message, worst_case_response
+from canprobe.protocol.response_times import Errors, Message, worst_case_response
 
 ERROR_BITS = 12 + 8 + 3  # two flags one behind the other, delimiter, intermission
 FRAME = (0x155, b"\x55\x55")

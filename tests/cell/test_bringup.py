@@ -15,12 +15,11 @@ import canprobe
 from canprobe.bus.sdo_client import upload
 from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
-from canprobe.eds import eds_path
-from canprobe.emulator.build import make_world
-from canprobe.emulator.faults import Fault, FaultKind
-from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.eds.packaged import eds_path
+from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
+from canprobe.emulator.world import make_world
 from canprobe.errors import BusError, InterfaceError, NodeError
-from canprobe.session import Session
+from canprobe.session.session import Session
 
 MS = 1_000_000
 
@@ -50,7 +49,7 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
 
 
 def frames(tmp_path):
-    from canprobe.bus.candump import read_candump
+    from canprobe.bus.disk import read_candump
 
     return [(t, can_id, data) for t, _, can_id, data in read_candump(tmp_path / "bus.log")]
 

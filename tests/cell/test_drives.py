@@ -3,10 +3,19 @@
 import numpy as np
 import pytest
 
-from canprobe.cell.drives import DriveAxis, DriveGroup
+from canprobe.cell.drives import (
+    BASE_COUNTS,
+    CARRIED_CYCLES,
+    STEADY,
+    DriveAxis,
+    DriveGroup,
+    PositionTrack,
+    TactileReceiver,
+)
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.robot.puma260 import MODELS, joints_to_counts
+from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_frame
+from canprobe.robot.kinematics import MODELS, joints_to_counts
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
@@ -116,3 +125,151 @@ def test_a_fault_reset_that_did_not_take_gets_a_new_edge():
         hear(group, [0] * 6, status=DriveState.FAULT.value)
         words.append(group.frames()[0][1][0] >> 7)
     assert words == [1, 0, 1, 0]
+
+
+# Positions that a motor can and cannot have reached, and where it is when nobody says.
+
+PERIOD = 2_500_000
+
+
+def moving(rate=10, cycles=20, track=None):
+    track = track or PositionTrack()
+    for k in range(cycles):
+        track.aim(abs(rate))
+        assert track.take(rate * k, k, k * PERIOD, guarded=True) or k == 0
+    return track
+
+
+@pytest.mark.parametrize("rate", [0, 10, -300])
+def test_a_steady_motion_is_believed_and_carried_on(rate):
+    track = moving(rate)
+    for age in range(1, 8):
+        assert track.position(19 + age, (19 + age) * PERIOD) == pytest.approx(rate * (19 + min(age, CARRIED_CYCLES)))
+    assert track.position(19, 19 * PERIOD) == rate * 19
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_jump_is_not_believed_and_the_next_right_one_is(sign):
+    track = moving(10)
+    assert not track.take(200 + sign * 60, 20, 20 * PERIOD, guarded=True)
+    assert (track.counts, track.cycle) == (190, 19)
+    assert track.take(210, 21, 21 * PERIOD, guarded=True)
+    assert track.position(22, 22 * PERIOD) == pytest.approx(220)
+
+
+def test_before_the_drive_is_enabled_everything_is_believed_but_nothing_at_rest():
+    track = PositionTrack()
+    for k in range(STEADY + 1):
+        track.take(1000, k, k * PERIOD, guarded=False)
+    assert track.steady >= STEADY
+    assert track.take(5000, 9, 9 * PERIOD, guarded=False)
+    assert track.steady == 0
+    track.take(1000, 10, 10 * PERIOD, guarded=False)
+    assert track.steady == 0
+
+
+def test_a_start_and_a_stop_are_believed():
+    """A drive of 30 Hz behind a ramp that begins and ends at once: x'' = ω²(r − x) − 2 ζ ω x'."""
+    omega, dt, x, v = 188.0, 2.5e-3, 0.0, 0.0
+    track, reference = PositionTrack(), 0.0
+    for k in range(200):
+        step = 40.0 if 50 <= k < 120 else 0.0
+        track.aim(step)
+        for _ in range(50):
+            reference += step / 50
+            a = omega**2 * (reference - x) - 2 * 0.9 * omega * v
+            v += a * dt / 50
+            x += v * dt / 50
+        assert track.take(round(x), k, k * PERIOD, guarded=True), k
+    assert track.counts == pytest.approx(40 * 70, abs=1)
+
+
+def test_noise_of_some_counts_is_believed():
+    track = PositionTrack()
+    for k in range(50):
+        assert track.take((k % 2) * (BASE_COUNTS // 3), k, k * PERIOD, guarded=True)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_wrong_reports_at_rest_do_not_grow_into_a_motion(sign):
+    """Each of them is near to where the one before would lead, and the target asks for nothing of the kind."""
+    track = moving(0)
+    assert track.take(sign * BASE_COUNTS, 20, 20 * PERIOD, guarded=True)
+    assert track.position(23, 23 * PERIOD) == sign * BASE_COUNTS
+    assert not track.take(sign * 3 * BASE_COUNTS, 21, 21 * PERIOD, guarded=True)
+    assert track.take(0, 22, 22 * PERIOD, guarded=True)
+
+
+# The delay contract of tactile frames: never in the cycle of their trigger, and placed when they were sampled.
+
+IDS = [0x511, *range(0x512, 0x51A)]
+
+
+def payloads(counter, sync_counter, age_us=5000):
+    header = TactileHeader(
+        frame_counter=counter,
+        sync_counter=sync_counter,
+        origin_row=4,
+        origin_col=5,
+        mode=TactileMode.WINDOW,
+        overload=False,
+        sample_age_us=age_us,
+        crc=0,
+    )
+    return pack_frame(header, np.full((16, 16), counter, np.uint8))
+
+
+def make_receiver():
+    return TactileReceiver(FrameAssembler(IDS, TactileMode.WINDOW, 2 * PERIOD), IDS, sync_overflow=240)
+
+
+def push(receiver, frame, t_ns=0):
+    for can_id, data in zip(IDS, frame, strict=True):
+        receiver.push(can_id, data, t_ns)
+
+
+def times(cycle):
+    return [k * PERIOD for k in range(cycle + 1)]
+
+
+def test_a_frame_is_not_usable_in_the_cycle_that_triggered_it():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=5))
+    assert receiver.take(4, 5, times(4)) is None
+    sample = receiver.take(5, 6, times(5))
+    assert sample is not None and sample.cycle == 4
+    assert sample.t_sample_ns == 4 * PERIOD - 5_000_000
+    assert receiver.take(6, 7, times(6)) is None
+
+
+def test_the_sync_counter_wraps():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=240))
+    sample = receiver.take(240, 1, times(240)[-240:])
+    assert sample is not None and sample.cycle == 239
+
+
+def test_sample_times_follow_the_real_syncs_not_the_period():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=3, age_us=0))
+    sample = receiver.take(3, 4, [0, PERIOD, 9 * PERIOD, 10 * PERIOD])  # an overrun before SYNC 3
+    assert sample is not None and sample.t_sample_ns == 9 * PERIOD
+
+
+def test_a_frame_older_than_every_known_sync_is_stale():
+    receiver = make_receiver()
+    push(receiver, payloads(1, sync_counter=200))
+    assert receiver.take(2, 3, times(2)) is None
+    assert receiver.stale == 1
+
+
+@pytest.mark.parametrize("lost", range(9))
+def test_a_frame_with_a_lost_pdo_is_never_handed_out(lost):
+    receiver = make_receiver()
+    for i, (can_id, data) in enumerate(zip(IDS, payloads(1, 1), strict=True)):
+        if i != lost:
+            receiver.push(can_id, data, 0)
+    push(receiver, payloads(2, sync_counter=3))
+    sample = receiver.take(3, 4, times(3))
+    assert sample is not None and sample.frame.header.frame_counter == 2
+    assert receiver.assembler.torn + receiver.assembler.orphans > 0

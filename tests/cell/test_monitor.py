@@ -12,12 +12,11 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe import api
-from canprobe.bus.candump import read_candump
-from canprobe.cell.monitor import Monitor
-from canprobe.cell.monitor_text import image_lines, lines, screen
+from canprobe.bus.disk import read_candump
+from canprobe.cell.monitor import Monitor, image_lines, lines, screen
 from canprobe.cli import main
-from canprobe.protocol.emcy import Emcy
-from canprobe.scene_loader import load_scene
+from canprobe.protocol.frames import Emcy
+from canprobe.scene.load import load_scene
 
 STEP_NS = 100_000_000
 

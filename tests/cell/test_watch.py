@@ -5,8 +5,7 @@ from __future__ import annotations
 import sys
 
 from canprobe.cell.watch import UNTOLD, NodeWatch
-from canprobe.protocol.emcy import Emcy
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Emcy
 
 SYNC_LOST, OVERHEATED, OVERCURRENT = 0x8100, 0x4210, 0x2310
 

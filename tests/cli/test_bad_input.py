@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from waiting import wait_for_size
 
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
 from canprobe.bus.socketcan import has_socketcan
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 

@@ -13,12 +13,10 @@ from full_disk import room_for
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
 from canprobe.cli import main
 from canprobe.errors import ResultsError
-from canprobe.studies.study import Column, StudyResult
-from canprobe.studies.study_files import write_study
-from canprobe.studies.sweep_store import CellStore
+from canprobe.studies.harness import CellStore, Column, StudyResult, write_study
 
 ROOM = 2000
 
@@ -73,7 +71,7 @@ def test_a_run_whose_frames_cannot_be_written_lets_go_and_ends_with_the_same_sta
 
 
 def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
-    table = pytest.importorskip("canprobe.tables")
+    table = pytest.importorskip("canprobe.results.files")
     pytest.importorskip("pyarrow")
     with room_for(ROOM), pytest.raises(ResultsError, match=r"log\.parquet: cannot be written"):
         table.npz_to_parquet(scan / "log.npz", tmp_path / "log.parquet")

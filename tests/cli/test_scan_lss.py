@@ -7,10 +7,10 @@ import json
 import pytest
 
 import canprobe
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import VirtualClock
 from canprobe.cli import main
-from canprobe.emulator.build import make_world
+from canprobe.emulator.world import make_world
 
 CHANNEL = ("--bus", "socketcan", "--channel", "can0")
 DRIVE = "0xca5e:0x260:0x10000"
@@ -20,15 +20,15 @@ DRIVE = "0xca5e:0x260:0x10000"
 def bus(monkeypatch):
     """A bus that every command of the test opens."""
     bus = LockstepBus(VirtualClock())
-    monkeypatch.setattr("canprobe.bus.open.open_port", lambda *_, **__: bus.port())
+    monkeypatch.setattr("canprobe.bus.interfaces.open_port", lambda *_, **__: bus.port())
     return bus
 
 
 @pytest.fixture
 def serve(bus, monkeypatch):
     """Runs `canprobe emulate`; its nodes live on the bus afterwards."""
-    monkeypatch.setattr("canprobe.emulation.rehearse", lambda plan: None)
-    monkeypatch.setattr("canprobe.bus.priority.ask_for_processor", lambda: False)
+    monkeypatch.setattr("canprobe.session.emulation.rehearse", lambda plan: None)
+    monkeypatch.setattr("canprobe.bus.scheduling.ask_for_processor", lambda: False)
     nodes = []
 
     def attach(participants, port, stop):
@@ -86,7 +86,7 @@ def test_the_only_blank_node_needs_no_name(serve, capsys):
 
 def test_a_scene_gives_its_nodes_their_ids(serve, capsys, tmp_path):
     """Serial numbers in the scene: ids as they stand there, whoever had which before; bring-up then checks them."""
-    text = (canprobe.scene_loader._packaged_files()["free"]).read_text()
+    text = (canprobe.scene.load._packaged_files()["free"]).read_text()
     scene = tmp_path / "mine.toml"
     scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1001, 1002, 1003, 1004, 1005, 1006]", 1))
     nodes = serve(str(scene), "--without-id", "1-6")
@@ -121,7 +121,7 @@ def test_what_is_stored_is_there_when_the_nodes_are_started_again(serve, tmp_pat
     assert stored["node_id"] == 9
     plan = canprobe.plan(canprobe.load_scene("free"))
     again = make_world(plan, (2,), without_id=(2,)).nodes[0]
-    from canprobe.emulator.store_file import keep_in_file
+    from canprobe.emulator.serve import keep_in_file
 
     keep_in_file(again, tmp_path / "serial00000002.json")
     assert again.start(0) == [(0x709, b"\0")]
@@ -164,7 +164,7 @@ def test_a_wrong_emulate_line_is_one_clear_line(words, what, capsys):
 
 def test_a_scene_whose_serial_numbers_are_wrong_is_refused(tmp_path):
     scene = tmp_path / "mine.toml"
-    text = canprobe.scene_loader._packaged_files()["free"].read_text()
+    text = canprobe.scene.load._packaged_files()["free"].read_text()
     scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1, 2, 3, 4, 5, 5]", 1))
     with pytest.raises(canprobe.errors.SceneError, match="serial_numbers: expected a list of 6 items"):
         canprobe.load_scene(str(scene))

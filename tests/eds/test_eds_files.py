@@ -9,7 +9,7 @@ import canopen
 import pytest
 from canopen.objectdictionary import datatypes
 
-from canprobe import eds
+from canprobe.eds import packaged as eds
 from canprobe.errors import EdsError
 from canprobe.protocol.frames import is_restricted
 

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from canprobe.eds.numbers import parse_integer, parse_sum
-from canprobe.eds.values import SIGNED, UNSIGNED, convert
+from canprobe.eds.sections import parse_integer, parse_sum
+from canprobe.eds.variables import SIGNED, UNSIGNED, convert
 
 WORDS = st.integers(0, 2**64 - 1)
 

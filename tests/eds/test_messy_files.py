@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 from canopen.objectdictionary.eds import import_eds
 
-from canprobe.eds import check_eds, eds_path, load_eds
-from canprobe.emulator.any_eds import make_eds_node
+from canprobe.eds.packaged import check_eds, eds_path, load_eds
+from canprobe.emulator.world import make_eds_node
 from canprobe.errors import EdsError
-from canprobe.planning.abilities import Abilities
+from canprobe.planning.devices import Abilities
 
 FOLDER = Path(__file__).parent / "messy"
 FILES = sorted(FOLDER.iterdir())

@@ -12,10 +12,10 @@ from canopen.objectdictionary import ObjectDictionary
 from canopen.objectdictionary.eds import import_eds
 from sdo_words import SdoWords
 
-from canprobe.eds import load_eds
-from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.node import SlaveNode
-from canprobe.emulator.plant.motor import MotorDynamics
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.emulator.plant.ideal_arm import MotorDynamics
 
 U8, U16, U32, U64, I16, I32, STRING, DOMAIN, REAL32 = 0x5, 0x6, 0x7, 0x1B, 0x3, 0x4, 0x9, 0xF, 0x8
 NODE_ID = 5

@@ -7,16 +7,16 @@ import itertools
 import pytest
 
 import canprobe
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.eds import load_eds
-from canprobe.emulator import build
-from canprobe.emulator.drive import make_drive_node
+from canprobe.bus.port import VirtualClock
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator import world as build
+from canprobe.emulator.array import make_tactile_node
+from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.serve import Exchange, serve
-from canprobe.emulator.tactile import make_tactile_node
-from canprobe.emulator.truth import TruthRecorder
+from canprobe.emulator.world import TruthRecorder
 from canprobe.errors import BusError
-from canprobe.scene_loader import load_scene
+from canprobe.scene.load import load_scene
 
 MS = 1_000_000
 CYCLE = 2_500_000

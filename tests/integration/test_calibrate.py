@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.tasks.ball_motion import ArcMotion
 from canprobe.errors import PlanError, SafetyStop, SceneError
-from canprobe.scene_tool import with_tool
+from canprobe.scene.geometry import with_tool
+from canprobe.tasks.calibrate import ArcMotion
 from canprobe.touch.servo import ProbePose
 
 ERROR_MM = (0.4, -0.3, 0.5)

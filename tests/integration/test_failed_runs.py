@@ -14,10 +14,9 @@ import pytest
 
 import canprobe
 from canprobe.api import OpenCell
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
 from canprobe.cli import main
-from canprobe.emulator.faults import Fault, FaultKind
-from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
 from canprobe.errors import NodeError, SafetyStop
 
 MS = 1_000_000

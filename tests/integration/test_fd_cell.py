@@ -7,10 +7,10 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.candump import read_candump
-from canprobe.bus.clock import VirtualClock
+from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.cell.build import make_tactile
+from canprobe.bus.port import VirtualClock
+from canprobe.cell.assembly import make_tactile
 from canprobe.errors import BusError, PlanError
 
 PERIOD_NS = 2_500_000

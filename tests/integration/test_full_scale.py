@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.eds import FULL_SCALE
+from canprobe.eds.packaged import FULL_SCALE
 from canprobe.errors import NodeError
-from canprobe.session import Session
+from canprobe.session.session import Session
 
 
 def press(full_scale_kpa, mode):

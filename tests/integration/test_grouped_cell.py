@@ -7,9 +7,9 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.candump import read_candump
+from canprobe.bus.disk import read_candump
 from canprobe.protocol.cia402 import DriveState, state_of
-from canprobe.robot.puma260 import MODELS
+from canprobe.robot.kinematics import MODELS
 
 
 @pytest.fixture(scope="module")

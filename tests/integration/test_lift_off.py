@@ -12,17 +12,17 @@ import pytest
 from injected import HOLD_CYCLE, Injected, altered, send
 
 import canprobe
-from canprobe.bus.interrupts import Terminated
 from canprobe.bus.port import ControllerState
-from canprobe.cell.build import make_task
-from canprobe.cell.lift_off import WAY
-from canprobe.cell.measurement import Command
+from canprobe.bus.scheduling import Terminated
+from canprobe.cell.controller import Command
 from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.tasks.probing import Phase
+from canprobe.cell.supervisor import WAY
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
 from canprobe.protocol.frames import SYNC_ID, NmtState
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.probing import Phase
 
 
 def lifted(run):

@@ -8,13 +8,13 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.candump import read_candump
-from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command
+from canprobe.bus.disk import read_candump
+from canprobe.cell.controller import Command
 from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 SHORT = {"free": 1.0, "listen": 0.5, "press": 0.5}
 

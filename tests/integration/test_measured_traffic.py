@@ -9,14 +9,14 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.cell.build import make_task
-from canprobe.cell.recording import read_recording
+from canprobe.bus.port import VirtualClock
 from canprobe.cli import main
-from canprobe.emulator.build import make_world
+from canprobe.emulator.world import make_world
 from canprobe.errors import UsageError
-from canprobe.session import Session, resolve_scene
+from canprobe.recorded.recording import read_recording
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 
 def timed(scene, **fields):
@@ -133,9 +133,9 @@ def real_bus(monkeypatch):
         reports.append(options["reports"])
         return bus.port()
 
-    monkeypatch.setattr("canprobe.bus.open.open_port", open_port)
-    monkeypatch.setattr("canprobe.session.MonotonicClock", lambda: bus.clock)
-    monkeypatch.setattr("canprobe.session.check_links", lambda *_: None)
+    monkeypatch.setattr("canprobe.bus.interfaces.open_port", open_port)
+    monkeypatch.setattr("canprobe.session.session.MonotonicClock", lambda: bus.clock)
+    monkeypatch.setattr("canprobe.session.session.check_links", lambda *_: None)
     return scene, reports
 
 

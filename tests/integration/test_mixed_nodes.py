@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.bus.clock import VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.cell.build import make_cell
-from canprobe.cell.measurement import Command
-from canprobe.emulator.build import make_world
+from canprobe.bus.port import VirtualClock
+from canprobe.cell.assembly import make_cell
+from canprobe.cell.controller import Command
+from canprobe.emulator.world import make_world
 from canprobe.errors import UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.session import Session
+from canprobe.session.session import Session
 
 
 def mixed_scene():

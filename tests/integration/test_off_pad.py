@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
+from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.limits import limits_of
 from canprobe.cell.supervision import Reaction
 from canprobe.errors import SafetyStop
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 EDGE_M = 8 * 1.5875e-3
 

@@ -12,12 +12,12 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe import results
-from canprobe.api import Command, results_folder
-from canprobe.bus.candump import CandumpWriter, read_candump
+from canprobe.api import results_folder
+from canprobe.bus.disk import CandumpWriter, read_candump, read_npz
+from canprobe.cell.controller import Command
 from canprobe.cli import main
 from canprobe.errors import InterfaceError, SafetyStop, UsageError
-from canprobe.npz_file import read_npz
+from canprobe.results import summary as results
 
 
 @pytest.fixture

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command, Measurement
-from canprobe.results import summarise
-from canprobe.session import Session, resolve_scene
+from canprobe.cell.controller import Command, Measurement
+from canprobe.results.summary import summarise
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 STALL_NS = 8_000_000
 EVERY = 40

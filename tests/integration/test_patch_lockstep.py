@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
-from canprobe.cell.scoring import score_shape
-from canprobe.cell.tasks.build import make_shape_estimator
-from canprobe.cell.tasks.shape import replay_samples
-from canprobe.results import shape_lines, summarise_shape
-from canprobe.session import Session, resolve_scene
+from canprobe.results.scores import score_shape
+from canprobe.results.summary import shape_lines, summarise_shape
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_shape_estimator, make_task
+from canprobe.tasks.shape import replay_samples
 
 
 @pytest.fixture(scope="module")

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.supervision import Reaction
 from canprobe.errors import SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
 from canprobe.protocol.frames import NmtState
-from canprobe.scene_geometry import true_object
-from canprobe.session import Session, resolve_scene
+from canprobe.scene.geometry import true_object
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 
 def press_begun_pressed(**limits):

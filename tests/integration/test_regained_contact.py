@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
-from canprobe.cell.tasks.probing import Phase
-from canprobe.scene import PlantSettings
-from canprobe.session import Session, resolve_scene
-from canprobe.studies.fault_runs import Witness
+from canprobe.scene.model import PlantSettings
+from canprobe.session.session import Session, resolve_scene
+from canprobe.studies.fault_scores import Witness
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.probing import Phase
 
 TARGET = 2.0
 AT_CYCLE = 900
@@ -48,7 +48,7 @@ class Disturbed:
             plant = self.session.world.plant
             there = None
             if self.move_mm is not None:
-                there = canprobe.scene_geometry.true_object(
+                there = canprobe.scene.geometry.true_object(
                     replace(
                         self.session.scene.object,
                         position_mm=tuple(np.add(self.session.scene.object.position_mm, self.move_mm)),

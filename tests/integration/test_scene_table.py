@@ -7,7 +7,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.errors import PlanError
-from canprobe.scene import ObjectSettings
+from canprobe.scene.model import ObjectSettings
 
 # scene: force RMS error and curvature RMS error that it stays below, percent
 TABLE = {

@@ -14,18 +14,16 @@ from injected import FREE_CYCLE, HOLD_CYCLE, Injected, altered, send
 
 import canprobe
 from canprobe.bus.port import ControllerState
+from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY, CONDITIONS
-from canprobe.cell.limits import limits_of
-from canprobe.cell.measurement import Command
+from canprobe.cell.controller import Command
 from canprobe.cell.supervision import Reaction
-from canprobe.cell.tasks.probing import Phase
-from canprobe.emulator.faults import FaultKind
-from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.emulator.faults import FaultKind, FaultyNode
 from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
-from canprobe.protocol.emcy import Emcy
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, NmtState
-from canprobe.session import Session
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SYNC_ID, Emcy, NmtState
+from canprobe.session.session import Session
+from canprobe.tasks.probing import Phase
 
 # nodes
 
@@ -578,7 +576,7 @@ def test_a_full_disk(tmp_path):
 
 
 def canprobe_lines(path):
-    from canprobe.bus.candump import read_candump
+    from canprobe.bus.disk import read_candump
 
     return read_candump(path)
 

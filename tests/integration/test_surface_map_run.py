@@ -7,9 +7,9 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.results import write_files
-from canprobe.scene_geometry import true_object
-from canprobe.touch.map_query import closest
+from canprobe.results.summary import write_files
+from canprobe.scene.geometry import true_object
+from canprobe.touch.surface_map import closest
 
 
 @pytest.fixture(scope="module")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.build import make_task
 from canprobe.errors import SafetyStop
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 
 def run_until_stopped(session, at_cycle=None, action=None):

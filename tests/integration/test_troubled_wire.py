@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import pytest
+from wire_faults import Babbler, ErrorsAt
 
 import canprobe
-from canprobe.bus.babbler import Babbler
-from canprobe.bus.candump import read_candump
-from canprobe.bus.wire_errors import ErrorsAt
-from canprobe.cell.build import make_task
+from canprobe.bus.disk import read_candump
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frame_bits import exact_bits
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 
 def last_statuswords(folder):

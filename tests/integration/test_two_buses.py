@@ -7,16 +7,15 @@ import pytest
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.candump import read_candump
-from canprobe.bus.clock import VirtualClock
-from canprobe.bus.joined import JoinedPort
+from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.cell.measurement import Command
-from canprobe.cell.recording import read_recording
+from canprobe.bus.port import JoinedPort, VirtualClock
+from canprobe.cell.controller import Command
 from canprobe.errors import InterfaceError, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
-from canprobe.session import Session
+from canprobe.recorded.recording import read_recording
+from canprobe.session.session import Session
 
 
 def split_scene():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 import canprobe
-from canprobe.scene import PlantSettings
+from canprobe.scene.model import PlantSettings
 
 NOMINAL = 1.27e8  # N/m³: 9.4 kN/m at 2 N on the cylinder
 pytestmark = pytest.mark.slow

@@ -7,9 +7,9 @@ import pytest
 from injected import HOLD_CYCLE, Injected
 
 import canprobe
-from canprobe.cell.build import make_task
-from canprobe.cell.measurement import Command
-from canprobe.session import Session, resolve_scene
+from canprobe.cell.controller import Command
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
 
 
 class Working:

@@ -7,15 +7,14 @@ import dataclasses
 import pytest
 
 import canprobe
-import canprobe.eds
+import canprobe.eds.packaged
 from canprobe.cell.configuration import make_setups
-from canprobe.emulator.plant.contact import elastic_contact
+from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning.contact_window import patch_radius_m, taxels_needed, window_choices
-from canprobe.planning.pdos import tactile_objects
-from canprobe.scene import ProbeSettings
-from canprobe.scene_loader import parse_scene
-from canprobe.scene_writer import dump_scene
+from canprobe.planning.choices import patch_radius_m, taxels_needed, window_choices
+from canprobe.planning.devices import tactile_objects
+from canprobe.scene.load import dump_scene, parse_scene
+from canprobe.scene.model import ProbeSettings
 
 PDOS = {4: 3, 6: 6, 8: 9, 10: 14, 12: 19}
 
@@ -116,7 +115,7 @@ def test_on_can_fd_every_word_of_every_window_has_its_place():
 
 def test_a_sensor_without_the_object_keeps_8(tmp_path):
     """An older array: the same file without 2008h."""
-    eds = (canprobe.eds.eds_path("tactile_array")).read_text()
+    eds = (canprobe.eds.packaged.eds_path("tactile_array")).read_text()
     start = eds.index("[2008]")
     older = eds[:start] + eds[eds.index("\n\n", start) + 2 :]
     count = eds.index("SupportedObjects=12\n1=0x2000")

@@ -7,9 +7,9 @@ import dataclasses
 import pytest
 
 import canprobe
-from canprobe.planning.traffic_meter import TrafficMeter, expected_messages
+from canprobe.planning.measured import TrafficMeter, expected_messages
 from canprobe.protocol.frame_bits import best_case_bits, exact_bits
-from canprobe.scene_loader import load_scene
+from canprobe.scene.load import load_scene
 
 CYCLES, PERIOD = 400, 2_500_000
 US = 1000

@@ -7,8 +7,8 @@ from scenes import change, refused
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.planning import plan_text
-from canprobe.scene_loader import load_scene
+from canprobe.planning.report import plan_dict, plan_text
+from canprobe.scene.load import load_scene
 
 HEARTBEAT, SYNC, FULL = 65, 65, 135
 
@@ -25,7 +25,7 @@ def test_sync_behind_the_masters_heartbeat_by_hand():
     on_the_wire = HEARTBEAT  # nothing is below 77Fh: the longest frame that was queued before it, of its own node
     assert plan.traffic.sync_response_ns == (on_the_wire + 9 * FULL + HEARTBEAT + HEARTBEAT + SYNC) * 1000
     assert 'bus.transmit_queue = "fifo"' in plan_text(plan)
-    assert plan.as_dict()["bus"]["transmit_queue"] == "fifo"
+    assert plan_dict(plan)["bus"]["transmit_queue"] == "fifo"
 
 
 def test_what_shares_a_queue_shares_its_worst_case():
@@ -55,7 +55,7 @@ def test_no_frame_of_a_run_is_later_than_planned(name, cycle, tmp_path):
 
 def test_a_bound_that_is_not_found_is_none(monkeypatch):
     """Should SYNC and feedback push each other on without end, there is no bound rather than the last guess."""
-    from canprobe.planning import budget
+    from canprobe.planning import traffic as budget
 
     monkeypatch.setattr(budget, "_ROUNDS", 1)
     assert any("without bound" in problem for problem in refused(load_scene("free")).problems)

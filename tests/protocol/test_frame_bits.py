@@ -7,10 +7,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
-from canprobe.protocol.crc import CRC15, CRC17, CRC21, Crc
 from canprobe.protocol.frame_bits import (
+    CRC15,
+    CRC17,
+    CRC21,
     FD_LENGTHS,
     WORST_ERROR_BITS,
+    Crc,
     FrameLength,
     best_case_bits,
     best_case_fd_bits,

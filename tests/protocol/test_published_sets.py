@@ -18,7 +18,7 @@ import pytest
 from simulated_bus import instants, simulate
 
 from canprobe.errors import ProtocolError
-from canprobe.protocol.timing import Errors, Message, worst_case_response
+from canprobe.protocol.response_times import Errors, Message, worst_case_response
 
 MS = 1_000_000
 

@@ -4,10 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from canprobe.robot.dynamics import RigidBody
-from canprobe.robot.inertia import LinkInertia, ball_inertia, puma260_inertia
-from canprobe.robot.kinematics import forward_jacobian, tool_z_offset
-from canprobe.robot.puma260 import MODELS, UPENN
+from canprobe.robot.dynamics import LinkInertia, RigidBody, ball_inertia, puma260_inertia
+from canprobe.robot.kinematics import MODELS, UPENN, forward_jacobian, tool_z_offset
 
 TOOL = tool_z_offset(80.0)
 BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)

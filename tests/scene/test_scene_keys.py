@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from canprobe.scene import Scene
+from canprobe.scene.model import Scene
 
 DOCS = Path(__file__).parents[2] / "docs"
 _spec = importlib.util.spec_from_file_location("scene_keys", DOCS / "scene_keys.py")

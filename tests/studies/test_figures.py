@@ -4,6 +4,7 @@ import dataclasses
 import functools
 import itertools
 
+import bridges_bench as bridges
 import matplotlib.image
 import numpy as np
 import pytest
@@ -15,26 +16,20 @@ from matplotlib.transforms import Bbox
 
 import canprobe
 from canprobe.emulator.faults import FaultKind
-from canprobe.studies import bridges, estimators, stability, stability_figure, workprec
-from canprobe.studies.bound import AT
-from canprobe.studies.bound_cases import NOISES, REGION, SIZES_M
-from canprobe.studies.bound_figure import draw_bound
-from canprobe.studies.cycle_times import CycleTimes
-from canprobe.studies.estimators_figure import draw_estimators
-from canprobe.studies.faults_figure import draw_ends, draw_faults
-from canprobe.studies.ground import SURFACES
-from canprobe.studies.pipeline_figure import draw_pipeline
-from canprobe.studies.plan_figure import draw_plan
-from canprobe.studies.realtime_cases import Measured
-from canprobe.studies.realtime_figure import draw_realtime
-from canprobe.studies.region_figure import draw_region
-from canprobe.studies.run_figure import draw_run
-from canprobe.studies.soak import Sample
-from canprobe.studies.soak_figure import draw_soak
-from canprobe.studies.surface_figure import draw_surface
-from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL
-from canprobe.studies.workprec_cell_figure import draw_cell
-from canprobe.studies.workprec_figure import draw_workprec
+from canprobe.results.figures import draw_plan, draw_run
+from canprobe.results.surface_figure import draw_surface
+from canprobe.studies import estimators, stability, workprec
+from canprobe.studies import stability as stability_figure
+from canprobe.studies.bound import AT, NOISES, REGION, SIZES_M, SURFACES, draw_bound
+from canprobe.studies.estimators import draw_estimators
+from canprobe.studies.faults import draw_ends, draw_faults
+from canprobe.studies.pipeline import draw_pipeline
+from canprobe.studies.realtime import draw_realtime
+from canprobe.studies.realtime_cases import CycleTimes, Measured
+from canprobe.studies.region import draw_region
+from canprobe.studies.soak import Sample, draw_soak
+from canprobe.studies.workprec import draw_workprec
+from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
 
 COLUMN_PX, WIDEST_PX, LEAST_TYPE_PX, LEAST_BAR_PX = 800, 1400, 9.0, 4.0
 FILLED, TILES = 0.3, 3

@@ -9,8 +9,7 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.studies import region
-from canprobe.studies.bound import AT, SEEDS
-from canprobe.studies.bound_cases import REGION, all_cases, reasons_outside
+from canprobe.studies.bound import AT, REGION, SEEDS, all_cases, reasons_outside
 
 
 def case_row(method="ml", ratio=1.0, bias=0.0, coverage=0.95, observed=1.0, **at):
@@ -68,7 +67,7 @@ def test_the_quick_pilot_runs_from_the_command_line(tmp_path, capsys):
 
 def test_a_path_that_is_hardly_wider_than_the_noise_is_outside():
     """5 mm of weave under 0.1 mm of noise: its sides are 0.37 mm from the middle, RMS."""
-    from canprobe.studies.bound_cases import NOISES, Case, criteria
+    from canprobe.studies.bound import NOISES, Case, criteria
 
     case = Case("cylinder", "weave", 0.04, 0.005, *NOISES[2])
     narrow = criteria(case, case.ground, np.zeros((3, 3)), 0.0)

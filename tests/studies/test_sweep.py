@@ -15,10 +15,11 @@ from waiting import wait_until
 
 from canprobe.cli import main
 from canprobe.errors import StudyError, UsageError
-from canprobe.studies import study, sweep, sweep_store
-from canprobe.studies.executors import THREADS, dask_executor, process_pool
-from canprobe.studies.sweep import Sweep, open_sweep
-from canprobe.studies.sweep_store import CellStore, as_json, cell_key, model_digest
+from canprobe.studies import harness as study
+from canprobe.studies import harness as sweep_store
+from canprobe.studies import sweep
+from canprobe.studies.harness import CellStore, as_json, cell_key, model_digest
+from canprobe.studies.sweep import THREADS, Sweep, dask_executor, open_sweep, process_pool
 
 DEMO = '''
 """A study of six cells; what happens in the fourth is set by the environment. Every measurement leaves a line."""
@@ -26,7 +27,7 @@ import os, signal, sys
 from dataclasses import dataclass
 from pathlib import Path
 import numpy as np
-from canprobe.studies.study import Column, StudyResult
+from canprobe.studies.harness import Column, StudyResult
 HERE = Path(__file__).parent
 
 @dataclass(frozen=True)

@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import canprobe
 from canprobe.bus.port import ControllerState
-from canprobe.cell.build import make_task
+from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.limits import limits_of
-from canprobe.cell.measurement import Command
-from canprobe.cell.tasks.probing import Phase
-from canprobe.emulator.faults import Fault
-from canprobe.emulator.faulty_node import FaultyNode
+from canprobe.cell.controller import Command
+from canprobe.emulator.faults import Fault, FaultyNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
-from canprobe.session import Session, resolve_scene
+from canprobe.session.session import Session, resolve_scene
+from canprobe.tasks.from_plan import make_task
+from canprobe.tasks.probing import Phase
 
 LONG_NS = 10_000_000_000
 FREE_CYCLE = 80

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 
 import canprobe
-from canprobe.eds import eds_path
+from canprobe.eds.packaged import eds_path
 from canprobe.errors import PlanError
-from canprobe.scene import Scene
+from canprobe.scene.model import Scene
 
 
 def change(scene: Scene, **sections: dict[str, Any]) -> Scene:

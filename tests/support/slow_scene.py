@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from canprobe.scene_loader import scenes_folder
+from canprobe.scene.load import scenes_folder
 
 
 def write_slow_scene(

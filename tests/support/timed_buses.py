@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from canprobe.bus.clock import VirtualClock
-from canprobe.bus.port import Frame
+from canprobe.bus.port import VirtualClock
 from canprobe.bus.timed import TimedBus
+from canprobe.protocol.frames import Frame
 
 BIT = 1000  # ns, at 1 Mbit/s
 INTERMISSION = 3 * BIT

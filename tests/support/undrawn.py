@@ -6,8 +6,8 @@ from dataclasses import replace
 from typing import Any
 
 import canprobe
-from canprobe.results import RunResult
-from canprobe.scene import Scene
+from canprobe.results.summary import RunResult
+from canprobe.scene.model import Scene
 
 
 def undrawn_run(scene: Scene, **options: Any) -> RunResult:

@@ -7,11 +7,9 @@ import numpy as np
 import pytest
 
 from canprobe.errors import UsageError
-from canprobe.touch.fit import fit_surface
-from canprobe.touch.local_patch import WIDE, LocalPatch
-from canprobe.touch.map_query import closest
+from canprobe.touch.estimate.fit import fit_surface
 from canprobe.touch.surface import SurfaceMatrix
-from canprobe.touch.surface_map import SurfaceMap, merge_patches, spaced
+from canprobe.touch.surface_map import WIDE, LocalPatch, SurfaceMap, closest, merge_patches, spaced
 
 RADIUS = 0.05
 SIGMA = {"sigma_point": 2e-5, "sigma_normal": 1e-3}

@@ -15,9 +15,8 @@ import pytest
 from slow_scene import write_slow_scene
 from waiting import wait_until
 
-from canprobe.bus.candump import read_candump
-from canprobe.bus.clock import MonotonicClock
-from canprobe.bus.port import TimedFrame
+from canprobe.bus.disk import read_candump
+from canprobe.bus.port import MonotonicClock, TimedFrame
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
 

@@ -10,7 +10,7 @@ from typing import Any
 import canopen
 import pytest
 
-from canprobe.eds import eds_path
+from canprobe.eds.packaged import eds_path
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 
 pytestmark = pytest.mark.vcan

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from canprobe.cli import main
-from canprobe.protocol.emcy import FOLLOWING_ERROR
-from canprobe.studies.fault_processes import ProcessFault
+from canprobe.protocol.frames import FOLLOWING_ERROR
+from canprobe.studies.faults_vcan import ProcessFault
 
 pytestmark = pytest.mark.vcan
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.port import MonotonicClock
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
 

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from canprobe.bus.guest import PROGRAM, GuestError, GuestJob, is_installed
 from canprobe.bus.socketcan import has_socketcan
-from canprobe.bus.supervise import Signals, supervise
+from canprobe.vcan.guest import PROGRAM, GuestError, GuestJob, is_installed
+from canprobe.vcan.launch import Signals, supervise
 
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import canprobe
-from canprobe.bus.candump import CandumpWriter
+from canprobe.bus.disk import CandumpWriter
 from canprobe.bus.port import ERR_FLAG
 
 pytestmark = pytest.mark.vcan

@@ -10,10 +10,9 @@ import pytest
 from serial_adapter import SerialAdapter
 from waiting import wait_until
 
-from canprobe.bus.clock import MonotonicClock
+from canprobe.bus.interfaces import open_port
 from canprobe.bus.link import LinkState, read_link, setting_line
-from canprobe.bus.open import open_port
-from canprobe.bus.port import Reports
+from canprobe.bus.port import MonotonicClock, Reports
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.cli import main
 from canprobe.errors import InterfaceError

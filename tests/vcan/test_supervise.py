@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from canprobe.bus import vcan
-from canprobe.bus.supervise import LocalJob, Signals, caught_signals, supervise
 from canprobe.cli import main
+from canprobe.vcan import launch as vcan
+from canprobe.vcan.launch import LocalJob, Signals, caught_signals, supervise
 
 
 class Scripted:
@@ -57,7 +57,7 @@ def test_time_out_terminates_then_kills(monkeypatch: pytest.MonkeyPatch) -> None
     job = Scripted(dies_of=signal.SIGTERM)
     assert supervise(job, Signals(), 0.0) == (124, True)
     assert job.told == [signal.SIGTERM]
-    monkeypatch.setattr("canprobe.bus.supervise._GRACE_S", 0.0)
+    monkeypatch.setattr("canprobe.vcan.launch._GRACE_S", 0.0)
     job = Scripted()
     assert supervise(job, Signals(), 0.0) == (124, True)
     assert job.told == [signal.SIGTERM, "kill"]

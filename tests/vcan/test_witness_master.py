@@ -10,7 +10,7 @@ from typing import Any
 import canopen
 import pytest
 
-from canprobe.eds import eds_path, load_eds
+from canprobe.eds.packaged import eds_path, load_eds
 
 pytestmark = pytest.mark.vcan
 MESSY = Path(__file__).parents[1] / "eds" / "messy"

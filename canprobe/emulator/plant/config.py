@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from canprobe.emulator.plant.taxels import TaxelConfig
-from canprobe.robot.kinematics import tool_z_offset
-from canprobe.robot.puma260 import ELBOW_FORM, Array, PumaModel
-from canprobe.scene_setup import Dynamics, Fidelity
-from canprobe.touch.objects import ObjectShape
+from canprobe.robot.kinematics import ELBOW_FORM, Array, PumaModel, tool_z_offset
+from canprobe.scene.setup import Dynamics, Fidelity
+from canprobe.touch.shapes import ObjectShape
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,25 +7,94 @@ contact geometry are held over ``hold_ns``.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.emulator.plant.equations import ArmEquations, State
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.equations import STEPS, ArmEquations, Effects, State, rosenbrock2
 from canprobe.emulator.plant.held_step import held_rosenbrock2
-from canprobe.emulator.plant.integrators import STEPS, rosenbrock2
-from canprobe.emulator.plant.motor import MotorDynamics
-from canprobe.emulator.plant.reference import NEVER, Reference
-from canprobe.robot.actuation import (
+from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
+from canprobe.robot.kinematics import (
     CONTINUOUS_TORQUE_NM,
     COULOMB_NM,
     PEAK_PERMILLE,
     REFLECTED_INERTIA,
     VISCOUS_NMS,
+    Array,
+    PumaModel,
     counts_per_radian,
+    counts_to_joints,
+    joints_to_counts,
 )
-from canprobe.robot.puma260 import Array, PumaModel, counts_to_joints, joints_to_counts
+
+# What a drive is asked for: straight ramps of counts, one after the other, each holding its end.
+
+NEVER = 1 << 62
+Ramp = tuple[int, int, float, float]
+"""Start and end time (ns), start and end (counts)."""
+
+
+class Reference:
+    """Reference of one motor.
+
+    Args:
+        counts: where it stands until the first ramp.
+    """
+
+    __slots__ = ("_ramps",)
+
+    def __init__(self, counts: float) -> None:
+        self._ramps: list[Ramp] = [(-1, -1, counts, counts)]
+
+    def add(self, ramp: Ramp, now_ns: int) -> None:
+        """Follow a ramp from its start on, or from now on where it began in the past; drops what was to come later.
+
+        Args:
+            ramp: not before the ramps that act already.
+            now_ns: the present time.
+        """
+        last = self._ramps[-1]
+        if last[0] <= now_ns and last[0] < ramp[0]:
+            self._ramps = [last, ramp]
+            return
+        start = max(ramp[0], now_ns)
+        kept: Sequence[Ramp] = [r for r in self._ramps if r[0] < start or r[0] < 0]
+        past = [r for r in kept if r[0] <= now_ns]
+        self._ramps = [*past[-1:], *(r for r in kept if r[0] > now_ns), ramp]
+
+    def at(self, t_ns: int) -> tuple[float, float]:
+        """Reference (counts) and its slope (counts/s) from t on.
+
+        Args:
+            t_ns: not before the last ramp that began.
+        """
+        t0, t1, start, end = self._ramps[-1]
+        if t0 > t_ns:
+            t0, t1, start, end = next(r for r in reversed(self._ramps) if r[0] <= t_ns)
+        if t_ns >= t1:
+            return end, 0.0
+        slope = (end - start) / (t1 - t0)
+        return start + slope * (t_ns - t0), 1e9 * slope
+
+    def next_bend(self, t_ns: int) -> int:
+        """First time after t at which the slope may change, ns.
+
+        Args:
+            t_ns: ns.
+        """
+        bend = NEVER
+        for t0, t1, _, _ in self._ramps:
+            if t_ns < t0 < bend:
+                bend = t0
+            if t_ns < t1 < bend:
+                bend = t1
+        return bend
+
+
+# Dynamic arm: rigid links, friction, drive cascade and the object's push, in the ideal arm's place.
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +102,7 @@ class Stepping:
     """How the arm is integrated.
 
     Args:
-        method: a key of ``integrators.STEPS``.
+        method: a key of ``equations.STEPS``.
         step_ns: longest step.
         hold_ns: how long mass matrix, bias and contact geometry are held.
     """
@@ -191,3 +260,60 @@ class DynamicArm:
             return held_rosenbrock2(equations, t, y, h)
         stepped: list[float] = self._step(equations, t, np.array(y), h).tolist()
         return stepped
+
+
+# The arm that a plant's configuration asks for.
+
+
+def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
+    """An ideal or a dynamic arm; what the ideal one does not need is not imported.
+
+    Args:
+        config: with a model.
+    """
+    assert config.model is not None
+    if config.fidelity == "ideal":
+        return IdealArm(config.model, config.q0, config.bandwidth_hz, config.damping_ratio)
+    d = config.dynamics
+    return DynamicArm(config.model, config.q0, make_equations(config), Stepping(d.integrator, d.step_ns, d.hold_ns))
+
+
+def make_equations(config: PlantConfig, effects: Effects | None = None, *, held: bool = True) -> ArmEquations:
+    """Equations of motion of a dynamic arm.
+
+    Args:
+        config: with a model.
+        effects: what acts; everything by default.
+        held: see ``ArmEquations``.
+    """
+    from canprobe.emulator.plant.equations import Cascade, DriveSettings
+    from canprobe.emulator.plant.pushing import Neighbourhood, Rubbing
+    from canprobe.robot.dynamics import RigidBody, ball_inertia, puma260_inertia
+    from canprobe.robot.kinematics import joints_per_motor
+
+    assert config.model is not None
+    d, effects = config.dynamics, effects or Effects()
+    ball = ball_inertia(d.payload, config.radius_m)
+    links = puma260_inertia(config.model).with_payload(d.payload, config.T_flange_probe_centre, ball)
+    body = RigidBody(config.model, links)
+    back = joints_per_motor()
+    inertia = np.array(REFLECTED_INERTIA)
+    if effects.links:  # a drive is tuned to what its motor moves in the first posture
+        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(6))[0] @ back)
+    drives = DriveSettings(
+        config.bandwidth_hz, config.damping_ratio, d.integral_s, d.velocity_feed_forward, d.torque_limit_permille
+    )
+    cascade = Cascade(drives, inertia)
+    if config.object is None:
+        return ArmEquations(body, cascade, effects=effects, held=held)
+    touching = Neighbourhood(
+        config.model,
+        back,
+        config.T_flange_probe_centre,
+        config.base_offset_m,
+        config.object,
+        radius=config.radius_m,
+        stiffness_n_m3=config.stiffness_n_m3,
+        rubbing=Rubbing(config.damping_s_m, d.friction),
+    )
+    return ArmEquations(body, cascade, touching, effects, held=held)

@@ -1,4 +1,4 @@
-"""Equations of motion of the driven arm in contact, as a ``Problem`` for the integrators.
+"""Equations of motion of the driven arm in contact, as a ``Problem`` for the integrators, which are here too.
 
 State (18): motor angles (rad), their rates (rad/s), the integrators of the six velocity loops (N m); all in motor
 coordinates. Mass matrix, bias (gravity, Coriolis) and the geometry of the contact can be held over a while
@@ -7,19 +7,334 @@ coordinates. Mass matrix, bias (gravity, Coriolis) and the geometry of the conta
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from math import tanh
+from math import sqrt, tanh
+from types import MappingProxyType
+from typing import NamedTuple, Protocol
 
 import numpy as np
+import numpy.typing as npt
 
-from canprobe.emulator.plant.cascade import Cascade
-from canprobe.emulator.plant.integrators import Linearised
-from canprobe.emulator.plant.loops import DriveLoops, Drives, LoopSlopes
+from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.emulator.plant.pushing import Contact
-from canprobe.robot.actuation import REFLECTED_INERTIA, STICTION_RATE, joints_per_motor
 from canprobe.robot.dynamics import RigidBody, dense
-from canprobe.robot.puma260 import Array
+from canprobe.robot.kinematics import (
+    CONTINUOUS_TORQUE_NM,
+    COULOMB_NM,
+    PEAK_PERMILLE,
+    REFLECTED_INERTIA,
+    STICTION_RATE,
+    VISCOUS_NMS,
+    joints_per_motor,
+)
+
+# Steps of ordinary differential equations y' = f(t, y), each one function of (problem, t, y, h).
+#
+# | step | order | for |
+# |---|---|---|
+# | ``semi_implicit_euler`` | 1 | mechanics that is not stiff; velocities first, positions with the new ones |
+# | ``runge_kutta_4`` | 4 | smooth and not stiff |
+# | ``implicit_euler`` | 1 | stiff; linearly implicit, one linear solve |
+# | ``rosenbrock2`` | 2 | stiff; two stages, one matrix, L-stable; second order whatever matrix the problem gives |
+# | ``exponential`` | 2 | exact where f is linear in y and t; else the exponential Rosenbrock-Euler step |
+# | ``adaptive`` | 2 | ``rosenbrock2`` in as many parts as its own error estimate asks for |
+#
+# Source: Hairer & Wanner, Solving ODEs II, IV.7; Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20, 1999
+# (ROS2); Hochbruck & Ostermann, Acta Numerica 2010 (exponential).
+
+Array = npt.NDArray[np.float64]
+
+GAMMA = 1.0 - sqrt(0.5)
+"""Of ROS2."""
+_MOST_PARTS = 4096
+
+
+class Linearised(NamedTuple):
+    """The equations near one place.
+
+    Attributes:
+        rate: f.
+        drift: partial derivative of f by t.
+        solve: r -> x of (I - g J) x = r; J may be an approximation of the Jacobian.
+    """
+
+    rate: Array
+    drift: Array
+    solve: Callable[[Array], Array]
+
+
+class Problem(Protocol):
+    """What a step asks of the equations. States begin with n positions, then their n rates, then anything."""
+
+    @property
+    def positions(self) -> int:
+        """n."""
+
+    def rate(self, t: float, y: Array) -> Array:
+        """f(t, y)."""
+
+    def drift(self, t: float, y: Array) -> Array:
+        """Partial derivative of f by t."""
+
+    def jacobian(self, t: float, y: Array) -> Array:
+        """Partial derivative of f by y."""
+
+    def linearised(self, t: float, y: Array, g: float) -> Linearised:
+        """All that a linearly implicit step asks for at one place."""
+
+
+Step = Callable[[Problem, float, Array, float], Array]
+
+
+def semi_implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """Explicit Euler, but positions advance with the new rates."""
+    n = problem.positions
+    new = y + h * problem.rate(t, y)
+    new[:n] = y[:n] + h * new[n : 2 * n]
+    return new
+
+
+def runge_kutta_4(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """The classical explicit step."""
+    k1 = problem.rate(t, y)
+    k2 = problem.rate(t + 0.5 * h, y + 0.5 * h * k1)
+    k3 = problem.rate(t + 0.5 * h, y + 0.5 * h * k2)
+    k4 = problem.rate(t + h, y + h * k3)
+    new: Array = y + (h / 6.0) * (k1 + 2.0 * (k2 + k3) + k4)
+    return new
+
+
+def implicit_euler(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """One Newton iteration of backward Euler."""
+    rate, drift, solve = problem.linearised(t, y, h)
+    new: Array = y + h * solve(rate + h * drift)
+    return new
+
+
+def rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """ROS2 with gamma = 1 - 1/sqrt(2)."""
+    return _rosenbrock2(problem, t, y, h)[0]
+
+
+def _rosenbrock2(problem: Problem, t: float, y: Array, h: float) -> tuple[Array, Array]:
+    """The step, and how far its own first-order step lies off."""
+    rate, drift, solve = problem.linearised(t, y, GAMMA * h)
+    drift *= GAMMA * h
+    k1 = solve(rate + drift)
+    k2 = solve(problem.rate(t + h, y + h * k1) - 2.0 * k1 - drift)
+    return y + (1.5 * h) * k1 + (0.5 * h) * k2, (0.5 * h) * (k1 + k2)
+
+
+def exponential(problem: Problem, t: float, y: Array, h: float) -> Array:
+    """y + h phi1(hJ) f + h^2 phi2(hJ) f_t, both from one matrix exponential."""
+    from scipy.linalg import expm
+
+    size = len(y)
+    augmented = np.zeros((size + 2, size + 2))
+    augmented[:size, :size] = h * problem.jacobian(t, y)
+    augmented[:size, size] = h * h * problem.drift(t, y)
+    augmented[:size, size + 1] = h * problem.rate(t, y)
+    augmented[size, size + 1] = 1.0
+    new: Array = y + expm(augmented)[:size, size + 1]
+    return new
+
+
+def adaptive(problem: Problem, t: float, y: Array, h: float, *, rtol: float = 1e-3, atol: float = 1e-5) -> Array:
+    """``rosenbrock2`` in parts whose estimated error stays within ``atol + rtol |y|``, component by component.
+
+    Raises:
+        ArithmeticError: when it would take more than 4096 parts.
+    """
+    done, part = 0.0, h
+    for _ in range(_MOST_PARTS):
+        part = min(part, h - done)
+        new, error = _rosenbrock2(problem, t + done, y, part)
+        size = float(np.max(np.abs(error) / (atol + rtol * np.maximum(np.abs(y), np.abs(new)))))
+        if size <= 1.0:
+            y, done = new, done + part
+            if done >= h * (1.0 - 1e-12):
+                return y
+        # NaN counts as an error too large
+        part *= min(4.0, max(0.2, 0.9 / sqrt(size))) if size > 0.0 else 4.0 if size == 0.0 else 0.2
+    raise ArithmeticError(f"a step of {h:g} s at t = {t:g} s needs more than {_MOST_PARTS} parts")
+
+
+STEPS: Mapping[str, Step] = MappingProxyType(
+    {
+        "semi-implicit": semi_implicit_euler,
+        "rk4": runge_kutta_4,
+        "implicit": implicit_euler,
+        "rosenbrock": rosenbrock2,
+        "exponential": exponential,
+        "adaptive": adaptive,
+    }
+)
+"""Name in a scene -> step."""
+
+
+# Drive cascade of a motor: position loop, velocity loop, torque limit, feed-forwards.
+#
+# Position: ``v* = kp (r - x) + share r'``. Velocity: ``u = Kv (v* - v) + s + tau_ff``, ``s' = Ki (v* - v)``, where s
+# also unwinds while the torque is at its limit. Torque: ``min(max(u, -limit), limit)``, without a lag of its own. All
+# in motor coordinates (``robot.actuation``). The loops are continuous; a real drive samples them at some kHz.
+#
+# With ``kp = w / 2z`` and ``Kv = 2 z w J`` a motor with the inertia J and nothing else is the second-order system of
+# the ideal arm: same bandwidth, same lag behind a ramp.
+
+
+@dataclass(frozen=True, slots=True)
+class DriveSettings:
+    """How the six drives are tuned.
+
+    Args:
+        bandwidth_hz: -3 dB frequency of position.
+        damping_ratio: 1 is critical.
+        integral_s: reset time of the velocity loop; 0 for none.
+        velocity_feed_forward: share of the reference's speed that is added behind the position loop; 1 removes the lag.
+        torque_limit_permille: of the continuous torque.
+    """
+
+    bandwidth_hz: float = 30.0
+    damping_ratio: float = 1.0
+    integral_s: float = 0.02
+    velocity_feed_forward: float = 0.0
+    torque_limit_permille: int = PEAK_PERMILLE
+
+
+class Cascade:
+    """Gains of six drives, motor coordinates, SI.
+
+    Args:
+        settings: the tuning.
+        inertia: (6,) what each drive takes for its motor's inertia, kg m^2.
+    """
+
+    def __init__(self, settings: DriveSettings, inertia: Array) -> None:
+        w, z = natural_frequency(settings.bandwidth_hz, settings.damping_ratio), settings.damping_ratio
+        self.position = w / (2.0 * z)
+        self.velocity: Array = 2.0 * z * w * inertia
+        self.integral: Array = self.velocity / settings.integral_s if settings.integral_s > 0.0 else 0.0 * inertia
+        self.unwind = 1.0 / settings.integral_s if settings.integral_s > 0.0 else 0.0
+        self.share = settings.velocity_feed_forward
+        self.limit: Array = np.array(CONTINUOUS_TORQUE_NM) * (1e-3 * settings.torque_limit_permille)
+
+    @property
+    def lag_s(self) -> float:
+        """How far a motor stays behind a steady ramp, s."""
+        return (1.0 - self.share) / self.position
+
+
+# The six drive loops in plain floats: what each motor gives for what it is asked.
+
+Drives = tuple[list[float], list[float], list[float]]
+"""Velocity error, torque asked for and torque given, of every motor."""
+
+
+class LoopSlopes(NamedTuple):
+    """(6,) each: slope of torque by velocity error, by angle, by rate and by integrator; slope of the integrator's own
+    rate by velocity error and by itself."""
+
+    gain: Array
+    by_theta: Array
+    by_rate: Array
+    by_sum: Array
+    sum_by_error: Array
+    sum_by_sum: Array
+
+
+class DriveLoops:
+    """Position and velocity loops, torque limits and friction of the six motors, on straight references.
+
+    Args:
+        cascade: the drives.
+        friction: whether motors and gears rub.
+
+    Attributes:
+        start, slope: (6,) reference at time 0 (rad) and its slope (rad/s).
+        ahead, fed: (6,) speed (rad/s) and torque (N m) added behind the position and the velocity loop.
+        gain, integral, limit: (6,) of the velocity loops and the largest torque.
+        viscous, coulomb: (6,) friction.
+    """
+
+    def __init__(self, cascade: Cascade, *, friction: bool) -> None:
+        on = 1.0 if friction else 0.0
+        self.cascade = cascade
+        self.position, self.unwind = cascade.position, cascade.unwind
+        self.viscous, self.coulomb = [on * x for x in VISCOUS_NMS], [on * x for x in COULOMB_NM]
+        self.gain: list[float] = cascade.velocity.tolist()
+        self.integral: list[float] = cascade.integral.tolist()
+        self.limit: list[float] = cascade.limit.tolist()
+        self.fed, self._speed_fed = [0.0] * 6, [0.0] * 6
+        self.set_reference(0.0, (0.0,) * 6, (0.0,) * 6)
+
+    def set_reference(self, t: float, theta: Sequence[float], slope: Sequence[float]) -> None:
+        """Straight reference of all motors from now on.
+
+        Args:
+            t: s.
+            theta: (6,) at t, rad.
+            slope: (6,) rad/s.
+        """
+        self.start = [x - v * t for x, v in zip(theta, slope, strict=True)]
+        self.slope = list(slope)
+        self._add_speeds()
+
+    def set_loop(self, axis: int, limit: float, speed: float, torque: float) -> None:
+        """Torque limit and feed-forwards of one motor from now on.
+
+        Args:
+            axis: 0 to 5.
+            limit: largest torque, N m; the cascade's own if that is less.
+            speed: added behind the position loop, rad/s.
+            torque: added behind the velocity loop, N m.
+        """
+        self.limit[axis] = min(limit, float(self.cascade.limit[axis]))
+        self._speed_fed[axis], self.fed[axis] = speed, torque
+        self._add_speeds()
+
+    def _add_speeds(self) -> None:
+        self.ahead = [self.cascade.share * v + f for v, f in zip(self.slope, self._speed_fed, strict=True)]
+
+    def drives(self, t: float, y: Sequence[float]) -> Drives:
+        """What the cascades do.
+
+        Args:
+            t: s.
+            y: (18,) state of the arm.
+        """
+        kp = self.position
+        errors, asked, given = [], [], []
+        for start, slope, ahead, gain, fed, limit, x, v, s in zip(
+            self.start, self.slope, self.ahead, self.gain, self.fed, self.limit, y[:6], y[6:12], y[12:], strict=True
+        ):
+            error = kp * (start + slope * t - x) + ahead - v
+            torque = gain * error + s + fed
+            errors.append(error)
+            asked.append(torque)
+            given.append(limit if torque > limit else -limit if torque < -limit else torque)
+        return errors, asked, given
+
+    def slopes(self, rates: Sequence[float], drives: Drives) -> LoopSlopes:
+        """Slopes of every motor's torque, friction included, and of its integrator's rate.
+
+        Args:
+            rates: (6,) of the motors, rad/s.
+            drives: what the cascades do.
+        """
+        found = []
+        for asked, given, rate, gain, integral, viscous, coulomb in zip(
+            *drives[1:], rates, self.gain, self.integral, self.viscous, self.coulomb, strict=True
+        ):
+            free = asked == given
+            slope, held = (gain, 0.0) if free else (0.0, self.unwind)
+            bent = tanh(rate / STICTION_RATE)
+            drag = viscous + coulomb / STICTION_RATE * (1.0 - bent * bent)
+            found.append((slope, -self.position * slope, -slope - drag, float(free), integral - held * gain, -held))
+        return LoopSlopes(*np.array(found).T)
+
+
+# Equations of motion of the driven arm in contact, as a ``Problem`` for the integrators.
 
 State = Sequence[float]
 """(18,) plain floats."""

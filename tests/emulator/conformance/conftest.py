@@ -17,15 +17,14 @@ from typing import Any, NamedTuple
 import pytest
 from sdo_words import SdoWords
 
-from canprobe.bus.clock import MonotonicClock, VirtualClock
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.port import Port
+from canprobe.bus.port import MonotonicClock, Port, VirtualClock
 from canprobe.bus.socketcan import SocketCanPort
-from canprobe.eds import load_eds
-from canprobe.emulator.drive import make_drive_node
-from canprobe.emulator.node import SlaveNode
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.array import TactileApplication
+from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.serve import serve
-from canprobe.emulator.tactile import TactileApplication
 
 MS = 1_000_000
 SLACK_MS = 5_000  # on vcan, for one answer; never waited for when all is well

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.emulator.store_file import keep_in_file
+from canprobe.emulator.serve import keep_in_file
 
 OFF = 0x80000000
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04

@@ -6,9 +6,9 @@ from functools import partial
 
 import pytest
 
-from canprobe.eds import load_eds
-from canprobe.emulator.aborts import Abort, SdoAbort
-from canprobe.emulator.node import SlaveNode
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.node.dictionary import Abort, SdoAbort
+from canprobe.emulator.node.slave_node import SlaveNode
 
 EDS = "puma260_joint"
 VENDOR, PRODUCT, REVISION, SERIAL = NUMBERS = (0xCA5E, 0x260, 0x10000, 0xA5000321)

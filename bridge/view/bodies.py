@@ -1,0 +1,370 @@
+"""What is seen as solid: the arm's links, the touched object, the estimated patch, the tactile array.
+
+Radii and thicknesses follow photographs of the arm; where the joints are follows the model, so shapes and kinematics
+cannot disagree.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from canprobe.bridge.sample import SurfacePatch, link_transforms
+from canprobe.bridge.view.meshes import Array, Colours, Faces, Mesh, cylinder, dome, grid, heat, link, merged, revolved
+from canprobe.protocol.tactile import SIDE
+from canprobe.robot.kinematics import PumaModel
+from canprobe.touch.contact import pad_to_direction
+from canprobe.touch.objects import Cylinder, Sphere
+from canprobe.touch.patch.image import PatchCalibration
+from canprobe.touch.shapes import Bowl, PlacedShape, Torus, Wave
+
+# The PUMA 260 as solid links, from its Denavit–Hartenberg rows: both published geometries, and any like them.
+
+WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
+RIM = 5e-3
+SHOULDER, ELBOW, WRIST = 0.050, 0.040, 0.026
+"""Radii round joints 2, 3 and 5, m."""
+UPPER_ARM, FOREARM = 0.046, 0.058
+"""Thickness of the two long links along the shoulder's axis, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """One solid of one colour, fixed to a link.
+
+    Attributes:
+        name: unique in the arm.
+        frame: 0 for the base, i for the frame behind joint i.
+        mesh: in that frame, m.
+        colour: RGB, 0–255.
+    """
+
+    name: str
+    frame: int
+    mesh: Mesh
+    colour: tuple[int, int, int]
+
+
+def link_frames(model: PumaModel, q: ArrayLike) -> Array:
+    """Frames of the base and of every link.
+
+    Args:
+        model: the arm.
+        q: (6,) joint angles, rad.
+
+    Returns:
+        (7, 4, 4) T_base_link; the last is the flange.
+    """
+    frames = np.empty((7, 4, 4))
+    frames[0] = np.eye(4)
+    for i, (_, _, T) in enumerate(link_transforms(model, np.asarray(q, dtype=np.float64))):
+        frames[i + 1] = frames[i] @ T
+    return frames
+
+
+def arm_parts(model: PumaModel) -> list[Part]:
+    """Solids of base and links."""
+    return [*_trunk(model), *_upper_arm(model), *_forearm(model), *_wrist(model)]
+
+
+def _trunk(model: PumaModel) -> list[Part]:
+    d1 = model.links[0]
+    side = math.copysign(1.0, model.links[2])  # on which side of the trunk the arm hangs, along axis 2
+    foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM)])
+    column = cylinder(0.054, (0.030, d1 - 0.072), RIM)
+    # frame 1: z along axis 2, y up along the trunk, origin at the shoulder
+    collar = cylinder(0.056, (-0.070, -0.058), 2e-3).moved(_UP)
+    neck = cylinder(0.052, (-0.058, 0.0), RIM).moved(_UP)
+    drum = cylinder(SHOULDER, _span(-side * 0.062, side * (_reach(model) - 0.002)), RIM)
+    return [
+        Part("foot", 0, foot, DARK),
+        Part("column", 0, column, WHITE),
+        Part("collar", 1, collar, DARK),
+        Part("shoulder", 1, merged([neck, drum]), WHITE),
+    ]
+
+
+def _reach(model: PumaModel) -> float:
+    """From the trunk's axis to the near side of the upper arm, m, along axis 2."""
+    return max(abs(model.links[2]) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
+
+
+def _upper_arm(model: PumaModel) -> list[Part]:
+    _, a2, offset, _, _, _ = model.links
+    side = math.copysign(1.0, offset)
+    shift = float(model.dh[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
+    trunk = shift - offset
+    near, far = trunk + side * _reach(model), trunk + side * (_reach(model) + UPPER_ARM)
+    shoulder, elbow = (-a2, 0.0), (0.0, 0.0)
+    beam = link((shoulder, SHOULDER + 0.004), (elbow, ELBOW + 0.002), _span(near, far), 8e-3)
+    cap = link((shoulder, SHOULDER - 0.014), (shoulder, SHOULDER - 0.014), _span(far, far + side * 0.006), 2e-3)
+    pin = cylinder(ELBOW - 0.014, _span(shift, shift - side * (0.5 * FOREARM + 0.02)))
+    return [Part("upper_arm", 2, beam, WHITE), Part("shoulder_cap", 2, merged([cap, pin]), DARK)]
+
+
+def _forearm(model: PumaModel) -> list[Part]:
+    _, _, offset, a3, d4, _ = model.links
+    # frame 3: z along the forearm, y against axis 2; the elbow is at x = −a3
+    half, elbow = 0.5 * FOREARM, (-a3, 0.0)
+    side = math.copysign(half, offset)
+    beam = link((elbow, ELBOW), ((0.0, d4 - 0.062), WRIST + 0.004), (-half, half), 8e-3)
+    cap = link((elbow, ELBOW - 0.014), (elbow, ELBOW - 0.014), _span(side, 1.2 * side), 2e-3)
+    ring = cylinder(WRIST - 0.001, (d4 - 0.040, d4 - 0.028), 2e-3)
+    return [Part("forearm", 3, beam.moved(_ZX), WHITE), Part("elbow_cap", 3, merged([cap.moved(_ZX), ring]), DARK)]
+
+
+def _wrist(model: PumaModel) -> list[Part]:
+    d6 = model.links[5]
+    # frame 4: y along the forearm, z along axis 5; frame 5: z along axis 6
+    stem = cylinder(WRIST - 0.003, (-0.030, 0.0), 3e-3).moved(_UP)
+    hinge = cylinder(0.021, (-0.027, 0.027), 4e-3)
+    hub = link(((0.0, 0.0), 0.018), ((0.0, d6 - 0.024), 0.015), (-0.017, 0.017), 3e-3).moved(_ZX)
+    flange = cylinder(0.021, (-0.016, 0.0), 2e-3)
+    return [
+        Part("wrist", 4, merged([stem, hinge]), WHITE),
+        Part("hub", 5, hub, GREY),
+        Part("flange", 6, flange, DARK),
+    ]
+
+
+def _span(a: float, b: float) -> tuple[float, float]:
+    return (a, b) if a <= b else (b, a)
+
+
+def probe_parts(radius: float, T_flange_probe: Array) -> tuple[Mesh, Mesh]:
+    """The probe in its own frame (origin at the sphere's centre, z the pole): its holder, and its elastic dome.
+
+    Args:
+        radius: of the sphere, m.
+        T_flange_probe: (4, 4); the holder goes back along z to the flange.
+    """
+    back = float(T_flange_probe[2, 3])
+    r = radius
+    outline = [(0.0, -back), (0.014, -back), (0.014, -0.72 * r), (0.62 * r, -0.42 * r), (0.9 * r, -0.42 * r)]
+    holder = revolved([*outline, (0.9 * r, -0.34 * r), (0.0, -0.34 * r)])
+    return holder, dome(radius, math.radians(110.0))
+
+
+def _axes(x: ArrayLike, y: ArrayLike, z: ArrayLike) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([x, y, z])
+    return T
+
+
+_UP = _axes((0, 0, 1), (1, 0, 0), (0, 1, 0))
+"""Carries a body along z to one along y."""
+_ZX = _axes((1, 0, 0), (0, 0, 1), (0, -1, 0))
+"""Carries an outline in x, y to one in x, z."""
+
+
+# The touched object as a sheet or a body of triangles, every vertex on its exact surface.
+
+REACH_M = 0.055
+"""How much of a surface without end is shown round the object's origin, to each side."""
+WHOLE_M = 0.12
+"""Largest radius of a body that is shown whole."""
+STEPS = 40
+
+
+def object_mesh(shape: PlacedShape, reach_m: float = REACH_M) -> Mesh:
+    """The surface of an object near its origin, base frame.
+
+    Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `reach_m` to each side),
+    everything else over a square of twice `reach_m`.
+
+    Args:
+        shape: the true object.
+        reach_m: m.
+    """
+    radius = getattr(shape, "radius", math.inf)
+    if radius <= WHOLE_M and isinstance(shape, Sphere):
+        return _placed(shape, dome(radius, math.pi, rings=32), -radius)
+    if radius <= WHOLE_M and isinstance(shape, Cylinder):
+        return _placed(shape, _tube(radius, reach_m), -radius)
+    if radius <= WHOLE_M and isinstance(shape, Bowl):
+        return _placed(shape, _hollow(radius), radius)
+    if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
+        return _ring(shape)
+    return grid(_sheet(shape, reach_m))
+
+
+def object_lines(shape: PlacedShape, reach_m: float = REACH_M, lines: int = 15) -> Array:
+    """Lines on the surface that make its curvature visible.
+
+    Args:
+        shape: the true object.
+        reach_m: to each side of the object's origin, m.
+        lines: in each of two directions.
+
+    Returns:
+        (n, 2, 3) segments, base frame, m.
+    """
+    sheet = _sheet(shape, _sheet_reach(shape, reach_m))
+    picked = np.linspace(0, STEPS, lines).round().astype(int)
+    along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in picked]
+    across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in picked]
+    return np.concatenate([*along, *across])
+
+
+def _sheet_reach(shape: PlacedShape, reach_m: float) -> float:
+    """Not over the edge of a body seen from above."""
+    radius = getattr(shape, "radius", math.inf)
+    return min(reach_m, 0.7 * radius) if not isinstance(shape, Cylinder) else reach_m
+
+
+def _sheet(shape: PlacedShape, reach_m: float) -> Array:
+    """(STEPS + 1, STEPS + 1, 3) feet of a square of the tangent plane, base frame; its front side is outside."""
+    T = shape.T_base_object
+    across = min(reach_m, 0.85 * shape.radius) if isinstance(shape, Cylinder) else reach_m
+    xs, ys = np.linspace(-reach_m, reach_m, STEPS + 1), np.linspace(-across, across, STEPS + 1)
+    plane = [[T[:3, 3] + x * T[:3, 0] + y * T[:3, 1] + _height(shape, y) * T[:3, 2] for y in ys] for x in xs]
+    return np.array([[shape.closest(point).point for point in row] for row in plane])
+
+
+def _height(shape: PlacedShape, y: float) -> float:
+    """Where to look for a foot: in the troughs too."""
+    if isinstance(shape, Wave):
+        return shape.amplitude * (math.cos(2.0 * math.pi * y / shape.wavelength) - 1.0)
+    return 0.0
+
+
+def _ring(shape: Torus) -> Mesh:
+    """A whole torus."""
+    angle = np.linspace(-math.pi, math.pi, 49)
+    profile = np.column_stack([shape.ring_radius + shape.radius * np.cos(angle), shape.radius * np.sin(angle)])
+    mesh = revolved(profile, 96)
+    return _placed(shape, Mesh(mesh.vertices - (shape.ring_radius, 0.0, 0.0), mesh.faces), -shape.radius)
+
+
+def _placed(shape: PlacedShape, mesh: Mesh, height_m: float) -> Mesh:
+    T = np.array(shape.T_base_object)
+    T[:3, 3] += height_m * T[:3, 2]
+    return mesh.moved(T)
+
+
+def _tube(radius: float, half: float) -> Mesh:
+    """A cylinder along x, open at its ends."""
+    angles = np.linspace(0.0, 2.0 * math.pi, 97)
+    y, z = radius * np.cos(angles), radius * np.sin(angles)
+    ends = [np.column_stack([np.full(len(angles), x), y, z]) for x in np.linspace(-half, half, 9)]
+    return grid(np.stack(ends, axis=1))
+
+
+def _hollow(radius: float) -> Mesh:
+    """The inside of the lower half of a ball."""
+    half = dome(radius, math.pi / 2)
+    return Mesh(half.vertices * (1.0, -1.0, -1.0), half.faces[:, ::-1])
+
+
+# The estimated patch as a disc on its quadric, and how uncertain its height is: shells at ±2 standard deviations.
+
+RADIUS_M, RINGS, SECTORS = 0.012, 6, 36
+EXAGGERATION = 20.0
+"""The shells stand this many times too far apart: 0.5 1/m is 36 µm at the disc's rim."""
+PATCH_LIFT_M = 3e-4
+"""Off the true surface, outward, so that the two do not flicker through each other."""
+MOST_M = 0.006
+"""Farthest that a shell is drawn from the patch: where curvature was not observed it would be nowhere."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PatchShape:
+    """One estimate to draw, in the contact frame.
+
+    Attributes:
+        surface: (n, 3) points of the disc, m, lifted by `LIFT_M`.
+        above, below: (n, 3) the shells outside and inside the object, exaggerated and cut off, m, lifted too.
+        sigma: (n,) standard deviation of the height, m, as stated; infinite where not observed.
+    """
+
+    surface: Array
+    above: Array
+    below: Array
+    sigma: Array
+
+
+def disc_points(radius: float = RADIUS_M) -> Array:
+    """(n, 2) points of the disc in the tangent plane, ring by ring from the middle, m."""
+    radii = np.linspace(0.0, radius, RINGS + 1)[1:, None]
+    angles = np.linspace(0.0, 2.0 * math.pi, SECTORS, endpoint=False)[None]
+    rings = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1).reshape(-1, 2)
+    points: Array = np.vstack([np.zeros((1, 2)), rings])
+    return points
+
+
+def disc_faces() -> Faces:
+    """(m, 3) triangles between the points of the disc; front side towards −z, out of the object."""
+    index = 1 + np.arange(RINGS * SECTORS).reshape(RINGS, SECTORS)
+    turned = np.roll(index, -1, axis=1)
+    middle = np.stack([np.zeros(SECTORS, np.int64), turned[0], index[0]], axis=1)
+    a, b, c, d = (x.ravel() for x in (index[:-1], turned[:-1], turned[1:], index[1:]))
+    return np.concatenate([middle, np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+
+
+def patch_shape(patch: SurfacePatch, xy: Array) -> PatchShape:
+    """What is drawn of an estimate.
+
+    Args:
+        patch: of the estimator.
+        xy: (n, 2) from :func:`disc_points`.
+    """
+    x, y = xy.T
+    height, sigma = patch.heights(x, y)
+    shift = np.minimum(2.0 * EXAGGERATION * sigma, MOST_M)
+    drawn = height - PATCH_LIFT_M
+    surface, above, below = (np.column_stack([x, y, z]) for z in (drawn, drawn - shift, drawn + shift))
+    return PatchShape(surface, above, below, sigma)
+
+
+# The tactile array on its dome: where each taxel lies, and its image as colours.
+
+FULL_COUNTS = 255
+SHARE = 0.9
+"""Side of a drawn taxel over the pitch."""
+TAXEL_LIFT_M = 2e-4
+"""How far above the dome taxels are drawn."""
+
+
+def taxel_poses(radius: float) -> tuple[Array, Array]:
+    """Where the taxels lie on the probe.
+
+    Args:
+        radius: of the probe, m.
+
+    Returns:
+        (256, 3) positions in the probe frame, m, and (256, 4) unit quaternions w, x, y, z that turn a tile lying in
+        the xy plane to its place; row by row, v and then u rising.
+    """
+    pitch = PatchCalibration().pitch_m
+    axis = (np.arange(SIDE) - 0.5 * (SIDE - 1)) * pitch
+    directions = np.array([pad_to_direction(u, v, radius) for v in axis for u in axis])
+    # the shortest turn from z to d: (1 + d_z, z × d), normalised
+    turns = np.column_stack([1.0 + directions[:, 2], -directions[:, 1], directions[:, 0], np.zeros(len(directions))])
+    turns /= np.linalg.norm(turns, axis=1, keepdims=True)
+    return (radius + TAXEL_LIFT_M) * directions, turns
+
+
+def tile() -> tuple[Array, NDArray[np.int64]]:
+    """One taxel: vertices (4, 3), m, and faces (2, 3), front side towards +z."""
+    half = 0.5 * SHARE * PatchCalibration().pitch_m
+    corners = half * np.array(((-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)), dtype=np.float64)
+    return corners, np.array(((0, 1, 2), (0, 2, 3)))
+
+
+def taxel_colours(taxels: NDArray[np.uint8]) -> Colours:
+    """(..., 3) colours of counts; a square-root scale, so that the rim of a patch is seen."""
+    return heat(np.sqrt(taxels.astype(np.float64)), 0.0, np.sqrt(FULL_COUNTS))
+
+
+def taxel_image(taxels: NDArray[np.uint8], pixels: int = 12) -> Colours:
+    """The image as RGB, each taxel a square of so many pixels; v rises upward.
+
+    Args:
+        taxels: (16, 16) counts, rows v, columns u.
+        pixels: per taxel.
+    """
+    colours = taxel_colours(taxels[::-1])
+    return np.repeat(np.repeat(colours, pixels, axis=0), pixels, axis=1)

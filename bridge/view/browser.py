@@ -1,0 +1,277 @@
+"""A cell in a browser: live, recorded with a time slider, or as one HTML file that replays a run."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections import deque
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from canprobe.bridge.sample import Context, Sample
+from canprobe.bridge.view.instants import NAMES, Curves, Follower, Moment, curves_of, row_of
+from canprobe.bridge.view.meshes import UNKNOWN, heat, scale
+from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
+from canprobe.bridge.view.recorded import RecordedRun
+from canprobe.bridge.view.stage import Panel, Stage, address, open_server
+from canprobe.bus.disk import write_text
+from canprobe.bus.port import MonotonicClock
+from canprobe.scene.geometry import true_object
+from canprobe.touch.shapes import PlacedShape
+
+# The bridge `view`: the cell in a browser while it runs.
+
+FRAME_NS, PLOT_NS = 40_000_000, 250_000_000
+"""Time on the wall between two pictures, and between two drawings of the plots."""
+ROW_S, WINDOW_S = 0.05, 30.0
+"""Time between two points of a plot, and how much of the past it shows."""
+_OFF_PATH = tuple(phase.name.lower() for phase in OFF_PATH)
+
+
+class LiveView:
+    """A sink of samples that shows the newest of them, as often as a browser wants to see it.
+
+    Args:
+        context: the plan, and where to listen.
+    """
+
+    def __init__(self, context: Context) -> None:
+        scene, settings = context.plan.scene, context.settings
+        shape = None if scene.object is None else true_object(scene.object)
+        errors = error_scale(shape)
+        self._stack = ExitStack()
+        server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
+        self._address = address(server)
+        self._stage = Stage(server, scene)
+        self._panel = Panel(server, scene, errors)
+        self._trail = Trail()
+        self._path = GrowingPath(server.scene, self._trail, errors)
+        self._follower = Follower(shape)
+        self._rows: deque[tuple[float, ...]] = deque(maxlen=round(WINDOW_S / ROW_S))
+        self._clock = MonotonicClock()
+        self._frame_ns = self._plot_ns = 0
+
+    @property
+    def where(self) -> str:
+        """Its address."""
+        return self._address
+
+    def start(self, epoch_ns: int) -> None:
+        """Nothing to do: times are shown from the opening of the bus."""
+
+    def write(self, sample: Sample) -> None:
+        """Take one sample; now and then show where the cell is."""
+        moment = self._follower.take(sample)
+        if sample.contact is not None and moment.phase not in _OFF_PATH:
+            value = moment.error if self._follower.shape is not None else moment.sigma
+            self._trail.add(moment.t_s, sample.contact.point, sample.contact.normal, value)
+        if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
+            self._rows.append(row_of(moment))
+        now_ns = self._clock.now_ns()
+        if now_ns - self._frame_ns >= FRAME_NS:
+            self._frame_ns = now_ns
+            self._show(moment, now_ns)
+
+    def _show(self, moment: Moment, now_ns: int) -> None:
+        curves = None
+        if now_ns - self._plot_ns >= PLOT_NS:
+            self._plot_ns = now_ns
+            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
+            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.refresh()
+            self._panel.show(moment, curves)
+
+    def close(self, summary: str | None) -> None:
+        """Take the page away."""
+        self._show(self._follower.moment, self._plot_ns + PLOT_NS)
+        self._stack.close()
+
+
+def open_sink(context: Context) -> LiveView:
+    """The bridge `view`."""
+    return LiveView(context)
+
+
+# A recorded run in a browser, with a time slider, play and pause.
+
+FRAME_S = 0.04
+MOST_POINTS = 600
+"""Points of a curve in a plot."""
+
+
+def serve_run(
+    run: RecordedRun,
+    *,
+    port: int,
+    host: str,
+    ready: Callable[[str], None],
+    whole: Callable[[], AbstractContextManager[None]] = nullcontext,
+) -> None:
+    """Show a run until it is interrupted.
+
+    Args:
+        run: from `read_run`.
+        port, host: see `open_server`.
+        ready: called with the address.
+        whole: what is done within it is not to be interrupted; pictures are made by libraries that take it ill.
+    """
+    with open_server(port, host) as server:
+        player = Player(server, run)
+        ready(address(server))
+        clock = MonotonicClock()
+        next_ns = clock.now_ns()
+        while True:
+            with whole():
+                player.step(FRAME_S)
+            next_ns = max(next_ns + round(FRAME_S * 1e9), clock.now_ns())
+            clock.sleep_until_ns(next_ns)
+
+
+class Player:
+    """The slider and what follows it; `step` moves the time on.
+
+    Args:
+        server: a `viser.ViserServer`.
+        run: what is shown.
+    """
+
+    def __init__(self, server: Any, run: RecordedRun) -> None:
+        self._server = server
+        self._run = run
+        errors = error_scale(shape_of(run))
+        self._stage = Stage(server, run.scene)
+        self._path = LoadedPath(server.scene, trail_of(run), errors)
+        gui = server.gui
+        start = float(run.log["t_s"][0])
+        with gui.add_folder("Replay"):
+            self._slider = gui.add_slider("time (s)", start, max(run.duration_s, start + 0.01), 0.01, start)
+            self._play = gui.add_checkbox("play", True)
+            self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
+        self._panel = Panel(server, run.scene, errors)
+        self._curves = curves_of(run.at(t) for t in run.times(max(FRAME_S, run.duration_s / MOST_POINTS)))
+        self._panel.show(run.at(start), self._curves)
+        self._shown = math.nan
+
+    def step(self, dt_s: float) -> None:
+        """Go on by so much of the wall's time, and show where the slider stands."""
+        t = float(self._slider.value)
+        if self._play.value:
+            t += dt_s * float(self._speed.value)
+            t = t if t <= self._run.duration_s else float(self._run.log["t_s"][0])
+            self._slider.value = t
+        if t == self._shown:
+            return
+        self._shown = t
+        moment = self._run.at(t)
+        with self._server.atomic():
+            self._stage.show(moment)
+            self._path.until(t)
+            self._panel.show(moment)
+
+
+def shape_of(run: RecordedRun) -> PlacedShape | None:
+    """The true object of a run's scene."""
+    return None if run.scene.object is None else true_object(run.scene.object)
+
+
+def trail_of(run: RecordedRun) -> Trail:
+    """The path of a run's contact, coloured by the error of its estimates; by their deviation without a true object."""
+    trail, log = Trail(), run.log
+    if "contact_mm" not in log:
+        return trail
+    touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
+    rows = np.nonzero(touched)[0]
+    answers = np.searchsorted(run.answers, rows, side="right") - 1
+    known = run.sigmas if run.scene.object is None else run.errors
+    values = np.append(known, math.nan)[answers].tolist()  # the last for −1: before the first answer
+    times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
+    for t_s, point, normal, value in zip(times, points, log["normal"][rows], values, strict=True):
+        trail.add(t_s, point, normal, value)
+    return trail
+
+
+# One HTML file that replays a run: viser's own client with the scene in it, and a panel of plots beside it.
+#
+# Nothing is loaded when it is opened, so that it can be mailed, and looked at years later, from any disk.
+
+MOST_FRAMES = 900
+"""A longer run is shown in larger steps: the file stays below ten megabytes."""
+
+
+def write_page(run: RecordedRun, file: Path) -> None:
+    """Write the replay of a run into one file.
+
+    Args:
+        run: from `read_run`.
+        file: to write; an older one is replaced.
+
+    Raises:
+        UsageError: viser is not installed.
+        ResultsError: the file cannot be written.
+    """
+    times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
+    page = _record(run, times)
+    head, middle, tail = page.partition("</head>")
+    panel = files(__package__).joinpath("panel.html").read_text(encoding="utf-8")
+    data = json.dumps(_panel_data(run, times), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
+    title = _escaped(f"canprobe: {run.title}")
+    head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
+    write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
+
+
+def _record(run: RecordedRun, times: Any) -> str:
+    """Viser's page with every frame in it."""
+    with open_server(0) as server:
+        stage = Stage(server, run.scene)
+        path = LoadedPath(server.scene, trail_of(run), error_scale(shape_of(run)))
+        recorder = server.get_scene_serializer()
+        before = float(times[0])
+        with server.atomic():  # nobody listens: nothing is sent
+            for t in times.tolist():
+                recorder.insert_sleep(t - before)
+                before = t
+                stage.show(run.at(t))
+                path.until(t)
+        return str(recorder.as_html())
+
+
+def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
+    """What the panel plots: columns, taxel images, colours; None for what is not finite."""
+    moments = [run.at(t) for t in times.tolist()]
+    curves = curves_of(moments)
+    shape = shape_of(run)
+    errors = error_scale(shape)
+    task = run.scene.task
+    blank = np.zeros((16, 16), np.uint8)
+    taxels = b"".join((blank if m.taxels is None else m.taxels).tobytes() for m in moments) if run.taxels else b""
+    return {
+        "title": run.title,
+        "scene": run.scene.name,
+        "start": float(times[0]),
+        "curves": {name: [_short(x) for x in curves[name].tolist()] for name in NAMES},
+        "phases": [m.phase for m in moments],
+        "target": task.force_n if task.kind in ("scan", "press") else None,
+        "truth": shape is not None,
+        "shape": run.scene.shape is not None,
+        "sensor": run.scene.sensor is not None,
+        "taxels": base64.b64encode(taxels).decode("ascii"),
+        "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
+        "heat": heat(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0)).tolist(),
+        "unknown": list(UNKNOWN),
+    }
+
+
+def _short(x: float) -> float | None:
+    return float(f"{x:.5g}") if math.isfinite(x) else None
+
+
+def _escaped(text: str) -> str:
+    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

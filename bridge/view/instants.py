@@ -1,0 +1,163 @@
+"""What is shown of one instant and plotted over time, and how it comes from samples, live or recorded."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
+from canprobe.bridge.view.meshes import Array
+from canprobe.touch.shapes import PlacedShape
+
+# What is shown of one instant, and how it comes from samples, live or recorded.
+
+SILENT_NS = 250_000_000
+"""A tactile frame, and the contact that was felt in it, is shown no longer than this after it came."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Moment:
+    """The cell at one instant.
+
+    Attributes:
+        t_s: on the clock of the samples, s.
+        phase: of the task.
+        q: (6,) joint angles, rad; None without an arm.
+        contact: where the probe touches; None without contact.
+        patch: the newest answer of the estimator.
+        taxels: (16, 16) counts of the newest frame; None before the first.
+        force: N, of the newest frame; NaN before the first.
+        error: of the patch, 1/m; NaN where there is no truth or no whole answer.
+        kappa_true: principal curvatures of the true object at the patch's contact point, 1/m, larger first; NaN
+            without either.
+        sigma: stated standard deviation of the patch's curvature, as a Frobenius norm, 1/m; infinite where a part of
+            it was not observed, NaN before the first.
+        dropped: samples lost on the way so far.
+    """
+
+    t_s: float = 0.0
+    phase: str | None = None
+    q: Array | None = None
+    contact: ContactFrame | None = None
+    patch: SurfacePatch | None = None
+    taxels: NDArray[np.uint8] | None = None
+    force: float = math.nan
+    error: float = math.nan
+    kappa_true: tuple[float, float] = (math.nan, math.nan)
+    sigma: float = math.nan
+    dropped: int = 0
+
+
+def curvature_error(patch: SurfacePatch, shape: PlacedShape) -> float:
+    """‖K − K_true‖ (Frobenius, 1/m) at the patch's contact point; NaN where not all curvature was observed."""
+    if not all(patch.observed) or not np.isfinite(patch.K).all():
+        return math.nan
+    true = shape.closest(patch.T_base_contact[:3, 3])
+    axes = patch.T_base_contact[:3, :2]
+    tensor = (true.directions.T * true.kappa) @ true.directions
+    return float(np.linalg.norm(patch.K - axes.T @ tensor @ axes))
+
+
+def true_kappa(patch: SurfacePatch, shape: PlacedShape) -> tuple[float, float]:
+    """Principal curvatures of the true object at the patch's contact point, 1/m, larger first."""
+    first, second = shape.closest(patch.T_base_contact[:3, 3]).kappa.tolist()
+    return first, second
+
+
+def curvature_sigma(patch: SurfacePatch) -> float:
+    """Root of the expected squared Frobenius error of K, as the estimator states it, 1/m."""
+    C = patch.covariance
+    variance = float(C[0, 0] + 2.0 * C[1, 1] + C[2, 2])
+    return math.sqrt(max(variance, 0.0)) if math.isfinite(variance) else math.inf
+
+
+class Follower:
+    """Keeps the newest of everything while samples come in.
+
+    Args:
+        shape: the true object, for the error; None where it is not known.
+    """
+
+    def __init__(self, shape: PlacedShape | None = None) -> None:
+        self.shape = shape
+        self.moment = Moment()
+        self._felt_ns = -SILENT_NS
+
+    def take(self, sample: Sample) -> Moment:
+        """The moment with what was new in a sample."""
+        now = replace(self.moment, t_s=sample.t_ns * 1e-9, phase=sample.phase, dropped=sample.dropped)
+        if sample.joints is not None:
+            now = replace(now, q=sample.joints.position)
+        if sample.taxels is not None:
+            self._felt_ns = sample.t_ns
+            force = 0.0 if sample.wrench is None else float(np.linalg.norm(sample.wrench.force))
+            now = replace(now, taxels=sample.taxels.counts, force=force, contact=sample.contact)
+        elif sample.wrench is not None:  # features only
+            self._felt_ns = sample.t_ns
+            now = replace(now, force=float(np.linalg.norm(sample.wrench.force)), contact=sample.contact)
+        elif sample.t_ns - self._felt_ns > SILENT_NS:
+            now = replace(now, contact=None)
+        if sample.patch is not None:
+            now = replace(now, patch=sample.patch, sigma=curvature_sigma(sample.patch))
+            if self.shape is not None:
+                error, kappa = curvature_error(sample.patch, self.shape), true_kappa(sample.patch, self.shape)
+                now = replace(now, error=error, kappa_true=kappa)
+        self.moment = now
+        return now
+
+
+# What is plotted over time: force, principal curvatures with their bands, the error of the curvature.
+
+NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "true1", "true2", "error", "sigma")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Curves:
+    """Columns of one length; NaN where there is nothing to plot.
+
+    Attributes:
+        columns: by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands.
+    """
+
+    columns: dict[str, Array]
+
+    def __getitem__(self, name: str) -> Array:
+        return self.columns[name]
+
+
+def kappa_sigmas(patch: SurfacePatch) -> tuple[float, float]:
+    """Stated standard deviations of κ1 ≥ κ2, 1/m; infinite where not observed."""
+    if not np.isfinite(patch.covariance).all() or not np.isfinite(patch.K).all():
+        return math.inf, math.inf
+    _, vectors = np.linalg.eigh(patch.K)
+    out = []
+    for u, v in vectors.T[::-1]:
+        g = np.array((u * u, 2.0 * u * v, v * v))
+        out.append(math.sqrt(max(float(g @ patch.covariance @ g), 0.0)))
+    return out[0], out[1]
+
+
+def row_of(moment: Moment) -> tuple[float, ...]:
+    """One row of the plots, in the order of `NAMES`."""
+    nan = math.nan
+    if moment.patch is None:
+        bands: tuple[float, ...] = (nan,) * 6
+    else:
+        kappa, sigmas = moment.patch.kappa, kappa_sigmas(moment.patch)
+        bands = tuple(
+            x
+            for k, s in zip(kappa, sigmas, strict=True)
+            for x in ((k, k - 1.96 * s, k + 1.96 * s) if math.isfinite(s) else (k, nan, nan))
+        )
+    sigma = moment.sigma if math.isfinite(moment.sigma) else nan
+    return (moment.t_s, moment.force, *bands, *moment.kappa_true, moment.error, sigma)
+
+
+def curves_of(moments: Iterable[Moment]) -> Curves:
+    """Columns of a run's moments."""
+    rows = np.array([row_of(moment) for moment in moments], dtype=np.float64).reshape(-1, len(NAMES))
+    return Curves(dict(zip(NAMES, rows.T, strict=True)))

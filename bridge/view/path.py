@@ -1,0 +1,178 @@
+"""The contact's path as coloured segments, and in the browser as nodes for each stretch of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+
+from canprobe.bridge.view.meshes import Array, Colours, linear_light, scale
+from canprobe.tasks.probing import Phase
+from canprobe.touch.shapes import PlacedShape
+
+# The contact's path as coloured segments: thinned, lifted off the surface, and cut into chunks by time.
+
+SPACING_M = 4e-4
+"""Path between two points that are drawn."""
+LIFT_M = 1e-3
+"""Off the surface, along the normal, so that the ghost does not hide the path."""
+GAP_M = 8e-3
+"""Two contacts farther apart are not joined: the probe was lifted between them."""
+OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
+"""Phases in which what the array still feels, or feels first, is no point of the path."""
+SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorScale:
+    """What the colours of the path mean.
+
+    Attributes:
+        high: value of the last colour, 1/m; the first is 0.
+        text: what is coloured, for a legend.
+    """
+
+    high: float
+    text: str
+
+    def colours(self, values: Array) -> Colours:
+        """(n, 3) colours of values (n,), 1/m; grey where there is none."""
+        return scale(values, 0.0, self.high)
+
+
+def error_scale(shape: PlacedShape | None) -> ErrorScale:
+    """Five per cent of the object's curvature; without a known object the stated deviation is coloured.
+
+    Args:
+        shape: the true object, or None.
+    """
+    if shape is None:
+        return ErrorScale(UNCERTAIN_PER_M, "stated std. deviation of K (1/m)")
+    kappa = shape.closest(shape.T_base_object[:3, 3]).kappa
+    return ErrorScale(max(SHARE * float(np.linalg.norm(kappa)), LEAST_PER_M), "error ‖K − K true‖ (1/m)")
+
+
+class Trail:
+    """Collects contacts into segments.
+
+    Args:
+        spacing_m: see `SPACING_M`.
+    """
+
+    def __init__(self, spacing_m: float = SPACING_M) -> None:
+        self._spacing = spacing_m
+        self._last: Array | None = None
+        self.segments: list[Array] = []
+        self.values: list[float] = []
+        self.times: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self.segments)
+
+    def add(self, t_s: float, point: Array, normal: Array, value: float) -> bool:
+        """Take one contact; whether a segment has come of it.
+
+        Args:
+            t_s: its time, s.
+            point: (3,) m.
+            normal: (3,) outward.
+            value: that colours the segment, 1/m.
+        """
+        lifted = point + LIFT_M * normal
+        if self._last is None:
+            self._last = lifted
+            return False
+        step = float(np.linalg.norm(lifted - self._last))
+        if step < self._spacing:
+            return False
+        joined = step < GAP_M
+        if joined:
+            self.segments.append(np.stack([self._last, lifted]))
+            self.values.append(value)
+            self.times.append(t_s)
+        self._last = lifted
+        return joined
+
+    def chunks(self, most: int = 240, least_s: float = 0.08) -> list[slice]:
+        """Neighbouring segments in groups of even time.
+
+        Args:
+            most: number of groups.
+            least_s: time that a group spans at least.
+        """
+        if not self.times:
+            return []
+        span = max((self.times[-1] - self.times[0]) / most, least_s)
+        group = [math.floor((t - self.times[0]) / span) for t in self.times]
+        edges = [0, *(i for i in range(1, len(group)) if group[i] != group[i - 1]), len(group)]
+        return [slice(a, b) for a, b in pairwise(edges)]
+
+
+# The path in the browser: a node for each stretch of it, so that a growing path is not sent again and again.
+
+THICKNESS_M = 1.5e-3
+STRETCH = 150
+"""Segments of one node of a live path."""
+
+
+class LoadedPath:
+    """A whole recorded path, shown up to an instant.
+
+    Args:
+        api: of viser's scene.
+        trail: of the run.
+        scale: of its colours.
+    """
+
+    def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
+        self._starts: list[float] = []
+        self._nodes: list[Any] = []
+        self._shown = 0
+        for chunk in trail.chunks():
+            self._starts.append(trail.times[chunk.start])
+            name = f"/path/{len(self._nodes):03d}"
+            self._nodes.append(_add(api, name, trail, chunk, scale, visible=False))
+
+    def until(self, t_s: float) -> None:
+        """Show what was touched until then."""
+        wanted = int(np.searchsorted(self._starts, t_s, side="right"))
+        low, high = sorted((self._shown, wanted))
+        for node in self._nodes[low:high]:
+            node.visible = wanted > self._shown
+        self._shown = wanted
+
+
+class GrowingPath:
+    """A path that grows while the cell runs.
+
+    Args:
+        api: of viser's scene.
+        trail: which grows elsewhere.
+        scale: of its colours.
+    """
+
+    def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
+        self._api, self._trail, self._scale = api, trail, scale
+        self._done = 0
+        self._sent = 0
+
+    def refresh(self) -> None:
+        """Send what has come since."""
+        while self._sent < len(self._trail):
+            end = min(self._done + STRETCH, len(self._trail))
+            name = f"/path/{self._done // STRETCH:04d}"
+            _add(self._api, name, self._trail, slice(self._done, end), self._scale, visible=True)
+            self._sent = end
+            if end - self._done == STRETCH:
+                self._done = end
+
+
+def _add(api: Any, name: str, trail: Trail, chunk: slice, scale: ErrorScale, *, visible: bool) -> Any:
+    colours = linear_light(scale.colours(np.array(trail.values[chunk])))
+    return api.add_line_segments(
+        name, np.array(trail.segments[chunk], np.float32), np.repeat(colours[:, None], 2, axis=1),
+        thickness=THICKNESS_M, thickness_units="world", visible=visible,
+    )  # fmt: skip

@@ -1,0 +1,490 @@
+"""Files at the edge: whole or not there, columns as `.npz`, and logs of a bus as candump and as python-can's forms.
+
+CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
+
+Source: can-utils, `candump -l` and `lib.c` (parse_canframe).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import re
+import struct
+import zipfile
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from io import FileIO
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any, Protocol
+
+import can
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.port import ERR_BUS, ERR_FLAG, Clock, ControllerState, Port, PortCounters, TimedFrame
+from canprobe.errors import ResultsError, UsageError
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
+
+# candump log files: `(0000000000.002500) can0 181#37060000`, time with six digits, from 0 in a recording of ours.
+
+_LINE = re.compile(
+    r"\((?P<s>\d+)\.(?P<us>\d{6})\) (?P<channel>\S+) (?P<id>[0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#"
+    r"(?:R(?P<length>[0-8]?)|#(?P<flags>[0-9A-Fa-f])(?P<fd>(?:[0-9A-Fa-f]{2}){0,64})|"
+    r"(?P<data>(?:[0-9A-Fa-f]{2}){0,8}))(?: [RT])?"
+)
+
+
+CLASSIC_BYTES = 8
+_BIT_RATE_SWITCH = 1
+_FRAMES = 32
+"""Frames that are kept as they are before they become lines, which is quicker for many at once."""
+_LINES = 256
+"""Lines that are joined before they go to the file."""
+
+
+_Format = Callable[[int, bytes, int], str]
+
+
+class CandumpWriter:
+    """Writes frames as candump does; a context manager. Its `write` is a recorder for a `LockstepBus`.
+
+    A file that fails (full disk) ends the log after a whole line and raises nothing: whoever records a moving machine
+    looks at `failure`.
+
+    Args:
+        path: the file to write; an existing one is replaced.
+        channel: the name in each line.
+        t0_ns: the time on the frames' clock that is written as 0.
+
+    Raises:
+        UsageError: somebody else writes this file just now.
+
+    Attributes:
+        failure: why nothing is written any more; None while all is well.
+    """
+
+    def __init__(self, path: str | Path, channel: str, t0_ns: int = 0) -> None:
+        self._t0_ns = t0_ns
+        self.failure: str | None = None
+        self._path = path
+        self._file = _opened_alone(path)
+        self._size = 0
+        self._frames: list[tuple[_Format, int, bytes, int]] = []
+        self._lines: list[str] = []
+        self.write = self.on(channel)
+
+    def on(self, channel: str) -> Callable[[int, bytes, int], None]:
+        """A recorder of the frames of one channel: called with (can_id, data, t_ns), it adds a line to this file."""
+        frames, form = self._frames, _ChannelLines(channel, self._t0_ns).line
+
+        def write(can_id: int, data: bytes, t_ns: int) -> None:
+            frames.append((form, can_id, data, t_ns))
+            if len(frames) >= _FRAMES:
+                self._form_lines()
+                if len(self._lines) >= _LINES:
+                    self.flush()
+
+        return write
+
+    def _form_lines(self) -> None:
+        self._lines += [form(can_id, data, t_ns) for form, can_id, data, t_ns in self._frames]
+        self._frames.clear()
+
+    def flush(self) -> None:
+        """Hand what was written to the file."""
+        self._form_lines()
+        data = "".join(self._lines).encode("ascii")
+        self._lines.clear()
+        if self.failure is not None:
+            return
+        written = 0
+        try:
+            while written < len(data):
+                written += self._file.write(data[written:])
+        except OSError as error:
+            self.failure = f"{self._path}: cannot be written: {error.strerror or error}"
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._size + data.rfind(b"\n", 0, written) + 1)
+        self._size += written
+
+    def close(self) -> None:
+        """Flush and close the file; twice is allowed."""
+        if not self._file.closed:
+            self.flush()
+        self._file.close()
+
+    def __enter__(self) -> CandumpWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.close()
+
+
+class _ChannelLines:
+    """Lines of one channel."""
+
+    __slots__ = ("_channel", "_names", "_prefix", "_second", "_t0_ns")
+
+    def __init__(self, channel: str, t0_ns: int) -> None:
+        self._channel, self._t0_ns = channel, t0_ns
+        self._second = -1
+        self._prefix = ""
+        self._names: dict[int, str] = {}
+
+    def line(self, can_id: int, data: bytes, t_ns: int) -> str:
+        """The same as `format_line`, counted from the log's first instant, in a fraction of its time."""
+        second, us = divmod((t_ns - self._t0_ns) // 1000, 1_000_000)
+        if second != self._second:
+            self._second, self._prefix = second, _format_second(second)
+        name = self._names.get(can_id)
+        if name is None:
+            name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
+        plain = len(data) <= CLASSIC_BYTES and not can_id & RTR_FLAG
+        payload = data.hex().upper() if plain else _format_payload(can_id, data)
+        return f"{self._prefix}{us:06d}{name}{payload}\n"
+
+
+def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:
+    """Return the line of one frame, newline included; ns below the microsecond are cut off."""
+    second, us = divmod(t_ns // 1000, 1_000_000)
+    return f"{_format_second(second)}{us:06d}) {channel} {_format_id(can_id)}#{_format_payload(can_id, data)}\n"
+
+
+def _format_second(second: int) -> str:
+    return f"({second:010d}."
+
+
+def _format_payload(can_id: int, data: bytes) -> str:
+    if len(data) > CLASSIC_BYTES:
+        return f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
+    return "R" if can_id & RTR_FLAG else data.hex().upper()
+
+
+def _format_id(can_id: int) -> str:
+    if can_id <= 0x7FF:
+        return f"{can_id:03X}"
+    plain = can_id & ~RTR_FLAG
+    return f"{plain & ~EFF_FLAG:08X}" if plain & EFF_FLAG else f"{plain:03X}"
+
+
+def _opened_alone(path: str | Path) -> FileIO:
+    """An empty file to write to, which nobody else can open so before it is closed."""
+    file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.close()
+        raise UsageError(f"{path}: another run writes this file; choose another folder") from None
+    except OSError:
+        pass  # a file system without locks
+    with contextlib.suppress(OSError):  # no file but a device
+        file.truncate(0)
+    return file
+
+
+def read_candump(
+    path: str | Path, only: Container[int] | None = None, *, whole: bool = False
+) -> Iterator[tuple[int, str, int, bytes]]:
+    """Read a candump log.
+
+    Args:
+        path: the log.
+        only: 11-bit identifiers that are wanted; other lines are passed over unread, a torn one too. None: all.
+        whole: a torn last line is an error like any other; else it is passed over, as a logger that is killed leaves
+            one.
+
+    Yields:
+        (t_ns, channel, can_id, data) of each line; can_id with the flags of `canprobe.bus.port`.
+
+    Raises:
+        UsageError: the file cannot be read, or a line is not one of candump's; with file and line number.
+    """
+    try:
+        with Path(path).open(encoding="ascii", errors="replace") as file:
+            for number, line in enumerate(file, 1):
+                if only is not None and _id_of(line) not in only:
+                    continue
+                text = line.rstrip("\r\n")
+                if text and (whole or line.endswith("\n") or _LINE.fullmatch(text)):
+                    yield _parse_line(text, path, number)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror}") from error
+
+
+def _id_of(line: str) -> int:
+    """The 11-bit identifier of a line without reading the rest of it; −1 where there is none."""
+    name = line.partition("#")[0].rpartition(" ")[2]
+    try:
+        return int(name, 16) if len(name) == 3 else -1
+    except ValueError:
+        return -1
+
+
+def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int, bytes]:
+    match = _LINE.fullmatch(text)
+    if match is None:
+        form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
+        raise UsageError(f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'")
+    t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
+    return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or match["data"] or "")
+
+
+def _parse_id(match: re.Match[str]) -> int:
+    can_id = int(match["id"], 16)
+    if len(match["id"]) == 8:  # 29 bits, or an error frame, which carries its own flag in the text
+        can_id = can_id | EFF_FLAG if can_id <= 0x1FFFFFFF else can_id
+    return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
+
+
+class FrameWriter(Protocol):
+    """Something frames are written to, such as a `CandumpWriter`."""
+
+    @property
+    def write(self) -> Callable[[int, bytes, int], None]:
+        """Called with (can_id, data, t_ns)."""
+        ...
+
+
+class RecordingPort:
+    """A `Port` that writes down what passes through it, sent frames with the time of sending.
+
+    In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
+    than the line above it.
+
+    Args:
+        port: the port to use.
+        writer: where to write; it is not closed with the port.
+    """
+
+    def __init__(self, port: Port, writer: FrameWriter) -> None:
+        self._port = port
+        self._write = writer.write
+
+    @property
+    def clock(self) -> Clock:
+        """The port's clock."""
+        return self._port.clock
+
+    @property
+    def channel(self) -> str:
+        """The port's channel."""
+        return self._port.channel
+
+    @property
+    def counters(self) -> PortCounters:
+        """The port's counters."""
+        return self._port.counters
+
+    @property
+    def state(self) -> ControllerState:
+        """As the port tells it."""
+        return self._port.state
+
+    @property
+    def stamps_arrival(self) -> bool:
+        """As the port does."""
+        return self._port.stamps_arrival
+
+    def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
+        """Send `frames` and write them down, with `t_ns` where it is given."""
+        sent_ns = self._port.clock.now_ns() if t_ns is None else t_ns
+        self._port.send_batch(frames)
+        for can_id, data in frames:
+            self._write(can_id, data, sent_ns)
+
+    def drain(self) -> list[TimedFrame]:
+        """Return what arrived, written down."""
+        frames = self._port.drain()
+        for can_id, data, t_ns in frames:
+            self._write(can_id, data, t_ns)
+        return frames
+
+    def wait(self, until_ns: int) -> None:
+        """Wait as the port does."""
+        self._port.wait(until_ns)
+
+    def close(self) -> None:
+        """Close the port; the writer stays open."""
+        self._port.close()
+
+
+# Files that are whole or not there, whatever stops the writing, and one way to say why one could not be written.
+
+_WRONG_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
+
+
+@contextlib.contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file that is written whole, under the name that is given to the block, or not at all.
+
+    That name is of the same folder and has the same suffix, by which libraries choose what to write. A block that
+    writes nothing there leaves everything as it was.
+
+    Args:
+        path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
+
+    Raises:
+        ResultsError: it cannot be written, for want of room say; an older one is as it was.
+        UsageError: it cannot be there: no such folder, or nobody may write there.
+    """
+    whole = path.resolve()
+    part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
+    try:
+        yield part
+        if part != whole and part.exists():
+            part.replace(whole)
+    except BaseException as error:
+        if part != whole:
+            with contextlib.suppress(OSError):
+                part.unlink(missing_ok=True)
+        if not isinstance(error, OSError) or isinstance(error, BrokenPipeError):
+            raise
+        if error.filename not in (None, str(part)):  # of something else
+            raise
+        kind = UsageError if isinstance(error, _WRONG_PATH) else ResultsError
+        raise kind(f"{path}: cannot be written: {error.strerror or error}") from error
+
+
+def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str | None = None) -> None:
+    """Write a text file whole: see `whole_file`; encoding and line ends as for `open`."""
+    with whole_file(path) as part:
+        part.write_text(text, encoding=encoding, newline=newline)
+
+
+# Logs of a bus in any form that python-can writes and reads: BLF for Vector's tools, ASC, TRC; candump by our own.
+#
+# The suffix names the form: ``.blf``, ``.asc``, ``.trc``, and ``.log``, ``.txt`` or none for candump, as which a file
+# of any other name is read too.
+
+_READERS: dict[str, Any] = {".asc": can.ASCReader, ".blf": can.BLFReader, ".trc": can.TRCReader}
+_WRITERS: dict[str, Any] = {".asc": can.ASCWriter, ".blf": can.BLFWriter, ".trc": can.TRCWriter}
+_Logged = tuple[int, str, int, bytes]
+FOREIGN = tuple(_READERS)
+"""Suffixes of the forms that python-can writes and reads for us."""
+_CANDUMP = (".log", ".txt", "")
+_STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFFFFFF
+
+
+def read_log(path: str | Path) -> Iterator[_Logged]:
+    """Read a log in the form that its suffix names.
+
+    Yields:
+        (t_ns, channel, can_id, data) of each frame, as `read_candump`; channels that a form numbers are can0, can1, ….
+
+    Raises:
+        UsageError: the file cannot be read, or is not of that form.
+    """
+    make_reader = _READERS.get(Path(path).suffix.lower())
+    if make_reader is None:
+        yield from read_candump(path)
+        return
+    try:  # a file of our own, as python-can leaves its one open where it is no log
+        with (
+            open(path, "rb") if make_reader is can.BLFReader else open(path, encoding="utf-8", errors="replace") as file
+        ):
+            for message in make_reader(file):
+                channel = message.channel if isinstance(message.channel, str) else f"can{message.channel or 0}"
+                yield round(message.timestamp * 1e6) * 1000, channel, _can_id(message), bytes(message.data)
+    except OSError as error:
+        raise UsageError(f"{path}: {error.strerror or error}") from error
+    except (ValueError, can.CanError, KeyError, IndexError, struct.error) as error:
+        raise UsageError(f"{path}: no {Path(path).suffix} log: {error}") from error
+
+
+def convert_log(source: str | Path, target: Path) -> int:
+    """Write a log in another form; both are named by their suffixes.
+
+    Args:
+        source: any log.
+        target: written anew.
+
+    Returns:
+        How many frames.
+
+    Raises:
+        UsageError: source and target are one file, one of them cannot be opened, the source is no log, or the target's
+            suffix names no form.
+        ResultsError: the target cannot be written; an older one is as it was.
+    """
+    form = target.suffix.lower()
+    if form not in (*FOREIGN, *_CANDUMP):
+        raise UsageError(f"{target}: expected .log (candump), {', '.join(FOREIGN)}, got {target.suffix}")
+    if target.exists() and target.samefile(source):
+        raise UsageError(f"{target}: a log cannot be converted into itself")
+    write = _write_candump if form in _CANDUMP else _write_foreign
+    with (
+        whole_file(target) as part,
+        part.open("wb") if form == ".blf" else part.open("w", encoding="utf-8", newline="\n") as file,
+    ):
+        return write(read_log(source), file, target)
+
+
+def _write_candump(frames: Iterable[_Logged], file: IO[Any], _: Path) -> int:
+    count = 0
+    for t_ns, channel, can_id, data in frames:
+        file.write(format_line(channel, can_id, data, t_ns))
+        count += 1
+    return count
+
+
+def _write_foreign(frames: Iterable[_Logged], file: IO[Any], target: Path) -> int:
+    count = 0
+    with _WRITERS[target.suffix.lower()](file) as writer:
+        if isinstance(writer, can.TRCWriter):
+            writer.filepath = str(target.absolute())  # stands in its header
+        for frame in frames:
+            writer.on_message_received(_message(*frame))
+            count += 1
+    return count
+
+
+def _can_id(message: can.Message) -> int:
+    if message.is_error_frame:  # most of these formats say no more than that there was an error
+        return ERR_FLAG | (int(message.arbitration_id) or ERR_BUS)
+    flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
+    return int(message.arbitration_id) | flags
+
+
+def _message(t_ns: int, channel: str, can_id: int, data: bytes) -> can.Message:
+    extended = bool(can_id & EFF_FLAG)
+    return can.Message(
+        timestamp=t_ns * 1e-9,
+        arbitration_id=can_id & (_EXTENDED_MASK if extended else _STANDARD_MASK),
+        is_extended_id=extended,
+        is_remote_frame=bool(can_id & RTR_FLAG),
+        is_error_frame=bool(can_id & ERR_FLAG),
+        data=data,
+        is_fd=len(data) > 8,
+        bitrate_switch=len(data) > 8,
+        channel=channel,
+    )
+
+
+# Columns in an ``.npz`` file: written, read, or told what is wrong with it.
+
+
+def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Write arrays into exactly this file, compressed, whole: numpy would append ``.npz`` to a name."""
+    with whole_file(path) as part, part.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **columns)
+
+
+def read_npz(path: Path, expected: str = "an .npz of a run") -> dict[str, NDArray[Any]]:
+    """Every array of an ``.npz`` file.
+
+    Args:
+        path: of the file.
+        expected: what it should be, in words.
+
+    Raises:
+        UsageError: no such file, or it is cut off, empty or something else.
+    """
+    try:
+        with path.open("rb") as opened:  # numpy leaves a file open that it cannot read
+            saved = np.load(opened, allow_pickle=False)
+            if not isinstance(saved, np.lib.npyio.NpzFile):
+                raise UsageError(f"{path}: expected {expected}, got a single array")
+            return {name: saved[name] for name in saved.files}
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise UsageError(f"{path}: expected {expected}; cannot be read: {error}") from error

@@ -1,0 +1,87 @@
+"""What a controller sees and says in one cycle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.protocol.tactile import TactileFrame
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate.answer import SurfaceEstimate
+
+
+Vector = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class TactileSample:
+    """A whole tactile frame with its place in time.
+
+    Attributes:
+        frame: the frame, complete and with the right CRC.
+        t_sample_ns: when the array was sampled, in the time of the cycle.
+        cycle: the cycle whose SYNC triggered it.
+    """
+
+    frame: TactileFrame
+    t_sample_ns: int
+    cycle: int
+
+
+@dataclass(frozen=True, slots=True)
+class Measurement:
+    """The state of the cell at one SYNC.
+
+    Attributes:
+        cycle: number of the cycle, from 0.
+        t_ns: time of its SYNC, ns since the first one.
+        q: joint angles at this SYNC (6,), rad; None in a scene without an arm.
+        q_age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
+        torque_permille: motor torque as reported (6,), NaN for a drive that does not report it; empty where none does.
+        statuswords: CiA 402 statuswords (6,).
+        enabled: every drive is in operation enabled.
+        tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
+            cycle k + 1 at the earliest, on every bus.
+        tactile_age: cycles since the trigger of the newest tactile sample, or since the first SYNC where none has come;
+            None without a sensor.
+    """
+
+    cycle: int
+    t_ns: int
+    q: Vector | None = None
+    q_age: tuple[int, ...] = ()
+    torque_permille: tuple[float, ...] = ()
+    statuswords: tuple[int, ...] = ()
+    enabled: bool = False
+    tactile: TactileSample | None = None
+    tactile_age: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What a controller wants in this cycle.
+
+    Attributes:
+        q_target: joint angles to reach two cycles later (6,), rad; None leaves the drives where they are.
+        done: the controller has finished; the cell is stopped in an orderly way.
+        stop_reason: set to stop the cell for safety, with the reason.
+        columns: named numbers for the log; a controller uses the same names in every cycle.
+        estimate: a new answer of its surface estimator, for observers; None in cycles without one.
+    """
+
+    q_target: Vector | None = None
+    done: bool = False
+    stop_reason: str | None = None
+    columns: dict[str, float | Vector] = field(default_factory=dict)
+    estimate: SurfaceEstimate | None = None
+
+
+class Controller(Protocol):
+    """Anything with ``step(measurement) → command``; a plain function is wrapped."""
+
+    def step(self, measurement: Measurement) -> Command:
+        """Decide one cycle."""

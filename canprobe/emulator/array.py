@@ -1,0 +1,318 @@
+"""The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
+
+A trigger is a SYNC at which the header's TPDO is due. The array is sampled there; what goes out is the image of an
+earlier trigger, because a real sensor needs a frame to process it. The header's sample age says so.
+Source: objects 2000h–2130h of `tactile_array.eds`; wire form in `protocol.tactile`.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from functools import cache
+from itertools import count, takewhile
+from typing import Protocol
+
+import numpy as np
+from canopen.objectdictionary import ObjectDictionary
+from numpy.typing import NDArray
+
+from canprobe.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
+from canprobe.emulator.node.core import Application
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
+from canprobe.emulator.node.slave_node import OdOf, SlaveNode
+from canprobe.errors import UsageError
+from canprobe.protocol.frames import NmtState
+from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_whole
+
+# What the sensor makes of a raw image: tare, gain, threshold, the window that follows the contact, features.
+
+Image = NDArray[np.uint8]
+Raw = NDArray[np.uint8] | NDArray[np.float64]
+"""Counts of 255 at full scale: whole ones of an ADC of 8 bits, parts of counts of a finer one."""
+FULL_SCALE = 255
+GAIN_ONE = 1000
+_HYSTERESIS = 0.75  # taxels the ideal origin must be away before the window moves; 0.5 would flicker
+_INDEX = np.arange(SIDE, dtype=np.float64)
+_SUMS = np.stack((np.ones(SIDE * SIDE), np.repeat(_INDEX, SIDE), np.tile(_INDEX, SIDE)))  # of 1, row, column
+TAXEL_AREA_M2 = 1.5875e-3**2
+
+
+def is_overloaded(raw: Raw) -> bool:
+    """Whether a taxel has reached full scale."""
+    if raw.dtype == np.uint8:
+        return FULL_SCALE in raw.tobytes()
+    return bool(raw.max() == FULL_SCALE)
+
+
+def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
+    """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
+    if tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8:
+        return _kept(threshold).take(raw.astype(np.intp))
+    counts = _scaled(raw, tare, gain_permille)
+    np.rint(counts, out=counts)
+    return _kept(threshold).take(counts.astype(np.intp), mode="clip")
+
+
+@cache
+def _kept(threshold: int) -> Image:
+    """(256,) what remains of each count."""
+    counts = np.arange(FULL_SCALE + 1, dtype=np.uint8)
+    counts[: max(threshold, 0)] = 0
+    return counts
+
+
+def correct_finely(
+    raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
+) -> NDArray[np.float64]:
+    """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
+    return _limited(_scaled(raw, tare, gain_permille), threshold)
+
+
+def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
+    counts = raw.astype(np.float64)
+    if tare is not None:
+        counts -= tare
+    if gain_permille != GAIN_ONE:
+        counts *= gain_permille / GAIN_ONE
+    return counts
+
+
+def _limited(counts: NDArray[np.float64], threshold: int) -> NDArray[np.float64]:
+    np.minimum(counts, FULL_SCALE, out=counts)
+    counts[counts < max(threshold, 0)] = 0.0
+    return counts
+
+
+def _moments(image: Raw) -> tuple[float, float, float]:
+    """Sum, centroid row, centroid column; the centre of the pad without a contact."""
+    total, rows, columns = _SUMS.dot(image.reshape(-1)).tolist()
+    if total == 0.0:
+        return 0.0, (SIDE - 1) / 2, (SIDE - 1) / 2
+    return total, rows / total, columns / total
+
+
+def middle(window: int = WINDOW) -> tuple[int, int]:
+    """First taxel (row, column) of a window in the middle of the pad."""
+    return (SIDE - window) // 2, (SIDE - window) // 2
+
+
+def follow(image: Raw, origin: tuple[int, int], window: int = WINDOW) -> tuple[int, int]:
+    """First taxel (row, column) of the window of so many taxels a side round the contact.
+
+    The window stays while the contact's centroid is near its middle, and where it is without a contact.
+    """
+    total, row, column = _moments(image)
+    if total == 0.0:
+        return origin
+    return _shift(origin[0], row, window), _shift(origin[1], column, window)
+
+
+def _shift(origin: int, centroid: float, window: int) -> int:
+    ideal = centroid - (window - 1) / 2
+    if abs(ideal - origin) <= _HYSTERESIS:
+        return origin
+    return min(max(round(ideal), 0), SIDE - window)
+
+
+def compute_features(image: Raw, full_scale_pa: float) -> Features:
+    """Force, centroid and central second moments of the whole pad.
+
+    Args:
+        image: corrected counts, (16, 16), whole or not.
+        full_scale_pa: pressure at 255 counts, Pa.
+    """
+    total, row, column = _moments(image)
+    if total == 0.0:
+        return Features(0.0, row, column, 0.0, 0.0, 0.0, 0)
+    weights = image / total
+    d_row, d_column = _INDEX - row, _INDEX - column
+    return Features(
+        force_n=total / FULL_SCALE * full_scale_pa * TAXEL_AREA_M2,
+        row=row,
+        col=column,
+        var_rr=float(d_row**2 @ weights.sum(axis=1)),
+        var_rc=float(d_row @ weights @ d_column),
+        var_cc=float(d_column**2 @ weights.sum(axis=0)),
+        peak=round(float(image.max())),
+    )
+
+
+# The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
+
+TARE = int.from_bytes(b"tare", "little")
+MODE, THRESHOLD, GAIN, TARE_COMMAND, FULL_SCALE_PA, OVERLOAD, ORIGIN = range(0x2000, 0x2007)
+IMAGE_ROWS, WINDOW_ROWS, HEADER, FEATURES = 0x2100, 0x2110, 0x2120, 0x2130
+_CONTENT = {TactileMode.FEATURES: FEATURES, TactileMode.WINDOW: WINDOW_ROWS, TactileMode.IMAGE: IMAGE_ROWS}
+_MAX_AGE_US = 0xFFFF
+_TARE_BYTES = SIDE * SIDE * 8
+
+
+class TactilePlant(Protocol):
+    """What the sensor needs of the plant."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`; idempotent."""
+
+    def sample_image(self, t_ns: int) -> Raw:
+        """Raw counts of the array at `t_ns`, (16, 16), 255 at full scale."""
+
+
+class TactileApplication(Application):
+    """The sensor function of one node. A tare command takes the mean of the next images as zero."""
+
+    def __init__(self, plant: TactilePlant, latency_frames: int = 1, tare_images: int = 16) -> None:
+        """Make the sensor.
+
+        Args:
+            plant: shared with the other nodes.
+            latency_frames: triggers between sampling an image and sending it.
+            tare_images: images averaged by one tare command.
+        """
+        self._plant = plant
+        self._latency, self._tare_images = latency_frames, tare_images
+        self._pipeline: deque[tuple[int, Raw]] = deque()
+        self._tare: NDArray[np.float64] | None = None
+        self._taring: list[Raw] | None = None
+        self._frames = 0
+        self._origin = middle()
+        self._counter = 0
+        self._triggered_ns: int | None = None
+
+    def attach(self, node: SlaveNode) -> None:
+        """Hang the sensor's objects on the node."""
+        self._node = node
+        for index in (HEADER, FEATURES, IMAGE_ROWS, WINDOW_ROWS):
+            node.pdos.on_trigger(index, self._trigger)
+        node.dictionary.on_check(TARE_COMMAND, _check_tare)
+        node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
+        for index in (MODE, THRESHOLD, GAIN, FULL_SCALE_PA):
+            node.dictionary.on_write(index, lambda _sub, _value: self._read_settings())
+        self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
+        entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
+        self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
+        if self._sized:
+            node.dictionary.on_check(WINDOW_SIZE, self._check_window)
+            node.dictionary.on_write(WINDOW_SIZE, self._begin_window)
+        self._read_settings()
+
+    def _read_settings(self) -> None:
+        """Take what the dictionary says now; an array without a window size has 8 taxels along the window."""
+        number = self._node.dictionary.number
+        self._mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
+        self._gain, self._threshold = number(GAIN, 0, 1000), number(THRESHOLD)
+        self._full_scale = number(FULL_SCALE_PA, 0, 100_000)
+        self._window = number(WINDOW_SIZE, 0, WINDOW) if self._sized else WINDOW
+
+    def keep(self) -> bytes:
+        """The tare."""
+        return b"" if self._tare is None else self._tare.tobytes()
+
+    def recall(self, kept: bytes) -> None:
+        """The tare as it was stored, if any."""
+        if len(kept) not in (0, _TARE_BYTES):
+            raise UsageError(f"{self._node.name}: stored tare: expected {_TARE_BYTES} bytes, got {len(kept)}")
+        self._tare = np.frombuffer(kept).reshape(SIDE, SIDE) if kept else None
+
+    def reset(self, t_ns: int) -> None:
+        """Power on."""
+        self._pipeline.clear()
+        self._taring = None
+        self._frames = 0
+        self._read_settings()
+        self._origin = middle(self._window)
+
+    def entered(self, t_ns: int) -> None:
+        """Sample at once on entering operational, so that the first frame shows something real."""
+        self._pipeline.clear()
+        self._triggered_ns = None
+        if self._node.state is NmtState.OPERATIONAL:
+            self._sample(t_ns)
+
+    def advance(self, t_ns: int) -> None:
+        """The plant moves on."""
+        self._plant.advance(t_ns)
+
+    def sync(self, t_ns: int, counter: int) -> None:
+        """Remember the counter; the trigger, if there is one, follows."""
+        self._counter = counter
+
+    def _sample(self, t_ns: int) -> None:
+        self._plant.advance(t_ns)
+        raw = self._plant.sample_image(t_ns)
+        self._pipeline.append((t_ns, raw))
+        if self._taring is not None:
+            self._taring.append(raw)
+            if len(self._taring) == self._tare_images:
+                self._tare, self._taring = np.mean(self._taring, axis=0), None
+
+    def _trigger(self, t_ns: int) -> None:
+        if t_ns == self._triggered_ns:
+            return  # PDOs of one frame in different groups
+        self._triggered_ns = t_ns
+        self._sample(t_ns)
+        pipeline = self._pipeline
+        while len(pipeline) > self._latency + 1:
+            pipeline.popleft()
+        sampled_ns, raw = pipeline.popleft() if len(pipeline) > self._latency else pipeline[0]
+        self._show(raw, min((t_ns - sampled_ns) // 1000, _MAX_AGE_US))
+
+    def _show(self, raw: Raw, age_us: int) -> None:
+        """Put one frame into the objects that the TPDOs carry."""
+        dictionary, mode, window = self._node.dictionary, self._mode, self._window
+        settings = self._tare, self._gain, self._threshold
+        image = correct(raw, *settings)
+        overload = is_overloaded(raw) or is_overloaded(image)
+        self._origin = follow(image, self._origin, window)
+        row, column = self._origin if mode is TactileMode.WINDOW else (0, 0)
+        header = TactileHeader(self._frames, self._counter, row, column, mode, overload, age_us, window=window)
+        self._frames = (self._frames + 1) % 256
+        content: Image | Features = image
+        if mode is TactileMode.FEATURES:
+            seen = image if raw.dtype == np.uint8 else correct_finely(raw, *settings)
+            content = compute_features(seen, self._full_scale)
+        whole = pack_whole(header, content)
+        words = struct.unpack(f"<{len(whole) // 8}Q", whole)
+        dictionary.put(OVERLOAD, 0, int(overload))
+        dictionary.put(ORIGIN, 0, self._origin[0] << 4 | self._origin[1])
+        content_words = words if mode is TactileMode.FEATURES else words[1:]
+        dictionary.values.update(zip(self._content[mode], content_words, strict=False))
+        dictionary.put(HEADER, 0, words[0])
+
+    def _check_window(self, subindex: int, value: Value) -> None:
+        if value not in WINDOWS:
+            raise SdoAbort(Abort.VALUE)
+        if self._node.state is NmtState.OPERATIONAL and value != self._window:
+            raise SdoAbort(Abort.DEVICE_STATE)
+
+    def _begin_window(self, subindex: int, value: Value) -> None:
+        self._read_settings()
+        self._origin = middle(self._window)
+
+    def _begin_tare(self, subindex: int, value: Value) -> None:
+        self._tare, self._taring = None, []
+
+
+def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
+    """Keys of sub-index 1, 2, … of an object, as many as there are."""
+    return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
+
+
+def make_tactile_node(
+    od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1, od_of: OdOf | None = None
+) -> SlaveNode:
+    """A tactile node on the plant.
+
+    Args:
+        od: of `tactile_array.eds`, for this node id.
+        node_id: 1–127, or 255 for none.
+        plant: shared by all nodes.
+        latency_frames: triggers between sampling an image and sending it.
+        od_of: the EDS for another node id, where LSS may give the node one.
+    """
+    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames), od_of=od_of)
+
+
+def _check_tare(subindex: int, value: Value) -> None:
+    if value != TARE:
+        raise SdoAbort(Abort.CANNOT_STORE)

@@ -1,0 +1,406 @@
+"""What every mode of operation shares: the drive's parts, its feedback, what stops it, halt, and the statusword's
+bits.
+
+A mode lives between `start` and `leave`, in operation enabled only.
+Source: CiA 402-2, controlword bits 4–6, 8 and 9, statusword bits 10–13, halt option code 605Dh.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+from canprobe.emulator.drive.parameters import PEAK_PERMILLE, DriveParameters, Units
+from canprobe.emulator.drive.reference import AxisPlant, Motion
+from canprobe.emulator.node.dictionary import Dictionary, Value
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.protocol import cia402
+from canprobe.protocol.frames import FOLLOWING_ERROR, RPDO_TIMEOUT, SYNC_LOST
+
+# What a drive tells the plant's position loop: the torque limit 6072h and the feed-forwards 60B1h and 60B2h.
+#
+# The feed-forwards act in the mode that gives them; leaving it takes them back. In cyclic synchronous velocity 60B1h is
+# part of the target already, and in cyclic synchronous torque both are: there the loop gets none.
+# Source: CiA 402-2, objects 6072h, 60B1h, 60B2h.
+
+_LIMIT, _SPEED, _TORQUE = 0x6072, 0x60B1, 0x60B2
+
+
+class DriveLoop:
+    """Torque limit and feed-forwards of one axis; the plant hears of changes only.
+
+    Attributes:
+        changed: a position mode has to `feed_forward` in this cycle.
+
+    Args:
+        axis: of the plant, 0-based.
+        plant: shared with the other drives.
+        parameters: of the drive.
+        dictionary: of the drive.
+    """
+
+    def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, dictionary: Dictionary) -> None:
+        self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
+        self._told: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
+        self.changed = True
+        for index in (_SPEED, _TORQUE):
+            dictionary.on_write(index, self._written)
+        dictionary.on_write(_LIMIT, lambda _sub, _value: self._tell(*self._told[1:]))
+
+    def feed_forward(self) -> None:
+        """Take limit and offsets as they are now."""
+        self._tell(self._number(_SPEED) * self._parameters.units.speed_scale, float(self._number(_TORQUE)))
+        self.changed = False
+
+    def feed_torque(self) -> None:
+        """Take limit and torque offset: every cycle of a velocity mode."""
+        self._tell(0.0, float(self._number(_TORQUE)))
+
+    def release(self) -> None:
+        """Limit only."""
+        self._tell(0.0, 0.0)
+
+    def _written(self, subindex: int, value: Value) -> None:
+        self.changed = True
+
+    def _tell(self, speed: float, torque: float) -> None:
+        self.changed = True
+        wanted = (self._parameters.max_torque, speed, torque)
+        if wanted != self._told:
+            self._told = wanted
+            self._plant.set_loop(self._axis, *wanted)
+
+
+# What a drive tells of itself: actual and demand values, brought up to date only where somebody reads them.
+#
+# Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
+# Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
+
+_I16, _I32 = 1 << 15, 1 << 31
+_TORQUES = (0x6074, 0x6077)
+
+
+class DriveFeedback:
+    """Actual values of one axis.
+
+    Attributes:
+        counts: motor position at the last `measure`.
+        plant_torque: tells the torque that the plant needs for its motion now, permille.
+    """
+
+    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
+        self._core, self._axis, self._plant = node.core, axis, plant
+        self.counts = 0.0
+        self._velocity = 0.0
+        self._t_ns: int | None = None
+        self.plant_torque = partial(plant.torque_permille, axis)
+        self._sources: dict[int, Callable[[], float]] = {
+            0x6062: lambda: units.position(motion.demand(self._t_ns or 0)),
+            0x6064: lambda: (self.counts - units.origin) / units.scale,
+            0x606B: lambda: motion.speed(self._t_ns or 0) / units.speed_scale,
+            0x606C: lambda: self._velocity / units.speed_scale,
+            0x60F4: lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale,
+        }
+        self.tell_torque(self.plant_torque)
+        for index in self._sources:
+            if node.dictionary.has_index(index):
+                sample = self._sampler(index, _I16 if index in _TORQUES else _I32)
+                node.pdos.on_trigger(index, sample)
+                node.dictionary.on_read(index, self._reader(sample))
+
+    def reset(self, t_ns: int) -> None:
+        """Velocity starts anew."""
+        self._t_ns = None
+        self._velocity = 0.0
+
+    def measure(self, t_ns: int) -> float:
+        """Position at `t_ns`, counts; the velocity is the mean since the last call."""
+        last_ns = self._t_ns
+        if t_ns != last_ns:
+            self._plant.advance(t_ns)
+            counts = self._plant.motor_counts(self._axis)
+            if last_ns is not None:
+                self._velocity = (counts - self.counts) / (t_ns - last_ns) * 1e9
+            self.counts, self._t_ns = counts, t_ns
+        return self.counts
+
+    def tell_torque(self, source: Callable[[], float]) -> None:
+        """Take the torque, permille, from `source` from now on: the plant's, or that of a drive that controls it."""
+        self._sources.update(dict.fromkeys(_TORQUES, source))
+
+    def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
+        """What puts a value into the dictionary, as a whole number within +-limit."""
+        values, key, sources = self._core.dictionary.values, index << 8, self._sources
+
+        def sample(t_ns: int) -> None:
+            if t_ns != self._t_ns:
+                self.measure(t_ns)
+            number = round(sources[index]())
+            values[key] = number if -limit <= number < limit else min(max(number, -limit), limit - 1)
+
+        return sample
+
+    def _reader(self, sample: Callable[[int], None]) -> Callable[[int], None]:
+        return lambda _subindex: sample(self._core.now_ns)
+
+
+# The faults that a drive has found: reported, shown in 603Fh, and forgotten at a fault reset.
+#
+# Source: CiA 402-2, object 603Fh; CiA 301, "Emergency object".
+
+
+class DriveFaults:
+    """Codes of the faults that are there.
+
+    Attributes:
+        following_error: whether one of them is, for statusword bit 13.
+    """
+
+    def __init__(self, node: SlaveNode, detected: Callable[[int], None]) -> None:
+        """`detected(t_ns)` starts the fault reaction."""
+        self._node, self._detected = node, detected
+        self._codes: list[int] = []
+        self._injected: list[int] = []
+        self._timer = node.core.timers.new(self._find_injected)
+        self.following_error = False
+
+    def reset(self) -> None:
+        """Power on."""
+        self._injected.clear()
+        self.forget()
+
+    def find(self, code: int, t_ns: int) -> None:
+        """A fault is there."""
+        self._codes.append(code)
+        self.following_error = self.following_error or code == FOLLOWING_ERROR
+        self._node.dictionary.put(0x603F, 0, code)
+        self._node.emcy.report(code)
+        self._detected(t_ns)
+
+    def inject(self, code: int) -> None:
+        """Find a fault at the next `advance`."""
+        self._injected.append(code)
+        self._timer.arm(self._node.core.now_ns)
+
+    def forget(self) -> None:
+        """Fault reset: all are gone."""
+        for code in self._codes:
+            self._node.emcy.clear(code)
+        self._codes.clear()
+        self.following_error = False
+        self._node.dictionary.put(0x603F, 0, 0)
+
+    def _find_injected(self, due_ns: int) -> None:
+        codes, self._injected = self._injected, []
+        for code in codes:
+            self.find(code, due_ns)
+
+
+# What makes a drive stop by itself in operation enabled: a silent master, and a motor that does not follow.
+#
+# Source: CiA 402-2, objects 6065h and 6066h; CiA 301, error codes 8100h and 8250h.
+
+
+class Supervision:
+    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error."""
+
+    def __init__(self, node: SlaveNode, parameters: DriveParameters, on_loss: Callable[[int, int], None]) -> None:
+        """`on_loss(code, t_ns)` is called when the master is taken for dead."""
+        self._node, self._parameters, self._on_loss = node, parameters, on_loss
+        self._timer = node.core.timers.new(self._sync_missing)
+        self._misses = 0
+        self._by_rpdo = False
+        self._outside_ns: int | None = None
+
+    def start(self, target: int | None, t_ns: int) -> None:
+        """Operation is enabled, in a mode that lives by SYNC and the object `target`, or by neither (None)."""
+        self._misses = 0
+        self._outside_ns = None
+        self._timer.cancel()
+        if target is not None:
+            self._by_rpdo = self._node.pdos.receives(target)
+            self._timer.arm(t_ns + self._parameters.patience_ns)
+
+    def stop(self) -> None:
+        """Operation is no longer enabled."""
+        self._timer.cancel()
+
+    @property
+    def watching(self) -> bool:
+        """Between `start` and `stop`."""
+        return self._timer.due_ns is not None
+
+    def sync(self, fresh: bool, t_ns: int) -> None:
+        """A SYNC came, with a target since the last one (fresh) or without."""
+        self._timer.arm(t_ns + self._parameters.patience_ns)
+        self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
+        if self._misses >= self._parameters.misses:
+            self._node.emcy.report(RPDO_TIMEOUT)
+            self._on_loss(RPDO_TIMEOUT, t_ns)
+
+    def following_error(self, error_counts: float, t_ns: int) -> bool:
+        """Whether the error has been outside 6065h for the time of 6066h."""
+        window = self._parameters.following_window
+        if abs(error_counts) <= window:
+            self._outside_ns = None
+            return False
+        if self._outside_ns is None:
+            self._outside_ns = t_ns
+        return t_ns - self._outside_ns >= self._parameters.following_timeout_ns
+
+    def _sync_missing(self, due_ns: int) -> None:
+        self._node.emcy.report(SYNC_LOST)
+        self._on_loss(SYNC_LOST, due_ns)
+
+
+# What every mode of operation shares: the drive's parts, the controlword's own bits, halt, and the statusword's.
+
+REACHED = 1 << cia402.TARGET_REACHED
+FOLLOWS = 1 << cia402.DRIVE_FOLLOWS
+
+
+@dataclass(frozen=True, slots=True)
+class DriveParts:
+    """What a mode works with.
+
+    Attributes:
+        show: the mode's part of the statusword may have changed.
+        fault: `fault(code, t_ns)`.
+    """
+
+    node: SlaveNode
+    axis: int
+    plant: AxisPlant
+    parameters: DriveParameters
+    motion: Motion
+    feedback: DriveFeedback
+    supervision: Supervision
+    loop: DriveLoop
+    show: Callable[[], None]
+    fault: Callable[[int, int], None]
+
+
+class DriveMode:
+    """Mode 0, none: it stands still. Base of the others.
+
+    Attributes:
+        target: index of the object that a cyclic mode lives by; None: SYNC and RPDOs are not watched.
+        limited: statusword bit 11.
+        halted: controlword bit 8.
+    """
+
+    target: int | None = None
+
+    def __init__(self, parts: DriveParts) -> None:
+        self.parts = parts
+        self._motion, self._parameters, self._units = parts.motion, parts.parameters, parts.parameters.units
+        self._supervision, self._values = parts.supervision, parts.node.dictionary.values
+        self.limited = self.halted = False
+        self._standstill = False
+        self._word = 0
+
+    def reset(self) -> None:
+        """Power on."""
+
+    def start(self, word: int, t_ns: int) -> None:
+        """The mode takes over; the reference stands, or slows down. `word` is the present controlword."""
+        self._word = word
+        self.limited = self._standstill = False
+        self.halted = bool(word >> cia402.HALT & 1)
+        if self.halted:
+            self._halt(t_ns)
+
+    def leave(self, t_ns: int) -> None:
+        """Another mode takes over, or operation is disabled."""
+        self.parts.loop.release()
+
+    def sync(self, t_ns: int, counts: float) -> None:
+        """A SYNC; the motor is at `counts`."""
+
+    def status(self) -> int:
+        """Bits 10, 12 and 13 of the statusword."""
+        return REACHED if self._standstill else 0
+
+    def command(self, word: int, t_ns: int) -> None:
+        """The controlword changed; all values that came with it are stored."""
+        changed, self._word = word ^ self._word, word
+        if changed >> cia402.HALT & 1:
+            self.halted = bool(word >> cia402.HALT & 1)
+            if self.halted:
+                self._halt(t_ns)
+            else:
+                self._standstill = False
+                self.resume(t_ns)
+        self.bits(word, changed, t_ns)
+        self.parts.show()
+
+    def bits(self, word: int, changed: int, t_ns: int) -> None:
+        """The controlword's bits beside halt."""
+
+    def resume(self, t_ns: int) -> None:
+        """Halt is over."""
+
+    def _halt(self, t_ns: int) -> None:
+        self._motion.decelerate(t_ns, self._parameters.halt_rate, self._at_standstill)
+
+    def _at_standstill(self, t_ns: int) -> None:
+        self._standstill = True
+        self.parts.show()
+
+    def _limit(self, limited: bool) -> None:
+        if limited is not self.limited:
+            self.limited = limited
+            self.parts.show()
+
+    def _strains(self) -> bool:
+        """Whether the motion takes all of 6072h, or more, which an ideal plant gives all the same."""
+        limit = self._parameters.max_torque
+        return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
+
+    def _look(self) -> tuple[int, float] | None:
+        """For a mode's timer: now, and where the motor is; None when the following error has become a fault."""
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        return None if self._lags(t_ns, counts) else (t_ns, counts)
+
+    def _lags(self, t_ns: int, counts: float) -> bool:
+        """Watch the following error; True when it has become a fault."""
+        if not self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
+            return False
+        self.parts.fault(FOLLOWING_ERROR, t_ns)
+        return True
+
+
+class CyclicMode(DriveMode):
+    """A mode with a target for every SYNC; without one it keeps the last, until the master is taken for dead."""
+
+    target: int
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._fresh = self._commanded = False
+        parts.node.dictionary.on_write(self.target, self._target_written)
+
+    def start(self, word: int, t_ns: int) -> None:
+        """Nothing is followed until a target comes."""
+        self._fresh = self._commanded = False
+        super().start(word, t_ns)
+
+    def status(self) -> int:
+        """The drive follows the command value, unless halted."""
+        return super().status() if self.halted else FOLLOWS
+
+    def sync(self, t_ns: int, counts: float) -> None:
+        """Watch the master, latch the target."""
+        fresh, self._fresh = self._fresh, False
+        self._supervision.sync(fresh, t_ns)
+        self._commanded = self._commanded or fresh
+        if self._commanded and not self.halted and self._supervision.watching:
+            self.latch(t_ns)
+
+    def latch(self, t_ns: int) -> None:
+        """Follow the target from now on."""
+
+    def _target_written(self, subindex: int, value: object) -> None:
+        self._fresh = True

@@ -1,0 +1,186 @@
+"""Parameters of a CiA 402 drive as its application uses them, read from the dictionary whenever one is written.
+
+Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 607Fh, 6080h, 6083h–6085h, 609Ah, 60C2h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+
+from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
+
+# Factor group: the master's position units ↔ motor counts, polarity, and where the zero is.
+#
+#     position = (counts - origin) · 6092h / (608Fh · 6091h),   each a quotient :01 / :02
+#
+# As delivered the quotients cancel: a unit is a count. Of an EDS without one of the objects it counts as 1.
+# Source: CiA 402-2, "Factor group", objects 607Eh (bit 7 position, bit 6 velocity), 608Fh, 6091h, 6092h.
+
+FACTORS = (0x607E, 0x608F, 0x6091, 0x6092)
+_RESOLUTION, _GEAR, _FEED = FACTORS[1:]
+_POSITION, _VELOCITY = 7, 6  # bits of 607Eh
+
+
+class Units:
+    """Conversions of one drive.
+
+    Attributes:
+        scale: counts per position unit; negative where 607Eh turns positions round.
+        speed_scale: the same for velocities, with their own polarity.
+        magnitude: without sign, for windows, speeds and accelerations.
+        turn: counts of one motor turn, 608Fh; also the distance of the index pulses.
+        origin: counts at position 0; homing sets it.
+    """
+
+    __slots__ = ("magnitude", "origin", "scale", "speed_scale", "turn")
+
+    def __init__(self) -> None:
+        self.scale = self.speed_scale = self.magnitude = self.turn = 1.0
+        self.origin = 0.0
+
+    def read(self, dictionary: Dictionary) -> None:
+        """Take the present factors."""
+        self.turn = _quotient(dictionary, _RESOLUTION)
+        self.magnitude = self.turn * _quotient(dictionary, _GEAR) / _quotient(dictionary, _FEED)
+        polarity = dictionary.number(0x607E)
+        self.scale = -self.magnitude if polarity >> _POSITION & 1 else self.magnitude
+        self.speed_scale = -self.magnitude if polarity >> _VELOCITY & 1 else self.magnitude
+
+    def position(self, counts: float) -> float:
+        """Motor counts → position units."""
+        return (counts - self.origin) / self.scale
+
+    def counts(self, position: float) -> float:
+        """Position units → motor counts."""
+        return position * self.scale + self.origin
+
+
+def _quotient(dictionary: Dictionary, index: int) -> float:
+    return (dictionary.number(index, 1) or 1) / (dictionary.number(index, 2) or 1)
+
+
+# Parameters of a CiA 402 drive as its application uses them, read from the dictionary whenever one is written.
+
+STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
+NO_WINDOW = 0xFFFFFFFF
+DEFAULT_MISSES = 5
+"""Of a drive whose EDS has no 2000h."""
+DEFAULT_ACCELERATION = 100_000
+"""Position units/s², of a drive whose EDS has no profile acceleration."""
+PEAK_PERMILLE = 2000
+"""What the plant's motors can do at most."""
+_OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
+_INDICES = (
+    *(0x1006, MISSED_SYNCS, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
+    *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
+    *FACTORS,
+)
+
+
+class DriveParameters:
+    """Plain numbers; `read` refreshes them. Lengths, speeds and accelerations are counts here, whatever the units.
+
+    Attributes:
+        units: the factor group.
+        interpolation_ns: 60C2h, time to reach a latched target.
+        following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
+        position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
+        misses: 2000h, SYNCs missed before the master is taken for dead.
+        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half.
+        low, high: 607Dh, position units; low >= high means no limits.
+        abort_connection, quick_stop, shutdown, disable, halt, fault_reaction: option codes.
+        acceleration, deceleration, quick_deceleration, homing_acceleration: 6083h–6085h, 609Ah, counts/s².
+        max_speed: the lower of 607Fh and 6080h, counts/s; infinite for neither.
+        max_torque: 6072h, permille.
+    """
+
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        missed_syncs = dictionary.entries.get(key_of(MISSED_SYNCS))
+        self._has_misses = missed_syncs is not None and missed_syncs.name == MISSED_SYNCS_NAME
+        self.units = Units()
+        self.read()
+        for index in _INDICES:
+            dictionary.on_write(index, lambda _sub, _value: self.read())
+        for index, allowed in _OPTIONS.items():
+            dictionary.on_check(index, _check_among(allowed))
+        dictionary.on_check(0x60C2, _check_interpolation)
+
+    def read(self) -> None:
+        """Take the present values of the dictionary."""
+        number = self._dictionary.number
+        self.units.read(self._dictionary)
+        self.interpolation_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
+        self.position_window, self.position_time_ns = self._window(0x6067), number(0x6068) * 1_000_000
+        self.misses = number(MISSED_SYNCS, 0, DEFAULT_MISSES) if self._has_misses else DEFAULT_MISSES
+        cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
+        self.patience_ns = self.misses * cycle_ns + cycle_ns // 2
+        self.low, self.high = number(0x607D, 1), number(0x607D, 2)
+        self._read_options()
+        self._read_dynamics()
+
+    def _read_options(self) -> None:
+        number = self._dictionary.number
+        self.abort_connection = number(0x6007, 0, 3)
+        self.quick_stop = number(0x605A, 0, 2)
+        self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
+        self.halt = number(0x605D, 0, 1)
+        self.fault_reaction = number(0x605E, 0, 2)
+
+    def _read_dynamics(self) -> None:
+        number, magnitude = self._dictionary.number, self.units.magnitude
+        self.deceleration, self.quick_deceleration = number(0x6084) * magnitude, number(0x6085) * magnitude
+        self.acceleration = (number(0x6083) or DEFAULT_ACCELERATION) * magnitude
+        self.homing_acceleration = (number(0x609A) or DEFAULT_ACCELERATION) * magnitude
+        turns_per_s = number(0x6080) / 60.0
+        self.max_speed = min(number(0x607F) * magnitude or inf, turns_per_s * self.units.turn or inf)
+        self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
+
+    def _window(self, index: int) -> float:
+        value = self._dictionary.number(index, 0, NO_WINDOW)
+        return inf if value == NO_WINDOW else value * self.units.magnitude
+
+    @property
+    def quick_stop_rate(self) -> float:
+        """Deceleration of a quick stop: the slow-down ramp for 605Ah = 1, 5, the quick stop ramp for 2, 6."""
+        return self.deceleration if self.quick_stop in (1, 5) else self.quick_deceleration
+
+    @property
+    def halt_rate(self) -> float:
+        """Deceleration of a halt, 605Dh: the slow-down ramp (1) or the quick stop ramp (2)."""
+        return self.quick_deceleration if self.halt == 2 else self.deceleration
+
+    @property
+    def fault_rate(self) -> float:
+        """Deceleration of the fault reaction, 605Eh; 0 means the brake at once."""
+        return {1: self.deceleration, 2: self.quick_deceleration}.get(self.fault_reaction, 0)
+
+    @property
+    def fence(self) -> tuple[float, float]:
+        """The software limits, counts, lower first; infinite for none."""
+        if self.low >= self.high:
+            return -inf, inf
+        ends = self.units.counts(self.low), self.units.counts(self.high)
+        return min(ends), max(ends)
+
+    def clamp(self, target: int) -> int:
+        """The target within the software limits."""
+        low, high = self.low, self.high
+        return target if low <= target <= high or low >= high else min(max(target, low), high)
+
+
+def _check_among(allowed: frozenset[int]) -> Callable[[int, Value], None]:
+    def check(subindex: int, value: Value) -> None:
+        if value not in allowed:
+            raise SdoAbort(Abort.VALUE)
+
+    return check
+
+
+def _check_interpolation(subindex: int, value: Value) -> None:
+    too_fine = subindex == 2 and int(value) < -9
+    if (subindex == 1 and not value) or too_fine or (subindex == 2 and int(value) > 0):
+        raise SdoAbort(Abort.VALUE)

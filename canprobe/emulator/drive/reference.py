@@ -1,0 +1,408 @@
+"""The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import copysign, exp, inf, log, sqrt
+from typing import NamedTuple, Protocol
+
+from canprobe.emulator.node.core import Timers
+from canprobe.emulator.plant.ideal_arm import MotorDynamics
+
+# Trapezoidal motion to a target, from any position and speed, as pieces of constant acceleration.
+#
+# A motor that moves the wrong way, or too fast to stop in time, is braked to rest first and turned round. One that is
+# faster than allowed is braked to the profile velocity.
+# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0.
+
+
+class Piece(NamedTuple):
+    """Constant acceleration over some time: s, counts, counts/s, counts/s²."""
+
+    duration_s: float
+    position: float
+    velocity: float
+    acceleration: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position and velocity `t_s` after the piece began."""
+        return (
+            self.position + t_s * (self.velocity + 0.5 * t_s * self.acceleration),
+            self.velocity + t_s * self.acceleration,
+        )
+
+
+class Profile:
+    """Pieces one after the other, at rest at `end` after them.
+
+    Attributes:
+        duration_s: s.
+        end: position at rest, counts.
+    """
+
+    def __init__(self, pieces: tuple[Piece, ...], end: float) -> None:
+        self._pieces = pieces
+        self.end = end
+        self.duration_s = sum(piece.duration_s for piece in pieces)
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s) `t_s` after the start."""
+        if t_s >= self.duration_s:
+            return self.end, 0.0
+        for piece in self._pieces:
+            if t_s < piece.duration_s:
+                return piece.at(t_s)
+            t_s -= piece.duration_s
+        return self.end, 0.0
+
+
+def braking(position: float, velocity: float, deceleration: float) -> Profile:
+    """To rest, as soon as the deceleration (counts/s², positive) allows."""
+    piece = Piece(abs(velocity) / deceleration, position, velocity, -copysign(deceleration, velocity))
+    return Profile((piece,), piece.at(piece.duration_s)[0])
+
+
+def trapezoid(
+    position: float, velocity: float, target: float, *, speed: float, acceleration: float, deceleration: float
+) -> Profile:
+    """To rest at a target.
+
+    Args:
+        position: at the start, counts.
+        velocity: at the start, counts/s.
+        target: counts.
+        speed: of the flat part, counts/s, positive.
+        acceleration: counts/s², positive.
+        deceleration: counts/s², positive.
+    """
+    pieces: list[Piece] = []
+    stop = position + 0.5 * velocity * abs(velocity) / deceleration
+    sign = copysign(1.0, target - stop) if target != stop else copysign(1.0, velocity)
+    if velocity * sign < 0.0:
+        pieces.append(Piece(abs(velocity) / deceleration, position, velocity, sign * deceleration))
+        position, velocity = stop, 0.0
+    way, v0 = sign * (target - position), abs(velocity)
+    peak = min(
+        speed, sqrt((2 * acceleration * deceleration * way + deceleration * v0**2) / (acceleration + deceleration))
+    )
+    change = acceleration if peak >= v0 else -deceleration
+    lengths = ((peak - v0) / change, 0.0, peak / deceleration)
+    used = 0.5 * (v0 + peak) * lengths[0] + 0.5 * peak * lengths[2]
+    cruise = max(0.0, (way - used) / peak) if peak > 0.0 else 0.0
+    for seconds, rate in zip((lengths[0], cruise, lengths[2]), (change, 0.0, -deceleration), strict=True):
+        piece = Piece(seconds, position, velocity, sign * rate)
+        pieces.append(piece)
+        position, velocity = piece.at(seconds)
+    return Profile(tuple(pieces), target)
+
+
+# Endless references: constant velocity, and what a constant torque does to the motor; both end at a fence.
+#
+# Source: CiA 402-2, cyclic synchronous velocity and torque modes; software position limits 607Dh.
+
+
+class Trajectory(Protocol):
+    """A reference as a function of the time since its start."""
+
+    duration_s: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s)."""
+
+
+class ConstantVelocity:
+    """A straight line without an end."""
+
+    duration_s = inf
+
+    def __init__(self, position: float, velocity: float) -> None:
+        self._position, self._velocity = position, velocity
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s)."""
+        return self._position + self._velocity * t_s, self._velocity
+
+
+class TorqueRun:
+    """Motion under a constant torque, solved exactly; velocity stays within a limit.
+
+    Friction first brings a motor to rest that moves against the torque, then keeps it there unless the torque is
+    above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
+    """
+
+    duration_s = inf
+
+    def __init__(
+        self, position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
+    ) -> None:
+        """Start.
+
+        Args:
+            position: counts.
+            velocity: counts/s; cut to the limit.
+            permille: torque, 1/1000 of the rated torque.
+            dynamics: of the motor.
+            speed_limit: counts/s, may be infinite.
+        """
+        self._torque, self._dynamics, self._limit = permille, dynamics, speed_limit
+        velocity = min(max(velocity, -speed_limit), speed_limit)
+        self._first = self._phase(position, velocity, copysign(1.0, velocity)) if velocity else None
+        rest_s, position = self._first.rest(position) if self._first else (0.0, position)
+        self._turn_s = rest_s
+        self._rest = position
+        moves = abs(permille) > dynamics.coulomb
+        self._second = self._phase(position, 0.0, copysign(1.0, permille)) if moves and rest_s < inf else None
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s)."""
+        if self._first is not None and t_s < self._turn_s:
+            return self._first.at(t_s)
+        if self._second is None:
+            return self._rest, 0.0
+        return self._second.at(t_s - self._turn_s)
+
+    def _phase(self, position: float, velocity: float, sign: float) -> _Phase:
+        gain, coulomb, damping = self._dynamics
+        final = gain * (self._torque - sign * coulomb) / damping
+        return _Phase(position, velocity, final, damping, self._limit)
+
+
+class _Phase:
+    """Velocity from `velocity` towards `final`, exponentially, without a change of sign; cut at the limit."""
+
+    def __init__(self, position: float, velocity: float, final: float, damping: float, limit: float) -> None:
+        self._position, self._velocity, self._final, self._damping = position, velocity, final, damping
+        self._cut_s, self._cut_velocity = inf, 0.0
+        if abs(final) > limit and final * velocity >= 0.0:
+            self._cut_velocity = copysign(limit, final)
+            self._cut_s = log((velocity - final) / (self._cut_velocity - final)) / damping
+
+    def rest(self, position: float) -> tuple[float, float]:
+        """When and where the motor is at rest; (inf, position) if never."""
+        if self._final * self._velocity >= 0.0:
+            return inf, position
+        t_s = log(1.0 - self._velocity / self._final) / self._damping
+        return t_s, self.at(t_s)[0]
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s)."""
+        free = min(t_s, self._cut_s)
+        decay = exp(-self._damping * free)
+        excess = self._velocity - self._final
+        velocity = self._final + excess * decay
+        position = self._position + self._final * free + excess * (1.0 - decay) / self._damping
+        if t_s > self._cut_s:
+            return position + self._cut_velocity * (t_s - self._cut_s), self._cut_velocity
+        return position, velocity
+
+
+class Fenced:
+    """A trajectory whose part outside the software limits is cut off: the motor waits at the limit."""
+
+    def __init__(self, inner: Trajectory, low: float, high: float) -> None:
+        """`low` and `high` in counts, infinite for none; a motor outside already may only come in."""
+        start, _ = inner.at(0.0)
+        self._inner, self._low, self._high = inner, min(low, start), max(high, start)
+        self.duration_s = inner.duration_s
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """Position (counts) and velocity (counts/s)."""
+        position, velocity = self._inner.at(t_s)
+        if self._low <= position <= self._high:
+            return position, velocity
+        return min(max(position, self._low), self._high), 0.0
+
+
+# The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill.
+
+STEP_NS = 2_500_000
+STANDSTILL_COUNTS = 0.1
+"""Motion in one step below which the motor is at rest."""
+PATIENCE_STEPS = 400
+NOTHING_S = 1e-9
+"""Rest of a trajectory that is none."""
+
+
+class AxisPlant(Protocol):
+    """What a drive needs of the plant. Positions are motor counts, calls at one instant are idempotent."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`."""
+
+    def motor_counts(self, axis: int) -> float:
+        """True motor position, counts."""
+
+    def torque_permille(self, axis: int) -> int:
+        """Motor torque, 1/1000 of the rated torque."""
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How the motor answers to torque."""
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """What the position loop may do: called when a drive's limit or feed-forward changes.
+
+        Args:
+            axis: 0-based.
+            limit_permille: largest torque, 1/1000 of the rated torque.
+            speed: counts/s added behind the position loop.
+            torque_permille: added behind the velocity loop.
+        """
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
+
+
+class Motion:
+    """Reference of one axis; remembers the ramp it gave last.
+
+    A trajectory goes to the plant as straight ramps of one step each, whose ends lie on it.
+    """
+
+    def __init__(self, axis: int, plant: AxisPlant, timers: Timers) -> None:
+        self._axis, self._plant = axis, plant
+        self._timer = timers.new(self._step)
+        self._start = self._end = 0.0
+        self._t0 = self._t1 = 0
+        self._trajectory: Trajectory | None = None
+        self._begin_ns = 0
+        self._patience = 0
+        self._was = 0.0
+        self._done: Callable[[int], None] | None = None
+
+    @property
+    def busy(self) -> bool:
+        """A trajectory or a deceleration is under way."""
+        return self._timer.due_ns is not None
+
+    def hold(self, t_ns: int) -> float:
+        """Stay where the motor is; returns that position, counts."""
+        self._stop()
+        self._plant.advance(t_ns)
+        here = self._plant.motor_counts(self._axis)
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        return here
+
+    def reach(self, counts: float, t_ns: int, duration_ns: int) -> None:
+        """From the end of the present ramp to `counts`, in `duration_ns` from now."""
+        if self._timer.due_ns is not None:
+            self._end = self.demand(t_ns)
+            self._stop()
+        start, end_ns = self._end, t_ns + duration_ns
+        self._start, self._end, self._t0, self._t1 = start, counts, t_ns, end_ns  # as `_ramp`, in every cycle
+        self._plant.set_ramp(self._axis, start, counts, t_ns, end_ns)
+
+    def demand(self, t_ns: int) -> float:
+        """The reference at `t_ns`, counts."""
+        if t_ns >= self._t1:
+            return self._end
+        return self._start + (self._end - self._start) * max(0, t_ns - self._t0) / (self._t1 - self._t0)
+
+    def speed(self, t_ns: int) -> float:
+        """Speed of the reference, counts/s; a ramp that has just ended still counts, as SYNC comes when it ends."""
+        if self._trajectory is not None:
+            return self._trajectory.at((t_ns - self._begin_ns) * 1e-9)[1]
+        moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
+        return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
+
+    def follow(self, trajectory: Trajectory, t_ns: int, done: Callable[[int], None] | None = None) -> None:
+        """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
+        self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
+        self._patience, self._was = PATIENCE_STEPS, inf
+        if trajectory.duration_s < NOTHING_S:
+            here = self.demand(t_ns)
+            self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        self._step(t_ns)
+
+    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None] | None = None) -> None:
+        """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
+
+        Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
+        reference at once.
+        """
+        here, speed = self.demand(t_ns), self.speed(t_ns) if rate > 0 else 0.0
+        if speed:
+            self.follow(braking(here, speed, rate), t_ns, done)
+            return
+        self._stop()
+        self._plant.advance(t_ns)
+        self._was = self._plant.motor_counts(self._axis)
+        self._patience, self._done = PATIENCE_STEPS, done
+        self._ramp(here, here, t_ns, t_ns + STEP_NS)
+        self._timer.arm(t_ns + STEP_NS)
+
+    def _step(self, due_ns: int) -> None:
+        trajectory = self._trajectory
+        if trajectory is None:
+            self._await_standstill(due_ns)
+            return
+        begun_s = (due_ns - self._begin_ns) * 1e-9
+        left_s = trajectory.duration_s - begun_s
+        if left_s < NOTHING_S:
+            self._trajectory, self._start = None, self._end  # the ramp that has just ended no longer counts as motion
+            self._await_standstill(due_ns)
+            return
+        step_s = STEP_NS * 1e-9
+        last = left_s <= step_s
+        step_ns = max(1, round(left_s * 1e9)) if last else STEP_NS
+        end = trajectory.at(trajectory.duration_s if last else begun_s + step_s)[0]
+        self._ramp(self.demand(due_ns), end, due_ns, due_ns + step_ns)
+        self._timer.arm(due_ns + STEP_NS)
+
+    def _await_standstill(self, due_ns: int) -> None:
+        if self._done is None:
+            return
+        self._plant.advance(due_ns)
+        here = self._plant.motor_counts(self._axis)
+        moved, self._was = abs(here - self._was), here
+        self._patience -= 1
+        if moved > STANDSTILL_COUNTS and self._patience > 0:
+            self._timer.arm(due_ns + STEP_NS)
+        else:
+            self._done(due_ns)
+
+    def _stop(self) -> None:
+        self._timer.cancel()
+        self._trajectory = None
+
+    def _ramp(self, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
+        self._start, self._end, self._t0, self._t1 = start, end, t0_ns, t1_ns
+        self._plant.set_ramp(self._axis, start, end, t0_ns, t1_ns)
+
+
+# An axis for a drive that has no plant: the motor is exactly where its reference is.
+#
+# Nothing loads it: there is no torque, and a following error never arises. Only a drive that controls torque asks how
+# the motor would answer to it; it is told an inertia and a viscous damping, without Coulomb friction.
+
+
+class IdealAxis:
+    """Follows straight references without a lag. The axis number that calls carry means nothing here."""
+
+    def __init__(self) -> None:
+        self._start = self._end = 0.0
+        self._t0 = self._t1 = self._now = 0
+
+    def advance(self, t_ns: int) -> None:
+        """Time has come to `t_ns`."""
+        self._now = max(self._now, t_ns)
+
+    def motor_counts(self, axis: int) -> float:
+        """Position, counts."""
+        if self._now >= self._t1:
+            return self._end
+        return self._start + (self._end - self._start) * max(0, self._now - self._t0) / (self._t1 - self._t0)
+
+    def torque_permille(self, axis: int) -> int:
+        """Always 0."""
+        return 0
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """Of a motor of its own: from rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
+        return MotorDynamics(gain=1000.0, coulomb=0.0, damping=1.0)
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Nothing: there is no loop and no torque."""
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
+        self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns

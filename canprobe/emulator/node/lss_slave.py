@@ -1,0 +1,361 @@
+"""LSS slave: the node gets its id over the bus; and the memory that ids and parameters (1010h, 1011h) are kept in.
+
+An id that was configured is used from the next NMT reset communication on; a node that had none makes that reset by
+itself when it is switched back to waiting. What was stored is used after the next power on. The bit rate is that of
+the bus: another one is refused.
+Source: CiA 305, "LSS slave", "LSS services".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from enum import Enum
+
+from canprobe.emulator.node.core import NO_ROUTES, Application, NodeCore, Route
+from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value
+from canprobe.protocol.frames import (
+    BIT_RATES,
+    LSS_ANSWER_ID,
+    LSS_LENGTH,
+    LSS_REQUEST_ID,
+    NOTHING_ASKED,
+    UNCONFIGURED,
+    LssAddress,
+    LssCommand,
+    LssError,
+    LssState,
+    pack_lss,
+    pack_number,
+)
+
+# How an LSS slave is found among others: by its whole address, by bounds, or bit by bit.
+#
+# Source: CiA 305, switch state selective, identify remote slave, fastscan.
+
+SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
+IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
+_MASK = 0xFFFFFFFF
+
+
+class Match(Enum):
+    """What a question of fastscan means to this slave."""
+
+    NO = 0
+    YES = 1
+    FOUND = 2  # the whole address: it is selected
+
+
+class LssSearch:
+    """What one slave has heard of the questions so far."""
+
+    def __init__(self) -> None:
+        self._heard: list[tuple[int, int]] = []  # command and number, of the sequence under way
+        self._position = 0
+
+    def forget(self) -> None:
+        """Start again."""
+        self._heard.clear()
+        self._position = 0
+
+    def selects(self, data: bytes, mine: LssAddress) -> bool:
+        """Switch state selective: the four numbers one after another, the last one decides."""
+        return tuple(self._complete(data, SELECT)) == mine.numbers
+
+    def identifies(self, data: bytes, mine: LssAddress) -> bool:
+        """Identify remote slave: vendor and product, revision and serial number each from a lowest to a highest."""
+        numbers = self._complete(data, IDENTIFY)
+        if not numbers:
+            return False
+        vendor, product, revision_low, revision_high, serial_low, serial_high = numbers
+        return (
+            (vendor, product) == (mine.vendor_id, mine.product_code)
+            and revision_low <= mine.revision_number <= revision_high
+            and serial_low <= mine.serial_number <= serial_high
+        )
+
+    def fastscan(self, data: bytes, mine: LssAddress) -> Match:
+        """The bits of one number from the asked one upwards."""
+        bit, position, following = data[5:]
+        if not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
+            return Match.NO
+        if bit == NOTHING_ASKED:
+            self._position = 0
+            return Match.YES
+        asked = _MASK << bit & _MASK
+        if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
+            return Match.NO
+        self._position = following
+        return Match.FOUND if bit == 0 and following < position else Match.YES
+
+    def _complete(self, data: bytes, sequence: range) -> list[int]:
+        """Take one number of a sequence; all of them where it is the last one and none was left out, else nothing."""
+        if data[0] != sequence[0] and (not self._heard or self._heard[-1][0] != data[0] - 1):
+            self._heard.clear()
+            return []
+        if data[0] == sequence[0]:
+            self._heard.clear()
+        self._heard.append((data[0], _number_in(data)))
+        return [number for _, number in self._heard] if data[0] == sequence[-1] else []
+
+
+def _number_in(data: bytes) -> int:
+    """The 32 bits behind the command specifier."""
+    return int.from_bytes(data[1:5], "little")
+
+
+# Store and restore parameters (1010h, 1011h) in a memory that survives the resets of the node.
+#
+# Source: CiA 301, objects 1010h, 1011h and 1020h.
+
+SAVE = int.from_bytes(b"save", "little")
+LOAD = int.from_bytes(b"load", "little")
+_ALL = range(0x1000, 0x10000)
+_COMMUNICATION = range(0x1000, 0x2000)
+_APPLICATION = range(0x2000, 0x10000)
+_COMMUNICATION_ONLY = 2
+_GROUPS = {1: _ALL, 2: _COMMUNICATION, 3: _APPLICATION}
+_VERIFY = 0x1020
+_NEVER = frozenset({0x1003, 0x1010, 0x1011})
+
+
+class Store:
+    """Parameters of one node, kept by "save" and forgotten by "load" (from the next reset on).
+
+    Attributes:
+        saved: stored values by dictionary key; hand it to another node's store to model a power cycle.
+        kept: what the application stored beside the dictionary.
+        volatile: indices that are process data, never stored.
+        node_id: stored by LSS for the next power on, 255 for none; None where LSS never stored any.
+        changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
+    """
+
+    def __init__(self, core: NodeCore, application: Application) -> None:
+        self._core, self._application = core, application
+        self.saved: dict[int, Value] = {}
+        self.kept = b""
+        self.node_id: int | None = None
+        self.changed: Callable[[], None] = _nothing
+        self.volatile: set[int] = set()
+        core.dictionary.configured = self._unverify
+        core.dictionary.on_check(0x1010, self._save)
+        core.dictionary.on_check(0x1011, self._load)
+        core.dictionary.on_write(0x1010, self._show)
+        core.dictionary.on_write(0x1011, self._show)
+
+    def reset(self, t_ns: int) -> None:
+        """Nothing: the node calls `recall`."""
+
+    def entered(self, t_ns: int) -> None:
+        """Nothing."""
+
+    def routes(self) -> Mapping[int, Route]:
+        """Listens to nothing."""
+        return NO_ROUTES
+
+    def recall(self, communication_only: bool) -> None:
+        """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
+        area = _COMMUNICATION if communication_only else range(0x10000)
+        dictionary = self._core.dictionary
+        dictionary.restore(key for key in dictionary.entries if key >> 8 in area)
+        for key, value in self.saved.items():
+            if key >> 8 in area:
+                dictionary.values[key] = value
+
+    def keep_node_id(self, node_id: int) -> None:
+        """Store a node id (LSS store configuration). Raises SdoAbort when it could not be written."""
+        before, self.node_id = self.node_id, node_id
+        try:
+            self.changed()
+        except SdoAbort:
+            self.node_id = before
+            raise
+
+    def _save(self, subindex: int, value: Value) -> None:
+        if value != SAVE or subindex not in _GROUPS:
+            raise SdoAbort(Abort.CANNOT_STORE)
+        dictionary, skip = self._core.dictionary, _NEVER | self.volatile
+        saved = dict(self.saved)
+        for key, entry in dictionary.entries.items():
+            if entry.writable and entry.readable and key >> 8 in _GROUPS[subindex] and key >> 8 not in skip:
+                saved[key] = dictionary.values[key]
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._application.keep())
+
+    def _load(self, subindex: int, value: Value) -> None:
+        if value != LOAD or subindex not in _GROUPS:
+            raise SdoAbort(Abort.CANNOT_STORE)
+        saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"")
+
+    def _replace(self, saved: dict[int, Value], kept: bytes) -> None:
+        before = self.saved, self.kept
+        self.saved, self.kept = saved, kept
+        try:
+            self.changed()
+        except SdoAbort:
+            self.saved, self.kept = before
+            raise
+
+    def _unverify(self, index: int) -> None:
+        """Another value came over SDO: what 1020h says of the configuration is no longer true."""
+        if index == _VERIFY or index in _NEVER or index in self.volatile:
+            return
+        for subindex in (1, 2):
+            self._core.dictionary.put(_VERIFY, subindex, 0)
+
+    def _show(self, subindex: int, value: Value) -> None:
+        for index in (0x1010, 0x1011):
+            for sub in _GROUPS:
+                self._core.dictionary.put(index, sub, 1)
+
+
+def _nothing() -> None:
+    return None
+
+
+# LSS slave: the node gets its id over the bus. Without one it stays in initialisation and hears LSS alone.
+
+Answer = bytes | None
+_INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
+
+
+class LssSlave:
+    """The LSS service of one node.
+
+    Args:
+        core: of the node; its `node_id` is the active one.
+        store: keeps the id that "store configuration" stores.
+        reset: called with the time when a node that had no id is to boot with its new one.
+        bitrate: see below.
+
+    Attributes:
+        pending: node id from the next reset communication on, or `UNCONFIGURED`.
+        state: waiting or configuration.
+        bitrate: of the bus, bit/s.
+    """
+
+    def __init__(self, core: NodeCore, store: Store, reset: Callable[[int], None], bitrate: int = 1_000_000) -> None:
+        self._core, self._store, self._reset, self.bitrate = core, store, reset, bitrate
+        self.pending = core.node_id
+        self.state = LssState.WAITING
+        self._search = LssSearch()
+        self._in_both_states: dict[int, Callable[[bytes], Answer]] = {
+            LssCommand.IDENTIFY_UNCONFIGURED: self._identify_unconfigured,
+            **dict.fromkeys(IDENTIFY, self._identify),
+        }
+        self._in_waiting: dict[int, Callable[[bytes], Answer]] = {
+            LssCommand.FASTSCAN: self._fastscan,
+            **dict.fromkeys(SELECT, self._select),
+        }
+        self._in_configuration: dict[int, Callable[[bytes], Answer]] = {
+            LssCommand.CONFIGURE_NODE_ID: self._configure_node_id,
+            LssCommand.CONFIGURE_BIT_TIMING: self._configure_bit_timing,
+            LssCommand.STORE: self._store_configuration,
+            LssCommand.INQUIRE_NODE_ID: self._inquire_node_id,
+            **dict.fromkeys(_INQUIRE, self._inquire),
+        }
+
+    @property
+    def address(self) -> LssAddress:
+        """What 1018h holds."""
+        return LssAddress(*(self._core.dictionary.number(0x1018, subindex) for subindex in (1, 2, 3, 4)))
+
+    @property
+    def unconfigured(self) -> bool:
+        """The node has no id and waits for one."""
+        return self._core.node_id == UNCONFIGURED
+
+    def power_on(self) -> None:
+        """Take the id that was stored, if one was."""
+        if self._store.node_id is not None:
+            self.pending = self._store.node_id
+
+    def reset(self, t_ns: int) -> None:
+        """Back to waiting, nothing heard."""
+        self._enter(LssState.WAITING)
+
+    def entered(self, t_ns: int) -> None:
+        """LSS works in every NMT state."""
+
+    def routes(self) -> Mapping[int, Route]:
+        """The LSS master's messages."""
+        return {LSS_REQUEST_ID: self._receive}
+
+    def _receive(self, data: bytes, t_ns: int) -> None:
+        if len(data) != LSS_LENGTH:
+            return
+        if data[0] == LssCommand.SWITCH_GLOBAL:
+            self._switch(data[1], t_ns)
+            return
+        in_state = self._in_configuration if self.state is LssState.CONFIGURATION else self._in_waiting
+        act = self._in_both_states.get(data[0]) or in_state.get(data[0])
+        answer = act(data) if act is not None else None
+        if answer is not None:
+            self._core.send(LSS_ANSWER_ID, answer)
+
+    def _switch(self, mode: int, t_ns: int) -> None:
+        if mode not in tuple(LssState):
+            return
+        boots = self.state is LssState.CONFIGURATION and self.unconfigured and self.pending != UNCONFIGURED
+        self._enter(LssState(mode))
+        if boots and mode == LssState.WAITING:
+            self._reset(t_ns)
+
+    def _enter(self, state: LssState) -> None:
+        self.state = state
+        self._search.forget()
+
+    # ------------------------------------------------------------------ being found
+
+    @property
+    def _is_blank(self) -> bool:
+        """It has no id and was not given one yet: the searches are for such nodes alone."""
+        return self.unconfigured and self.pending == UNCONFIGURED
+
+    def _select(self, data: bytes) -> Answer:
+        if not self._search.selects(data, self.address):
+            return None
+        self._enter(LssState.CONFIGURATION)
+        return pack_lss(LssCommand.SELECTED)
+
+    def _identify(self, data: bytes) -> Answer:
+        return pack_lss(LssCommand.IDENTIFIED) if self._search.identifies(data, self.address) else None
+
+    def _identify_unconfigured(self, _: bytes) -> Answer:
+        return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._is_blank else None
+
+    def _fastscan(self, data: bytes) -> Answer:
+        match = self._search.fastscan(data, self.address) if self._is_blank else Match.NO
+        if match is Match.FOUND:
+            self._enter(LssState.CONFIGURATION)
+        return pack_lss(LssCommand.IDENTIFIED) if match is not Match.NO else None
+
+    # ------------------------------------------------------------------ being configured
+
+    def _configure_node_id(self, data: bytes) -> Answer:
+        fits = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
+        if fits:
+            self.pending = data[1]
+        return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE if fits else LssError.REFUSED)
+
+    def _configure_bit_timing(self, data: bytes) -> Answer:
+        same = data[1] == 0 and BIT_RATES.get(data[2]) == self.bitrate
+        return _verdict(LssCommand.CONFIGURE_BIT_TIMING, LssError.NONE if same else LssError.REFUSED)
+
+    def _store_configuration(self, _: bytes) -> Answer:
+        try:
+            self._store.keep_node_id(self.pending)
+        except SdoAbort:
+            return _verdict(LssCommand.STORE, LssError.STORE_FAILED)
+        return _verdict(LssCommand.STORE, LssError.NONE)
+
+    def _inquire(self, data: bytes) -> Answer:
+        return pack_number(LssCommand(data[0]), self.address.numbers[data[0] - _INQUIRE[0]])
+
+    def _inquire_node_id(self, _: bytes) -> Answer:
+        """The active id; in initialisation the pending one, which is about to be."""
+        node_id = self.pending if self.unconfigured else self._core.node_id
+        return pack_lss(LssCommand.INQUIRE_NODE_ID, bytes((node_id,)))
+
+
+def _verdict(command: LssCommand, error: LssError) -> bytes:
+    return pack_lss(command, bytes((error,)))

@@ -1,0 +1,306 @@
+"""The plant: arm, probe, object and array as one thing that the emulated nodes share.
+
+Time only moves forward; several calls at one instant are the same as one. Contact is solved once per distinct time
+and only when somebody asks. Contact pushes the dynamic arm back, not the ideal one: its drives are taken as stiff.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.dynamic_arm import DynamicArm, make_arm
+from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
+from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Probe, elastic_contact, in_pad, turned
+from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
+from canprobe.emulator.plant.taxels import SIDE, Image, TaxelArray, Vec, pad_coordinates
+from canprobe.errors import PlanError
+from canprobe.robot.kinematics import Array, chain, point_on_flange, point_velocity
+from canprobe.robot.straight_line import matrix_product
+from canprobe.touch.shapes import Nearest, Touches
+
+Truth = dict[str, float | bool | Array]
+
+
+class PlantState(NamedTuple):
+    """All that the truth of an instant follows from.
+
+    Attributes:
+        t_ns: the instant.
+        counts, rates: positions (counts) and rates (counts/s) of the motors; empty without an arm.
+    """
+
+    t_ns: int
+    counts: tuple[float, ...]
+    rates: tuple[float, ...]
+
+
+class Plant:
+    """Arm, probe, object and array.
+
+    Args:
+        config: what the plant is made of.
+    Raises:
+        PlanError: for a probe without an arm over a hollow as tight as itself.
+    """
+
+    def __init__(self, config: PlantConfig) -> None:
+        self.config = config
+        self.t_ns = 0
+        self.arm: IdealArm | DynamicArm | None = None
+        self._pressed: PressedProbe | None = None
+        if config.model is not None:
+            self.arm = make_arm(config)
+        if config.object is not None and config.model is None:
+            _refuse_tight_hollow(config)
+            self._pressed = PressedProbe(config)
+        self._tightest = (LEAST_CURVATURE - 1.0) / config.radius_m
+        self.array: TaxelArray | None = None
+        if config.taxels is not None:
+            rng = np.random.default_rng(config.seed)
+            self.array = TaxelArray(config.taxels, rng, radius_m=config.radius_m, stiffness_n_m3=config.stiffness_n_m3)
+        T_tool = config.T_flange_probe_centre
+        self._tool_origin: Vec = tuple(T_tool[:3, 3].tolist())
+        # None where the probe's axes are the flange's, the usual case.
+        self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
+        self._base: Vec = tuple(config.base_offset_m.tolist())
+        self._joints = _at_rest if config.model is None else matrix_product(config.model.joints_per_count.tolist())
+        self._solved: _Solution | None = None
+        self._image: tuple[int, Image] | None = None
+
+    def advance(self, t_ns: int) -> None:
+        """Move the present time on; earlier times and repeats change nothing.
+
+        Args:
+            t_ns: ns.
+        """
+        if t_ns > self.t_ns:
+            self.t_ns = t_ns
+            self._solved = None
+            if self.arm is not None:
+                self.arm.advance(t_ns)
+
+    def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
+        """Reference of one drive, see ``IdealArm.set_ramp``.
+
+        Raises:
+            RuntimeError: without an arm.
+        """
+        (self.arm or self._need_arm()).set_ramp(axis, start_counts, end_counts, t0_ns, t1_ns)
+
+    def motor_counts(self, axis: int) -> float:
+        """Motor position now, counts, continuous; 0 without an arm.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return self.arm.motor_counts(axis) if self.arm is not None else 0.0
+
+    def torque_permille(self, axis: int) -> int:
+        """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
+
+        Args:
+            axis: 0 to 5.
+        """
+        return self.arm.torque_permille(axis) if self.arm is not None else 0
+
+    def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
+        """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
+
+        Args:
+            axis: 0 to 5.
+            limit_permille: of the rated torque.
+            speed: counts/s.
+            torque_permille: of the rated torque.
+        """
+        if self.arm is not None:
+            self.arm.set_loop(axis, limit_permille, speed, torque_permille)
+
+    def motor_dynamics(self, axis: int) -> MotorDynamics:
+        """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
+
+        Args:
+            axis: 0 to 5.
+
+        Raises:
+            RuntimeError: without an arm.
+        """
+        return self._need_arm().motor_dynamics(axis)
+
+    def _need_arm(self) -> IdealArm | DynamicArm:
+        if self.arm is None:
+            raise RuntimeError("this plant has no arm")
+        return self.arm
+
+    def sample_image(self, t_ns: int) -> Image:
+        """Advance and sample the array; a second call at one instant gives the same image.
+
+        Args:
+            t_ns: time of the sample, ns.
+
+        Returns:
+            (16, 16) counts; zeros without an array.
+        """
+        self.advance(t_ns)
+        if self.array is None:
+            return np.zeros((SIDE, SIDE), dtype=np.uint8)
+        if self._image is None or self._image[0] != self.t_ns:
+            self._image = (self.t_ns, self._sampled(self.array, self._solution()))
+        return self._image[1].copy()
+
+    def pressure(self, state: PlantState | None = None) -> Array:
+        """(16, 16) mean pressure of every taxel, Pa, before the array's own imperfections; zeros without an array.
+
+        Args:
+            state: of this plant; the present one by default.
+        """
+        s = self._solution() if state is None else self._solve(state)
+        if self.array is None or s.depth <= 0.0:
+            return np.zeros((SIDE, SIDE))
+        field, directions = self.array.field, in_pad(s.foot, s.probe, s.direction)
+        means: Array = field.mean_pressure(s.pad_uv, s.depth, s.kappa, directions)
+        return means * (self.config.stiffness_n_m3 * s.contact.damping_factor)
+
+    def _sampled(self, array: TaxelArray, s: _Solution) -> Image:
+        if s.several and self.config.object is not None:
+            points = array.field.points(np.array(s.probe.centre), np.array(s.probe.axes))
+            return array.image_of(array.field.mean_of(-self.config.object.gaps(points)), 1e-9 * self.t_ns)
+        return array.image(
+            s.pad_uv,
+            s.depth,
+            s.kappa,
+            in_pad(s.foot, s.probe, s.direction) if s.depth > 0.0 else ((1.0, 0.0), (0.0, 1.0)),
+            1e-9 * self.t_ns,
+            pressure_factor=s.contact.damping_factor,
+        )
+
+    def state(self) -> PlantState:
+        """The present state: cheap to take, `truth` can be asked for it at any time."""
+        if self.arm is None:
+            return PlantState(self.t_ns, (), ())
+        return PlantState(self.t_ns, *self.arm.motors())
+
+    def truth(self, state: PlantState | None = None) -> Truth:
+        """True values of a state, SI, base frame.
+
+        Args:
+            state: of this plant; the present one by default.
+
+        Without contact ``force`` is 0 and the contact fields are those of the closest surface point; without an object
+        they are zeros.
+
+        Returns:
+            q (6), probe_centre (3), pole (3), force, depth (negative: gap), depth_rate, contact_point (3) on the
+            object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
+            in_contact.
+        """
+        s = self._solution() if state is None else self._solve(state)
+        return {
+            "q": np.array(s.q),
+            "probe_centre": np.array(s.probe.centre),
+            "pole": np.array(s.probe.axes[2]),
+            "force": s.contact.force,
+            "depth": s.depth,
+            "depth_rate": s.depth_rate,
+            "contact_point": np.array(s.foot.point),
+            "contact_normal": np.array(s.foot.normal),
+            "kappa": np.array(s.foot.kappa),
+            "direction1": np.array(s.foot.directions[0]),
+            "direction2": np.array(s.foot.directions[1]),
+            "pad_uv": np.array(s.pad_uv),
+            "in_contact": s.depth > 0.0,
+        }
+
+    def _solution(self) -> _Solution:
+        if self._solved is None:
+            self._solved = self._solve(self.state())
+        return self._solved
+
+    def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
+        if self._pressed is not None:
+            return self._pressed.at(1e-9 * t_ns)
+        if self.arm is None:
+            return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
+        c = chain(self.arm.model, q)
+        centre = point_on_flange(c, self._tool_origin)
+        axes = (c.x, c.y, c.z) if self._tool_axes is None else turned((c.x, c.y, c.z), self._tool_axes)
+        b0, b1, b2 = self._base
+        return Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
+
+    def _solve(self, state: PlantState) -> _Solution:
+        config = self.config
+        q, qd = self._joints(state.counts), self._joints(state.rates)
+        probe = self._probe(state.t_ns, q, qd)
+        if config.object is None:
+            return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
+        foot = config.object.nearest(probe.centre)
+        nx, ny, nz = foot.normal
+        vx, vy, vz = probe.velocity
+        depth, rate = config.radius_m - foot.distance, -(nx * vx + ny * vy + nz * vz)
+        k1, k2 = foot.kappa
+        touches = config.object.touches(probe.centre, config.radius_m)
+        contact = elastic_contact(
+            depth,
+            (max(k1, self._tightest), max(k2, self._tightest)),
+            config.radius_m,
+            config.stiffness_n_m3,
+            depth_rate=rate,
+            damping=config.damping_s_m,
+        )
+        if touches is not None:
+            contact = self._resting(touches, probe)
+        # Contact direction on the probe: from its centre against the object's outward normal.
+        (x0, x1, x2), (y0, y1, y2), (z0, z1, z2) = probe.axes
+        d = (-(nx * x0 + ny * x1 + nz * x2), -(nx * y0 + ny * y1 + nz * y2), -(nx * z0 + ny * z1 + nz * z2))
+        uv = pad_coordinates(d, config.radius_m)
+        return _Solution(q, probe, foot, depth, rate, contact, (k1, k2), uv, d, touches is not None)
+
+    def _resting(self, touches: Touches, probe: Probe) -> Contact:
+        """Several places at once, as one contact with the resultant force; it has no patch of its own."""
+        config = self.config
+        rates = -(touches.normals @ np.array(probe.velocity))
+        force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
+        return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
+
+
+def _at_rest(motors: Sequence[float]) -> tuple[float, ...]:
+    """Joints without an arm."""
+    return (0.0,) * 6
+
+
+@dataclass(slots=True, eq=False)
+class _Solution:
+    """Contact at one instant."""
+
+    q: tuple[float, ...]
+    probe: Probe
+    foot: Nearest
+    depth: float
+    depth_rate: float
+    contact: Contact
+    kappa: tuple[float, float]
+    pad_uv: tuple[float, float]
+    direction: Vec  # of the contact from the probe's centre, pad frame
+    several: bool = False  # it touches in several places, and these are of the deepest
+
+
+_POLE = (0.0, 0.0, 1.0)
+_ORIGIN = (0.0, 0.0, 0.0)
+_NOWHERE = Nearest(_ORIGIN, _ORIGIN, 0.0, (0.0, 0.0), (_ORIGIN, _ORIGIN))
+
+
+def _refuse_tight_hollow(config: PlantConfig) -> None:
+    """A probe without an arm is pressed on the object's reference point, which it must be able to reach."""
+    assert config.object is not None
+    tightest = config.object.tightest_concave_radius()
+    if tightest <= config.radius_m:
+        raise PlanError(
+            [
+                f"the object has a hollow of radius {1e3 * tightest:.1f} mm, the probe's radius is "
+                f"{1e3 * config.radius_m:.1f} mm: it cannot touch there in one point; take a smaller probe"
+            ]
+        )

@@ -1,0 +1,244 @@
+"""Plan → the emulated side: one plant, its nodes, and the recorder of what is true; or a node from an EDS alone."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from canopen.objectdictionary import ObjectDictionary
+from numpy.typing import NDArray
+
+from canprobe.eds.packaged import FULL_SCALE, has_full_scale, load_eds
+from canprobe.eds.reading import is_drive
+from canprobe.emulator.array import make_tactile_node
+from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.drive.reference import IdealAxis
+from canprobe.emulator.node.dictionary import key_of
+from canprobe.emulator.node.slave_node import SlaveNode
+from canprobe.emulator.plant.config import PlantConfig, PressMotion
+from canprobe.emulator.plant.plant import Plant
+from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.planning.model import Plan, PlannedNode
+from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
+from canprobe.robot.inverse import start_posture
+from canprobe.robot.kinematics import Array, PumaModel, forward
+from canprobe.scene.setup import Arm, Setup
+
+# Records what is true in the plant at every SYNC, beside what the nodes measure.
+
+
+class TruePlant(Protocol):
+    """A plant that tells its present true values."""
+
+    def advance(self, t_ns: int) -> None:
+        """Bring the plant to `t_ns`; idempotent."""
+
+    def state(self) -> Any:
+        """The present state, all that the truth follows from."""
+
+    def truth(self, state: Any) -> Mapping[str, Any]:
+        """True values of a state: numbers and arrays, always under the same names."""
+
+
+class TruthRecorder:
+    """A silent participant of the bus that writes down the plant's state at every SYNC.
+
+    What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
+
+    Args:
+        plant: whose truth.
+
+    Attributes:
+        origin_ns: time on the bus's clock that is 0 in the column ``t_s``.
+    """
+
+    name = "truth recorder"
+    witness = True
+    listens = frozenset((SYNC_ID,))
+
+    def __init__(self, plant: TruePlant) -> None:
+        self._plant = plant
+        self.origin_ns = 0
+        self._rows: list[tuple[int, int, Any]] = []
+
+    @property
+    def next_deadline_ns(self) -> None:
+        """Only a SYNC wakes it."""
+        return None
+
+    def start(self, t_ns: int) -> list[Frame]:
+        """Nothing to say."""
+        return []
+
+    def advance(self, t_ns: int) -> list[Frame]:
+        """Nothing is ever due."""
+        return []
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
+        """On a SYNC, take the state."""
+        if can_id == SYNC_ID:
+            self._plant.advance(t_ns)
+            self._rows.append((t_ns, data[0] if data else 0, self._plant.state()))
+        return []
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Columns, one row a SYNC: t_s (s), sync_count (0, 1, …), sync_counter (of the frame, 0 without), the truth."""
+        columns: dict[str, NDArray[Any]] = {
+            "t_s": np.array([t_ns - self.origin_ns for t_ns, _, _ in self._rows], dtype=np.float64) * 1e-9,
+            "sync_count": np.arange(len(self._rows), dtype=np.int64),
+            "sync_counter": np.array([counter for _, counter, _ in self._rows], dtype=np.int64),
+        }
+        truths = [self._plant.truth(state) for _, _, state in self._rows]
+        for name in truths[0] if truths else ():
+            columns[name] = np.array([truth[name] for truth in truths])
+        return columns
+
+
+def set_serial_number(node: SlaveNode, serial: int) -> None:
+    """Tell two devices of one EDS apart; a device without 1018h:04 has none."""
+    if key_of(0x1018, 4) in node.dictionary:
+        node.dictionary.set_default(0x1018, 4, serial)
+
+
+# Plan → the emulated side: one plant, its nodes, and the recorder of what is true.
+
+PARKED_ABOVE = 5e-3
+"""How far above the approach's first point an emulated arm stands at power on, m."""
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The emulated nodes and what they share.
+
+    Attributes:
+        nodes: the slaves, ascending by node id.
+        plant: arm, probe, object and array.
+        recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+    """
+
+    nodes: tuple[SlaveNode, ...]
+    plant: Plant
+    recorder: TruthRecorder | None
+
+    @property
+    def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
+        """Everything that lives on the bus; the recorder listens only."""
+        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
+
+
+def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
+    """The emulated nodes of a plan, behind one plant.
+
+    Where the scene gives a node no serial number, its node id in the scene is one.
+
+    Args:
+        plan: of the scene.
+        node_ids: which of its nodes to emulate.
+        truth: whether what is true is recorded.
+        without_id: which of them start without a node id and wait for LSS to give them one.
+    """
+    plant = Plant(_plant_config(plan.setup))
+    nodes = []
+    for node in plan.nodes:
+        if node.node_id not in node_ids:
+            continue
+        nodes.append(_node(plan.setup, node, UNCONFIGURED if node.node_id in without_id else node.node_id, plant))
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
+
+
+def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:
+    dictionary, od_of = load_eds(planned.eds, planned.node_id), partial(load_eds, planned.eds)
+    if planned.kind == "drive":
+        assert setup.arm is not None
+        axis = setup.arm.node_ids.index(planned.node_id)
+        node = make_drive_node(dictionary, node_id, axis, plant, od_of)
+    else:
+        assert setup.array is not None
+        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)
+        if has_full_scale(dictionary):
+            node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.full_scale))
+    serial = planned.identity.serial_number
+    set_serial_number(node, planned.node_id if serial is None else serial)
+    if node.lss is not None:
+        node.lss.bitrate = setup.bus.bitrate
+    return node
+
+
+def _plant_config(setup: Setup) -> PlantConfig:
+    truth, array, touch = setup.truth, setup.array, setup.touch
+    config = PlantConfig(
+        model=truth.model,
+        T_flange_probe_centre=truth.T_flange_probe,
+        radius_m=setup.probe.radius,
+        stiffness_n_m3=truth.stiffness,
+        damping_s_m=truth.damping,
+        object=truth.object,
+        taxels=None
+        if array is None
+        else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
+        bandwidth_hz=truth.bandwidth_hz,
+        press=PressMotion(force_n=touch.force) if touch is not None else PressMotion(),
+        seed=setup.seed,
+    )
+    if setup.arm is None or truth.model is None:
+        return config
+    q0 = _first_posture(setup, setup.arm)
+    return replace(
+        config,
+        q0=q0,
+        fidelity=truth.fidelity,
+        dynamics=truth.dynamics,
+        base_offset_m=_base_offset(setup.arm.model, truth.model, q0, setup.probe.T_flange_probe),
+    )
+
+
+def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe: Array) -> Array:
+    """Where the real arm's base stands in the controller's base frame, (3,), m.
+
+    An experimenter moves the arm to the object and takes that place for what the encoders say: both arms hold the
+    probe at one place in the first posture.
+    """
+    offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
+    return offset
+
+
+def _first_posture(setup: Setup, arm: Arm) -> Array:
+    """Joint angles (n,), rad, at power on: above the start point of a touch, else as the scene says."""
+    touch = setup.touch
+    if touch is None:
+        return arm.q_start
+    return start_posture(
+        arm.model,
+        touch.approach.start,
+        touch.approach.normal,
+        radius_m=touch.probe.radius,
+        T_flange_probe=touch.probe.T_flange_probe,
+        clearance_m=touch.approach.clearance + PARKED_ABOVE,
+        q_near=arm.q_start,
+    )
+
+
+# A node from an EDS alone, of any make: the values of the file, and a drive where the file describes one.
+
+
+def make_eds_node(
+    od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
+) -> SlaveNode:
+    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis of its own.
+
+    Args:
+        od: of any EDS, for this node id.
+        node_id: 1–127; or 255: it waits for LSS to give it one.
+        eds: the file, for a node that speaks LSS; None for one that does not.
+        serial: number for 1018h:04, in the place of the file's.
+    """
+    od_of = None if eds is None else partial(load_eds, eds)
+    drive = is_drive(od)
+    node = make_drive_node(od, node_id, 0, IdealAxis(), od_of) if drive else SlaveNode(od, node_id, od_of=od_of)
+    if serial is not None:
+        set_serial_number(node, serial)
+    return node

@@ -1,0 +1,1 @@
+"""A recorded bus, taken up again: recording → cycles → estimates, or observations for other tools."""

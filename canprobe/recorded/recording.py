@@ -1,0 +1,253 @@
+"""A recorded bus as the cell needs it: the frames of the planned nodes, in order, with the deadlines of their SYNCs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.disk import read_log
+from canprobe.bus.port import TimedFrame, is_bus_error
+from canprobe.errors import UsageError
+from canprobe.planning.model import Plan
+from canprobe.protocol.frames import SYNC_ID
+
+# A recorded bus as the cell needs it: the frames of the planned nodes, in order, checked to be there.
+
+RATE_TOLERANCE = 0.2
+"""Share by which the recorded SYNC period may differ from the scene's."""
+STAMP_JITTER_NS = 300_000
+"""Lines out of the order of their stamps by no more are in the order of the bus, and the stamps are wrong."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """The frames of one channel that the cell takes or sends.
+
+    Attributes:
+        path: the log.
+        channel: the one of its channels on which the nodes are.
+        frames: SYNC, TPDOs and RPDOs of the planned nodes, (can_id, data, t_ns).
+        times: their stamps (n,), ns.
+        syncs: which of them are SYNCs.
+        other: frames of this channel that are none of these.
+        malformed: PDOs of a wrong length, left out.
+        error_frames: bus errors on all channels.
+    """
+
+    path: Path
+    channel: str
+    frames: list[TimedFrame]
+    times: NDArray[np.int64]
+    syncs: NDArray[np.int64]
+    other: int
+    malformed: int
+    error_frames: int
+
+    @property
+    def sync_stamps(self) -> NDArray[np.int64]:
+        """When each SYNC went out, ns."""
+        return self.times[self.syncs]
+
+    @property
+    def sync_overflow(self) -> int | None:
+        """At which the SYNC counter starts again; None where it did not twice, or there is no counter."""
+        counters = [data[0] for _, data, _ in map(self.frames.__getitem__, self.syncs) if data]
+        last = [a for a, b in pairwise(counters) if b < a]
+        return max(counters) if last and last.count(max(counters)) >= 2 else None
+
+
+@dataclass(slots=True)
+class _Channel:
+    """What was read of one channel so far."""
+
+    frames: list[TimedFrame] = field(default_factory=list)
+    heard: set[int] = field(default_factory=set)
+    answers: int = 0
+    other: int = 0
+    malformed: int = 0
+
+
+def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
+    """Read the frames of a plan's nodes from a log.
+
+    Args:
+        path: the log; it may hold other nodes, other channels and error frames. Where the plan has several buses, the
+            log has them by the plan's names, and they are read as one.
+        plan: which identifiers and lengths to expect.
+        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order in which it
+            took the frames in. False puts them into the order of the bus.
+
+    Raises:
+        UsageError: no such file, a torn line, a node that was never heard, no SYNC, or SYNCs of another rate.
+    """
+    channels, error_frames = _read(path, plan)
+    name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
+    chosen = channels.get(name, _Channel())
+    _check_heard(path, plan, name, chosen)
+    frames = chosen.frames if as_taken else _in_bus_order(chosen.frames)
+    syncs = [i for i, frame in enumerate(frames) if frame[0] == SYNC_ID]
+    times = np.array([frame[2] for frame in frames], np.int64)
+    recording = Recording(
+        path, name, frames, times, np.array(syncs, np.int64), chosen.other, chosen.malformed, error_frames
+    )
+    _check_syncs(recording, plan)
+    return recording
+
+
+def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
+    lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
+    answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
+    channels: dict[str, _Channel] = {}
+    error_frames = 0
+    main, *others = [bus.channel for bus in plan.buses]
+    for t_ns, on, can_id, data in read_log(path):
+        if on in others and can_id == SYNC_ID:
+            continue  # the cell has one SYNC, which goes to all its buses
+        name = main if on in others else on
+        channel = channels.get(name)
+        if channel is None:
+            channel = channels[name] = _Channel()
+        if can_id == SYNC_ID and len(data) <= 1:
+            channel.frames.append((can_id, data, t_ns))
+        elif (length := lengths.get(can_id)) is None:
+            channel.other += 1
+            error_frames += is_bus_error(can_id)
+        elif len(data) != length:
+            channel.malformed += 1
+        else:
+            channel.frames.append((can_id, data, t_ns))
+            if can_id in answers:
+                channel.heard.add(can_id)
+                channel.answers += 1
+    return channels, error_frames
+
+
+def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
+    """Frames with stamps that never go back: a logger's small jitter is evened out, anything more is sorted."""
+    stamps = np.array([frame[2] for frame in frames], np.int64)
+    latest = np.maximum.accumulate(stamps)
+    if int((latest - stamps).max(initial=0)) > STAMP_JITTER_NS:
+        return sorted(frames, key=lambda frame: frame[2])
+    return [(can_id, data, t_ns) for (can_id, data, _), t_ns in zip(frames, latest.tolist(), strict=True)]
+
+
+def _check_heard(path: Path, plan: Plan, name: str, channel: _Channel) -> None:
+    silent = []
+    for node in plan.nodes:
+        missing = [pdo for pdo in plan.pdos_of(node.node_id, "tpdo") if pdo.cob_id not in channel.heard]
+        if missing:
+            ids = ", ".join(f"{pdo.cob_id:03X}h" for pdo in missing)
+            silent.append(f"node {node.node_id} ({node.role}) was never heard: no TPDO {ids}")
+    if silent:
+        where = f"{path}: on {name}" if name else f"{path}: no frame at all;"
+        wrong = f" ({channel.malformed} PDOs of a wrong length)" if channel.malformed else ""
+        raise UsageError("\n".join(f"{where} {line}{wrong}" for line in silent))
+
+
+def _check_syncs(recording: Recording, plan: Plan) -> None:
+    where = f"{recording.path}: on {recording.channel}"
+    if len(recording.syncs) < 2:
+        raise UsageError(f"{where} {len(recording.syncs)} SYNC (080h); a replay goes from SYNC to SYNC")
+    steps = np.diff(recording.sync_stamps)
+    if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):
+        raise UsageError(
+            f"{where} {twice} of {len(recording.syncs)} SYNCs (080h) at once with the one before: was every"
+            " frame logged twice?"
+        )
+    period = float(np.median(steps))
+    if abs(period - plan.sync.period_ns) > RATE_TOLERANCE * plan.sync.period_ns:
+        raise UsageError(
+            f"{where} a SYNC every {period * 1e-6:.3f} ms, but scene {plan.setup.name} has one every"
+            f" {plan.sync.period_ns * 1e-6:.3f} ms; set cycle.rate_hz"
+        )
+
+
+# The deadlines behind recorded SYNCs: which multiple of the period each was meant for.
+
+Numbers = NDArray[np.int64]
+_TRIALS = 64
+_EARLIER = 8
+"""By this part of a period at most the phase may be earlier than the one of the least lateness."""
+
+
+def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None) -> tuple[Numbers, Numbers]:
+    """The deadline of each SYNC.
+
+    A SYNC goes out at its deadline or less than a period later, and never two for one deadline. The phase of the
+    deadlines is the one that obeys this with the least lateness; stamps may be a microsecond early.
+
+    Args:
+        stamps_ns: when each SYNC went out (n,), ns, increasing, in whole microseconds as candump has them.
+        period_ns: of the cycle.
+        block: SYNCs after which the phase is looked for again, where the stamps are another clock's than the
+            producer's and drift against it; None where they are the same clock's.
+
+    Returns:
+        Number of each deadline (n,), in periods since the first one, strictly increasing; and the deadline itself
+        (n,), ns on the clock of the stamps.
+    """
+    deadlines = np.empty(len(stamps_ns), np.int64)
+    numbers = np.empty(len(stamps_ns), np.int64)
+    phase: int | None = None
+    for first in range(0, len(stamps_ns), block or max(1, len(stamps_ns))):
+        part = stamps_ns[first : first + block] if block else stamps_ns
+        found = _phase(part, period_ns)
+        if phase is not None:  # the same deadlines, drifted: within half a period of the last block's
+            found = phase + (found - phase + period_ns // 2) % period_ns - period_ns // 2
+        phase = found
+        numbers[first : first + len(part)] = (part - phase) // period_ns
+        deadlines[first : first + len(part)] = part - (part - phase) % period_ns
+    place = np.arange(len(numbers))
+    numbers = np.minimum.accumulate((numbers - place)[::-1])[::-1] + place  # of two at one deadline the first is late
+    return np.asarray(numbers - numbers[:1], dtype=np.int64), deadlines
+
+
+def _phase(stamps_ns: Numbers, period_ns: int) -> int:
+    """The deadlines' phase, 0 ≤ phase < period: among the stamps' own, so never later than any of them by chance."""
+    residues = np.sort(stamps_ns % period_ns)
+    candidates, passed = np.unique(residues, return_index=True)
+    lateness = period_ns * passed.astype(float) - float(len(residues)) * candidates
+    order = np.argsort(lateness, kind="stable")[:_TRIALS]
+    trials: list[int] = candidates[order].tolist()
+    best = min(trials, key=lambda phase: _implausibility(stamps_ns, phase, period_ns))
+    return _earliest(candidates, _doubled(stamps_ns, candidates, period_ns), best, period_ns // _EARLIER)
+
+
+def _earliest(candidates: Numbers, doubled: Numbers, best: int, most_ns: int) -> int:
+    """The earliest phase before ``best`` that contradicts no more than it does.
+
+    Where many SYNCs are late the least lateness is found too late: those that were in time before it would then all be
+    a whole period late.
+    """
+    i = int(np.searchsorted(candidates, best))
+    while i > 0 and doubled[i - 1] <= doubled[i] and best - candidates[i - 1] <= most_ns:
+        i -= 1
+    return int(candidates[i])
+
+
+def _doubled(stamps_ns: Numbers, phases: Numbers, period_ns: int) -> Numbers:
+    """By phase (m,), ascending: how many SYNCs had the deadline of the one before, as none lies between the two."""
+    close = np.flatnonzero(np.diff(stamps_ns) < period_ns)
+    first = np.searchsorted(phases, stamps_ns[close] % period_ns, side="right")
+    end = np.searchsorted(phases, stamps_ns[close + 1] % period_ns, side="right")
+    steps = np.zeros(len(phases) + 1, np.int64)
+    np.add.at(steps, first, 1)
+    np.add.at(steps, end, -1)
+    between = np.cumsum(steps)[:-1] + np.count_nonzero(end < first)
+    return np.asarray(len(close) - between, dtype=np.int64)
+
+
+def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:
+    """Contradictions of a phase; and the lateness, by its root: many in time and one late, not all a little late.
+
+    Two SYNCs at one deadline contradict it, and so does a first SYNC that is nearly a period late, unless it is: for
+    want of one before it nothing else tells an early one from a late one.
+    """
+    numbers, lateness = np.divmod(stamps_ns - phase, period_ns)
+    steps, waits = np.diff(numbers), np.diff(stamps_ns)
+    first = bool(len(steps)) and steps[0] > 1 and 2 * waits[0] < 3 * period_ns
+    return int(np.count_nonzero(steps < 1)) + int(first), float(np.sqrt(lateness).sum())

@@ -1,0 +1,1 @@
+"""What a run leaves behind: summary, scores against the truth, files, tables and figures."""

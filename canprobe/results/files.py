@@ -1,0 +1,330 @@
+"""Columns of a run as a table, and a surface map as a file: each with its units, and back without loss.
+
+A column of a log may hold a vector or a matrix a row. A table has one number a cell: `q_rad` (n, 6) becomes `q_rad_0` …
+`q_rad_5`, `K_per_m` (n, 2, 2) becomes `K_per_m_0_0` … `K_per_m_1_1`. Which column it was stands in the metadata.
+
+Needs the extra `data` (pandas, pyarrow).
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.disk import read_npz, whole_file, write_npz
+from canprobe.errors import UsageError
+from canprobe.touch.surface_map import LocalPatch, SurfaceMap
+
+if TYPE_CHECKING:
+    import pandas
+
+
+# Columns of a run as a table: pandas in memory, Parquet on disk, each with its units, and back without loss.
+
+_UNITS = {
+    "per_m2": "1/m^2",
+    "per_m": "1/m",
+    "permille": "permille",
+    "m_s": "m/s",
+    "rad": "rad",
+    "deg": "deg",
+    "mm": "mm",
+    "hz": "Hz",
+    "ns": "ns",
+    "us": "us",
+    "n": "N",
+    "m": "m",
+    "s": "s",
+}
+_TRUTH_UNITS = {  # the plant's own columns carry no suffix: they are SI
+    "q": "rad",
+    "probe_centre": "m",
+    "force": "N",
+    "depth": "m",
+    "depth_rate": "m/s",
+    "contact_point": "m",
+    "kappa": "1/m",
+    "pad_uv": "m",
+}
+_EXTRA = "pip install 'canprobe[data]'"
+_ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet
+
+
+def unit_of(name: str) -> str:
+    """The unit of a column of a log, of a truth file or of estimates; `1` for what has none."""
+    if name in _TRUTH_UNITS:
+        return _TRUTH_UNITS[name]
+    return next((unit for suffix, unit in _UNITS.items() if name.endswith(f"_{suffix}")), "1")
+
+
+@dataclass(frozen=True, slots=True)
+class _Cell:
+    """One column of a table: of which array, and where in it."""
+
+    name: str
+    of: str
+    index: tuple[int, ...]
+    shape: tuple[int, ...]
+    values: NDArray[Any]
+
+
+def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | None = None) -> pandas.DataFrame:
+    """Columns as a table, by time.
+
+    Args:
+        columns: arrays (n,), (n, k) or (n, k, l) with one row a cycle; the suffix of a name is its unit.
+        attrs: added to the frame's `attrs`.
+
+    Returns:
+        The frame; its index is `t_s` where there is one. `attrs["units"]` maps every column to its unit.
+
+    Raises:
+        UsageError: pandas is missing, or columns differ in length.
+    """
+    pandas = _need("pandas", "a table")
+    cells = _cells(columns)
+    frame = pandas.DataFrame({cell.name: cell.values for cell in cells})
+    if "t_s" in columns:
+        frame = frame.set_index("t_s")
+    frame.attrs = {**(attrs or {}), "units": {cell.name: unit_of(cell.of) for cell in cells}}
+    return frame
+
+
+def load_table(path: Path | str) -> pandas.DataFrame:
+    """A table from a `.npz` of a run (`log.npz`, `truth.npz`) or from Parquet.
+
+    Raises:
+        UsageError: no such file, another kind of file, or the extra is missing.
+    """
+    source = Path(path)
+    if source.suffix == ".npz":
+        return to_frame(read_npz(source))
+    columns, attrs = _read_parquet(source)
+    return to_frame(columns, {name: value for name, value in attrs.items() if name != "units"})
+
+
+def npz_to_parquet(npz: Path | str, parquet: Path | str, attrs: Mapping[str, Any] | None = None) -> None:
+    """Write a run's `.npz` as Parquet: any tool reads the numbers, and `parquet_to_npz` all of it.
+
+    Raises:
+        UsageError: no such file, or the extra is missing.
+    """
+    write_parquet(read_npz(Path(npz)), parquet, attrs)
+
+
+def parquet_to_npz(parquet: Path | str, npz: Path | str) -> None:
+    """Write a Parquet file of ours as the `.npz` that it came from: same names, shapes, types and bits.
+
+    Raises:
+        UsageError: no such file, not one of ours, or the extra is missing.
+    """
+    columns, _ = _read_parquet(Path(parquet))
+    write_npz(Path(npz), columns)
+
+
+def write_parquet(
+    columns: Mapping[str, NDArray[Any]], path: Path | str, attrs: Mapping[str, Any] | None = None
+) -> None:
+    """Write columns as Parquet; each field's metadata has its unit, and the array and place that it came from.
+
+    Raises:
+        UsageError: the extra is missing, or columns differ in length.
+        ResultsError: the file cannot be written.
+    """
+    arrow = _need("pyarrow", "Parquet")
+    cells = _cells(columns)
+    fields, arrays = [], []
+    for cell in cells:
+        array = arrow.array(cell.values)
+        metadata = {
+            "unit": unit_of(cell.of),
+            "of": cell.of,
+            "index": json.dumps(cell.index),
+            "shape": json.dumps(cell.shape),
+        }
+        fields.append(arrow.field(cell.name, array.type, metadata=metadata))
+        arrays.append(array)
+    units = {cell.name: unit_of(cell.of) for cell in cells}
+    schema = arrow.schema(fields, metadata={_ATTRS: json.dumps({**(attrs or {}), "units": units})})
+    parquet = _need("pyarrow.parquet", "Parquet")
+    with whole_file(Path(path)) as part:
+        parquet.write_table(arrow.Table.from_arrays(arrays, schema=schema), part)
+
+
+def _cells(columns: Mapping[str, NDArray[Any]]) -> list[_Cell]:
+    lengths = {len(values) for values in columns.values()}
+    if len(lengths) > 1:
+        raise UsageError(f"columns of {', '.join(map(str, sorted(lengths)))} rows do not make one table")
+    return [
+        _Cell("_".join((name, *map(str, index))), name, index, values.shape[1:], values[(slice(None), *index)])
+        for name, values in columns.items()
+        for index in np.ndindex(*values.shape[1:])
+    ]
+
+
+def _read_parquet(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
+    arrow = _need("pyarrow", "Parquet")
+    if not path.exists():
+        raise UsageError(f"{path}: no such file")
+    try:
+        table = _need("pyarrow.parquet", "Parquet").read_table(path)
+    except (OSError, arrow.ArrowException) as error:
+        raise UsageError(f"{path}: expected Parquet: {error}") from error
+    columns: dict[str, NDArray[Any]] = {}
+    for field in table.schema:
+        if field.metadata is None or b"of" not in field.metadata:
+            raise UsageError(f"{path}: column {field.name} does not say of which array it is: not a file of ours")
+        values = table.column(field.name).to_numpy()
+        name, shape = field.metadata[b"of"].decode(), json.loads(field.metadata[b"shape"])
+        column = columns.setdefault(name, np.empty((len(values), *shape), values.dtype))
+        column[(slice(None), *json.loads(field.metadata[b"index"]))] = values
+    return columns, json.loads((table.schema.metadata or {}).get(_ATTRS, b"{}"))
+
+
+def _need(module: str, purpose: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise UsageError(f"{purpose} needs {module}: {_EXTRA}") from error
+
+
+# A surface map as a file: ``surface.npz``, plain arrays, no pickle.
+#
+# Columns (n patches, m path points; base frame; mixed units are SI in the stated order):
+#
+# =========================  ==========  ==============================================================================
+# ``format_version``         ()          1
+# ``method``                 ()          estimator
+# ``t_s``                    (n,)        instant of the last sample
+# ``travelled_m``            (n,)        path of the contact until then
+# ``T_base_contact_m``       (n, 4, 4)   contact frame to base; z is the inward normal
+# ``S_per_m``                (n, 4, 4)   surface matrix in the contact frame, c34 = −½
+# ``K_covariance_per_m2``    (n, 3, 3)   of (K11, K12, K22); NaN, infinite where not observed
+# ``S_covariance_si``        (n, 9, 9)   of (c14, c24, c44, c13, c23, c33, c11, c12, c22): –, –, m, 1/m …
+# ``pose_known``             (n,)        1 where ``S_covariance_si`` tells height and tilt
+# ``observed``               (n, 2)      1 for each principal curvature that was observed
+# ``combinations``           (n, 3, 3)   rows: observed combinations of (K11, √2 K12, K22); NaN beyond the rank
+# ``memory_m``               (n,)        path that the patch rests on
+# ``innovation``             (n,)        mean squared whitened residual per degree of freedom
+# ``path_m``                 (m, 3)      contact points
+# =========================  ==========  ==============================================================================
+
+FORMAT_VERSION = 1
+Array = NDArray[np.float64]
+
+_PER_PATCH: dict[str, tuple[str, tuple[int, ...]]] = {
+    "t_s": ("t_s", ()),
+    "travelled_m": ("travelled_m", ()),
+    "T_base_contact_m": ("T_base_contact", (4, 4)),
+    "S_per_m": ("S", (4, 4)),
+    "K_covariance_per_m2": ("K_covariance", (3, 3)),
+    "S_covariance_si": ("S_covariance", (9, 9)),
+    "pose_known": ("pose_known", ()),
+    "observed": ("observed", (2,)),
+    "combinations": ("combinations", (3, 3)),
+    "memory_m": ("distance_m", ()),
+    "innovation": ("innovation", ()),
+}
+"""Column → field of a patch and shape."""
+_COLUMNS = ("format_version", "method", "path_m", *_PER_PATCH)
+
+
+def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None:
+    """Write a map to a file, exactly that file (numpy would append ``.npz`` to a name without it).
+
+    Args:
+        surface_map: the map.
+        path: of the file; an older one is replaced.
+    """
+    columns: dict[str, NDArray[np.generic]] = {
+        "format_version": np.array(FORMAT_VERSION),
+        "method": np.array(surface_map.method),
+        "path_m": surface_map.path,
+    }
+    for name, (field, shape) in _PER_PATCH.items():
+        column = np.full((len(surface_map), *shape), np.nan)
+        for i, patch in enumerate(surface_map.patches):
+            value = np.asarray(getattr(patch, field), np.float64)
+            column[(i, slice(len(value))) if value.ndim else i] = value
+        columns[name] = column
+    write_npz(Path(path), columns)
+
+
+def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
+    """Read a map that `save_surface_map` or ``canprobe run`` has written.
+
+    Args:
+        path: of the file, or of the folder of a run.
+
+    Raises:
+        UsageError: no such file, not a surface map, another version, or a column that is missing, unknown or wrong;
+            the message names the file and the column.
+    """
+    file = Path(path)
+    if file.is_dir():
+        file = file / "surface.npz"
+    if not file.exists():
+        raise UsageError(f"{file}: no such file; a run writes surface.npz where its scene asks for a shape")
+    columns = read_npz(file, "an npz file with a surface map")
+    if (version := columns.get("format_version")) is None:
+        raise UsageError(f"{file}: expected a surface map, got a file without 'format_version'")
+    if version.shape != () or version != FORMAT_VERSION:
+        raise UsageError(
+            f"{file}: expected format_version {FORMAT_VERSION}, got {version}; write it again with this canprobe"
+        )
+    if missing := [name for name in _COLUMNS if name not in columns]:
+        raise UsageError(f"{file}: missing {', '.join(missing)}")
+    if unknown := [name for name in columns if name not in _COLUMNS]:
+        raise UsageError(f"{file}: unknown {', '.join(unknown)}; expected {', '.join(_COLUMNS)}")
+    method = columns.pop("method")
+    if method.dtype.kind != "U" or method.shape != ():
+        raise UsageError(f"{file}: method: expected a name, got {method.dtype} of shape {method.shape}")
+    _check(file, columns)
+    return _build(file, columns, str(method))
+
+
+def _check(file: Path, columns: dict[str, NDArray[np.generic]]) -> None:
+    rows = len(columns["t_s"]) if columns["t_s"].ndim else 0
+    wanted = {name: (rows, *shape) for name, (_, shape) in _PER_PATCH.items()}
+    wanted["path_m"] = (len(columns["path_m"]) if columns["path_m"].ndim else 0, 3)
+    for name, shape in wanted.items():
+        if columns[name].shape != shape or columns[name].dtype != np.float64:
+            raise UsageError(
+                f"{file}: {name}: expected float64 of shape {shape}, got {columns[name].dtype} of {columns[name].shape}"
+            )
+
+
+def _build(file: Path, columns: dict[str, NDArray[np.generic]], method: str) -> SurfaceMap:
+    values = {name: column.astype(np.float64) for name, column in columns.items() if name != "format_version"}
+    patches: list[LocalPatch] = []
+    try:
+        for i in range(len(values["t_s"])):
+            patches.append(_patch({field: values[name][i] for name, (field, _) in _PER_PATCH.items()}))
+        return SurfaceMap(patches=tuple(patches), path=values["path_m"], method=method)
+    except UsageError as error:
+        raise UsageError(f"{file}: patch {len(patches)}: {error}") from error
+
+
+def _patch(row: dict[str, Array]) -> LocalPatch:
+    combinations = row["combinations"]
+    return LocalPatch(
+        T_base_contact=row["T_base_contact"],
+        S=row["S"],
+        K_covariance=row["K_covariance"],
+        S_covariance=row["S_covariance"],
+        pose_known=bool(row["pose_known"]),
+        observed=row["observed"],
+        combinations=combinations[np.isfinite(combinations).all(axis=1)],
+        t_s=float(row["t_s"]),
+        travelled_m=float(row["travelled_m"]),
+        distance_m=float(row["distance_m"]),
+        innovation=float(row["innovation"]),
+    )

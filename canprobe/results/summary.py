@@ -1,0 +1,544 @@
+"""What a run leaves behind: the summary, the log, the scene as resolved, its traffic beside the plan."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.disk import read_candump, write_npz, write_text
+from canprobe.bus.port import ERR_FLAG, is_bus_error
+from canprobe.cell.cell import Cell
+from canprobe.errors import UsageError
+from canprobe.planning.make import make_plan
+from canprobe.planning.measured import MeasuredTraffic, TrafficMeter
+from canprobe.planning.model import Plan
+from canprobe.results.files import save_surface_map
+from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
+from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
+from canprobe.scene.load import dump_scene
+from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
+from canprobe.session.session import LOCKSTEP, Session
+from canprobe.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.tasks.touch import losses_text, summarise_losses
+from canprobe.touch.consistency import Consistency
+from canprobe.touch.surface_map import SurfaceMap
+
+if TYPE_CHECKING:
+    import pandas
+
+
+# A recorded bus set beside the plan of its scene.
+
+LOG = "bus.log"
+
+
+def measure_traffic(
+    log: Path | str, scene: Scene | Plan, *, channel: str | None = None, exact: bool = True
+) -> MeasuredTraffic:
+    """Count what was on a bus and set it beside the plan, message by message.
+
+    Args:
+        log: a candump log, or the folder of a run.
+        scene: the scene that ran, or its plan.
+        channel: of the log; by default that of the scene's first bus, or the only one in the log.
+        exact: count stuff bits too, which takes a few µs a frame.
+
+    Returns:
+        Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
+        that the plan does not list.
+
+    Raises:
+        UsageError: the log cannot be read, has no SYNC on this channel, or several channels and none was named.
+        PlanError: the scene does not fit its bus.
+    """
+    path = Path(log) / LOG if Path(log).is_dir() else Path(log)
+    plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
+    meters: dict[str, TrafficMeter] = {}
+    syncs: Counter[str] = Counter()
+    for t_ns, name, can_id, data in read_candump(path):
+        meter = meters.get(name)
+        if meter is None:
+            meter = meters[name] = TrafficMeter(plan, name, exact)
+        if can_id & ERR_FLAG:
+            meter.error_frames += is_bus_error(can_id)
+        else:
+            meter.write(can_id, data, t_ns)
+            syncs[name] += can_id == 0x080
+    return _chosen(path, meters, syncs, plan, channel).report()
+
+
+def _chosen(
+    path: Path, meters: dict[str, TrafficMeter], syncs: Counter[str], plan: Plan, channel: str | None
+) -> TrafficMeter:
+    with_sync = [name for name in meters if syncs[name]]
+    wanted = plan.buses[0].channel if channel is None else channel
+    if wanted in with_sync:
+        return meters[wanted]
+    if channel is None and len(with_sync) == 1:
+        return meters[with_sync[0]]
+    if not with_sync:
+        raise UsageError(f"{path}: no SYNC (080h) on any channel; expected the log of a cell that ran")
+    raise UsageError(
+        f"{path}: no SYNC (080h) on channel {wanted}; name one that has it: {', '.join(sorted(with_sync))}"
+    )
+
+
+# What a run leaves behind: the summary, the log, the scene as resolved.
+
+Array = NDArray[np.float64]
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """One finished run.
+
+    That of :func:`canprobe.open_cell` is there when a controller has ended, and complete when the block is left: until
+    then the drives are not disabled, the bus is not closed, and nothing may be asked of it.
+
+    Attributes:
+        plan: what was planned.
+        summary: the content of ``summary.json``.
+        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+            and in the estimates counts from the instant that is 0 in ``bus.log``.
+        truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
+        estimates: what each estimator said, by name; the online one first.
+        taxels: (16, 16) counts of the task's last tactile frame, or None.
+        surface_map: the local patches of the online estimator, or None where no shape was felt.
+        consistency: the tests at its crossings, or None.
+        out: the folder with the files, or None.
+    """
+
+    plan: Plan
+    summary: dict[str, Any]
+    log: dict[str, Array]
+    truth: dict[str, Array]
+    estimates: dict[str, list[ShapeRecord]] = field(default_factory=dict)
+    taxels: NDArray[np.uint8] | None = None
+    surface_map: SurfaceMap | None = None
+    consistency: Consistency | None = None
+    out: Path | None = None
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Only what is not there is asked for here: before the run is finished, everything."""
+            if name not in RunResult.__slots__:
+                raise AttributeError(f"RunResult has no attribute {name!r}")
+            raise UsageError(
+                f"result.{name}: complete when the block of open_cell is left; ask for it behind the block"
+            )
+
+    def text(self) -> str:
+        """The summary for people."""
+        return summary_text(self.summary, self.out)
+
+    def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
+        """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
+
+        Args:
+            what: `log` (a row a cycle), `truth` (a row a SYNC), or `estimates` (a row an answer of the estimator in
+                the loop; see `estimates` for the others).
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.results.files import to_frame
+
+        return to_frame(self._columns(what), self._attrs)
+
+    def to_parquet(self, path: Path | str, what: Literal["log", "truth", "estimates"] = "log") -> None:
+        """Write the same table as Parquet; `canprobe.load_table` reads it.
+
+        Raises:
+            UsageError: the extra `data` is missing.
+        """
+        from canprobe.results.files import write_parquet
+
+        write_parquet(self._columns(what), path, self._attrs)
+
+    @property
+    def _attrs(self) -> dict[str, Any]:
+        return {name: self.summary[name] for name in ("scene", "bus", "seed")}
+
+    def _columns(self, what: str) -> dict[str, Array]:
+        if what == "estimates":
+            from canprobe.results.scores import estimate_columns
+
+            return estimate_columns(next(iter(self.estimates.values()), []))
+        if what not in ("log", "truth"):
+            raise UsageError(f"to_pandas: expected log, truth or estimates, got {what!r}")
+        return self.log if what == "log" else self.truth
+
+
+def summarise(
+    session: Session,
+    controller: object,
+    estimates: dict[str, list[ShapeRecord]],
+    stop_reason: str | None,
+    *,
+    map_summary: dict[str, Any] | None = None,
+    bridges: dict[str, dict[str, Any]] | None = None,
+) -> dict[str, Any]:
+    """The content of ``summary.json``; what does not apply is None."""
+    scene, cell = session.scene, session.cell
+    cycle = cell.cycle
+    sim_time = cycle.t_ns * 1e-9 if cycle is not None else 0.0
+    wall = session.wall_ns * 1e-9
+    log = cell.log.arrays()
+    summary = {
+        "schema": SCHEMA,
+        "scene": scene.name,
+        "bus": scene.bus.interface,
+        "seed": scene.seed,
+        "completed": stop_reason is None,
+        "stop_reason": stop_reason,
+        "sim_time_s": sim_time,
+        "wall_time_s": wall,
+        "realtime_factor": sim_time / wall if wall > 0 else None,
+        "contact": _contact(session, controller, log),
+        "shape": summarise_shape(
+            scene,
+            getattr(controller, "shape", None),
+            estimates,
+            _truth(session),
+            log.get("t_s", np.empty(0)),
+            map_summary=map_summary,
+        ),
+        "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
+        "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
+        "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
+        "bus_load": {
+            bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
+            for bus in session.plan.buses
+        },
+        "traffic": _traffic(session),
+        "left_out": [f"{what}: {why}" for what, why in (*session.plan.left_out, *session.plan.not_available)],
+        "warnings": list(session.plan.warnings),
+        "bridges": bridges,
+        "faults": [*cell.faults, *(session.observers.faults if session.observers is not None else ())],
+    }
+    return {name: _without_nan(value) for name, value in summary.items()}
+
+
+def log_columns(cell: Cell) -> dict[str, Array]:
+    """The columns of ``log.npz``, on the run's clock; a run that was stopped before its first cycle has no row."""
+    log = {"t_s": np.empty(0), **cell.log.arrays()}
+    return {**log, "t_s": log["t_s"] + cell.start_ns * 1e-9}
+
+
+def check_clock(file: Path, log: Mapping[str, Array]) -> None:
+    """Refuse the log of an earlier canprobe, whose times counted from the first SYNC: no cycle is due at 0.
+
+    Raises:
+        UsageError: it is such a log.
+    """
+    if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
+        raise UsageError(
+            f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
+            " wrote them; run the scene again"
+        )
+
+
+def _without_nan(value: Any) -> Any:
+    """The same for JSON: what is not finite does not apply."""
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_without_nan(part) for part in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def _traffic(session: Session) -> dict[str, Any]:
+    """What was on each bus beside the plan; on a real one counted afterwards, from the log.
+
+    Where there is no log, or it ended before the first SYNC, only the bus errors are known.
+    """
+    if session.meters:
+        return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
+    plan = session.plan
+    with contextlib.suppress(UsageError):
+        if session.out is not None:
+            log = session.out / LOG
+            return {b.channel: measure_traffic(log, plan, channel=b.channel, exact=False).as_dict() for b in plan.buses}
+    errors = {channel: counter.error_frames for channel, counter in session.traffic.items()}
+    return {channel: {"as_planned": None if n == 0 else False, "error_frames": n} for channel, n in errors.items()}
+
+
+def _truth(session: Session) -> dict[str, Array]:
+    """The plant's truth; empty where nothing was emulated, or nothing happened."""
+    return session.truth if "force" in session.truth else {}
+
+
+def _scan(controller: object) -> tuple[int, int] | None:
+    cycles = getattr(controller, "scan_cycles", None)
+    return cycles if cycles is not None and cycles[1] > cycles[0] else None
+
+
+def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
+    task, scan = session.scene.task, _scan(controller) if session.keeps_all else None
+    names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
+    target = task.force_n if task.kind in ("scan", "press") else None
+    figures: dict[str, float | None] = dict.fromkeys(names)
+    measured: float | None = None
+    if scan is not None:
+        measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
+        if truth := _truth(session):
+            figures = score_contact(truth, *scan, task.force_n)
+            if task.kind != "scan":
+                figures["speed_mean_m_s"] = None
+        else:
+            figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
+    return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
+        "losses": summarise_losses(getattr(controller, "losses", ()))
+    }
+
+
+def _rms_error(values: Array, target: float) -> float | None:
+    """RMS error over the cycles that have a value: one in which the cell held has none."""
+    told = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((told - target) ** 2))) if len(told) else None
+
+
+def summarise_shape(
+    scene: Scene,
+    tracker: ShapeTracker | None,
+    estimates: dict[str, list[ShapeRecord]],
+    truth: Mapping[str, Array],
+    sync_times: Array,
+    *,
+    map_summary: dict[str, Any] | None = None,
+) -> dict[str, Any]:
+    """The section ``shape`` of ``summary.json``; the first of the estimates is the one that is summed up.
+
+    Args:
+        scene: of the run.
+        tracker: its contacts; None without a shape.
+        estimates: what each estimator said, by name.
+        truth: columns of the plant's truth, one row a SYNC; empty where there is none.
+        sync_times: time of each SYNC (n,), s, on the clock of the estimates.
+        map_summary: of the scan's surface map.
+    """
+    names = (
+        *("method", "kappa_true_per_m", "kappa_est_per_m", "kappa_rms_error_per_m", "kappa_rms_error_percent"),
+        *("normal_rms_deg", "position_rms_mm", "observed", "patch_fraction", "cramer_rao_ratio"),
+    )
+    shape: dict[str, Any] = dict.fromkeys(names)
+    if not estimates:
+        return shape
+    method = next(iter(estimates))
+    records = estimates[method]
+    shape["method"] = method
+    if map_summary is not None:
+        shape["map"] = map_summary
+    if records:
+        shape["observed"] = [bool(o) for o in records[-1].estimate.observed]
+        shape["kappa_est_per_m"] = finite_or_none(records[-1].estimate.kappa)
+    if not truth:
+        return shape
+    scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
+    score = scores[method]
+    shape |= {
+        "kappa_true_per_m": score.kappa_true,
+        "kappa_est_per_m": score.kappa_est or shape["kappa_est_per_m"],
+        "kappa_rms_error_per_m": score.kappa_rms,
+        "kappa_rms_error_percent": score.kappa_rms_percent,
+        "normal_rms_deg": score.normal_rms_deg,
+        "position_rms_mm": score.position_rms_mm,
+        "patch_fraction": score.patch_fraction,
+        "cramer_rao_ratio": _bound_ratio(scene, tracker, score, truth, sync_times),
+        "methods": {
+            name: {
+                "kappa_rms_error_per_m": s.kappa_rms,
+                "kappa_rms_error_percent": s.kappa_rms_percent,
+                "normal_rms_deg": s.normal_rms_deg,
+                "position_rms_mm": s.position_rms_mm,
+                "estimates": s.estimates,
+                "observed_fraction": s.observed_fraction,
+                "patch_fraction": s.patch_fraction,
+            }
+            for name, s in scores.items()
+        },
+    }
+    return shape
+
+
+def _bound_ratio(
+    scene: Scene, tracker: ShapeTracker | None, score: ShapeScore, truth: Mapping[str, Array], sync_times: Array
+) -> float | None:
+    """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
+
+    None where the contact patch helped most answers: the bound is that of points and normals.
+    """
+    from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, SIGMA_POINT_M, centroid_coupling
+
+    shape = scene.shape
+    if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
+        return None
+    bound = bound_of_scan(
+        tracker.samples,
+        truth,
+        sync_times,
+        memory_m=shape.memory_mm * 1e-3,
+        sigma_point=SIGMA_POINT_M,
+        sigma_normal=SIGMA_NORMAL_RAD,
+        coupling=centroid_coupling(resolve(scene).probe),
+    )
+    return None if bound is None else score.kappa_rms / bound
+
+
+def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
+    """Floats for JSON: what is not finite was not observed, and is None."""
+    return [float(v) if np.isfinite(v) else None for v in values]
+
+
+def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
+    cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
+    statistics = cycle.statistics if cycle is not None else None
+    assembler = tactile.assembler if tactile is not None else None
+    return {
+        "rate_hz": cycle.number / (cycle.t_ns * 1e-9) if cycle is not None and cycle.t_ns > 0 else None,
+        "cycles": cycle.number + 1 if cycle is not None else 0,
+        "overruns": statistics.overruns if statistics is not None else 0,
+        "missed_pdos": drives.missed if drives is not None else 0,
+        "late_pdos": drives.late if drives is not None else 0,
+        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans if assembler is not None else 0,
+        "stale_frames": tactile.stale if tactile is not None else 0,
+        "unplaced_contacts": getattr(controller, "unplaced", 0),
+        "slowed_cycles": getattr(controller, "slowed", 0),
+        "dropped_frames": cell.counters.overruns,
+        "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
+        "response_us": _percentiles(statistics.response_ns if statistics is not None else []),
+        "compute_us": _percentiles(statistics.compute_ns if statistics is not None else []),
+    }
+
+
+def _observed(session: Session) -> dict[str, float | None] | None:
+    """What observers and bridges added to a cycle, after its work; None without any."""
+    return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
+
+
+def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
+    if not values_ns:
+        return dict.fromkeys(("p50", "p99", "p999", "max"))
+    us = np.asarray(values_ns) / 1000
+    p50, p99, p999 = np.percentile(us, (50, 99, 99.9)).tolist()
+    return {"p50": p50, "p99": p99, "p999": p999, "max": float(us.max())}
+
+
+def write_files(result: RunResult, out: Path) -> None:
+    """Write what a run leaves in ``out``, besides the files that are there already and the figures.
+
+    Raises:
+        ResultsError: one cannot be written; no part of it is left.
+    """
+    write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
+    write_text(out / "scene.toml", dump_scene(result.plan.scene))
+    write_npz(out / "log.npz", result.log)
+    if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
+        write_text(out / FILE, text)
+    if result.surface_map is not None:
+        save_surface_map(result.surface_map, out / "surface.npz")
+
+
+def _figure(value: float | None, unit: str, digits: int = 2) -> str:
+    return "not observed" if value is None else f"{value:.{digits}f} {unit}".rstrip()
+
+
+def summary_text(summary: dict[str, Any], out: Path | None) -> str:
+    """A summary as lines for people."""
+    contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
+    pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] == LOCKSTEP else "real time"
+    rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
+    lines = [
+        f"{summary['scene']} on {summary['bus']}, seed {summary['seed']}: "
+        + ("done" if summary["completed"] else f"stopped: {summary['stop_reason']}"),
+        f"  time       {summary['sim_time_s']:.2f} s in {summary['wall_time_s']:.2f} s ({pace})",
+        f"  cycle      {rate}, {cycle['overruns']} overruns,"
+        f" {cycle['missed_pdos']} missed PDOs, {cycle['torn_frames']} torn frames",
+    ]
+    lines += [f"  plan       {choice}" for choice in summary.get("choices", ())]
+    if contact["force_rms_error_n"] is not None:
+        target = contact["force_target_n"]
+        lines.append(
+            f"  force      target {target:g} N, RMS error {contact['force_rms_error_n']:.3f} N"
+            f" ({100 * contact['force_rms_error_n'] / target:.1f} %), highest {contact['force_max_n']:.2f} N"
+        )
+    if contact["speed_mean_m_s"] is not None:
+        lines.append(
+            f"  contact    {100 * contact['contact_fraction']:.1f} % of the scan at"
+            f" {contact['speed_mean_m_s'] * 1e3:.2f} mm/s"
+        )
+    if contact["losses"]:
+        lines.append(f"  {losses_text(contact['losses'])}")
+    if shape["method"] is not None:
+        lines += shape_lines(shape)
+    if summary.get("calibration") is not None:
+        lines += calibration_lines(summary["calibration"])
+    lines += bridge_lines(summary.get("bridges") or {})
+    lines += [f"  noted      {fault}" for fault in summary["faults"]]
+    lines += [f"  warning    {warning}" for warning in summary.get("warnings", ())]
+    if out is not None:
+        lines.append(f"  files      {out}")
+    return "\n".join(lines)
+
+
+def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """What each bridge was given and lost, as lines for people."""
+    return [
+        f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
+        + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
+        for name, status in bridges.items()
+    ]
+
+
+def curvature_text(values: Sequence[float | None] | None) -> str:
+    """Principal curvatures as people read them, with their unit."""
+    if values is None:
+        return "–"
+    observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
+    if not observed:
+        return "not observed"
+    return f"{observed} 1/m" + (", the other one not observed" if None in values else "")
+
+
+def shape_lines(shape: dict[str, Any]) -> list[str]:
+    """The section ``shape`` of a summary as lines for people."""
+    estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
+    lines = [f"  curvature  {estimated}; true {true}"]
+    for name, score in shape.get("methods", {}).items():
+        if score["estimates"] == 0:
+            lines.append(f"    {name:<10} not scored: no estimate of both curvatures after the first 20 mm")
+            continue
+        percent = score["kappa_rms_error_percent"]
+        lines.append(
+            f"    {name:<10} RMS error {_figure(score['kappa_rms_error_per_m'], '1/m')}"
+            + (f" ({percent:.1f} %)" if percent is not None else "")
+            + f", normal {_figure(score['normal_rms_deg'], 'deg', 3)},"
+            f" position {_figure(score['position_rms_mm'], 'mm', 3)}"
+            + (f", with the patch in {100 * score['patch_fraction']:.0f} %" if score["patch_fraction"] else "")
+        )
+    if (surface := shape.get("map")) is not None:
+        lines.append(
+            f"  map        {surface['patches']} patches, {surface['crossings']} crossings" + _crossings(surface)
+        )
+    return lines
+
+
+def _crossings(surface: dict[str, Any]) -> str:
+    shares = (
+        f"{part} {100 * surface[part]['share_p_below_0.05']:.0f} %"
+        for part in ("curvature", "normal", "height")
+        if surface[part]["share_p_below_0.05"] is not None
+    )
+    text = ", ".join(shares)
+    return f"; p below 0.05 of {text}" if text else ""

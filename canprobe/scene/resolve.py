@@ -1,0 +1,223 @@
+"""Scene → setup: the only place where a scene's millimetres, degrees and defaults become SI."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from canprobe.errors import PlanError
+from canprobe.robot.kinematics import MODELS
+from canprobe.robot.tool_calibration import ball_approaches
+from canprobe.scene.geometry import T_base_object, T_flange_probe, scan_axes, true_object
+from canprobe.scene.model import (
+    ArmSettings,
+    LimitSettings,
+    PlantSettings,
+    ProbeSettings,
+    Scene,
+    SensorSettings,
+    ServoSettings,
+    ShapeSettings,
+    TaskSettings,
+)
+from canprobe.scene.rules import need_scene
+from canprobe.scene.setup import (
+    Approach,
+    Arm,
+    Array,
+    Calibrate,
+    Drive,
+    Dynamics,
+    Floats,
+    Free,
+    Listen,
+    Probe,
+    SafetyLimits,
+    Scan,
+    Setup,
+    Shape,
+    Task,
+    Touch,
+    Truth,
+)
+from canprobe.touch.servo import SurfaceGains, make_strategy
+
+MM = 1e-3
+EFFECTS = ("noise", "gain_error", "blur", "hysteresis", "creep", "crosstalk", "saturation", "threshold")
+
+
+def resolve(scene: Scene) -> Setup:
+    """The setup of a scene.
+
+    Args:
+        scene: as `load_scene` gave it, or changed since.
+
+    Raises:
+        UsageError: this is no scene.
+        PlanError: the object that the scene describes is none.
+    """
+    need_scene(scene)
+    arm = _arm(scene.arm) if scene.arm is not None else None
+    array = _array(scene.sensor) if scene.sensor is not None else None
+    settings = scene.probe or ProbeSettings()
+    probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
+    return Setup(
+        scene=scene,
+        name=scene.name,
+        title=scene.title,
+        seed=scene.seed,
+        figures=scene.scene.figures,
+        bus=scene.bus,
+        rate_hz=scene.cycle.rate_hz,
+        realtime=scene.cycle.realtime,
+        compute_ns=round(scene.cycle.compute_us * 1000),
+        limits=_limits(scene.limits),
+        bring_up=scene.bring_up,
+        bridge=scene.bridge,
+        arm=arm,
+        array=array,
+        probe=probe,
+        kind=scene.task.kind,
+        task=_task(scene, arm, array, probe),
+        truth=_truth(scene, arm, probe),
+    )
+
+
+def _arm(settings: ArmSettings) -> Arm:
+    serials = settings.serial_numbers or (None,) * len(settings.node_ids)
+    nodes = zip(settings.node_ids, serials, strict=True)
+    return Arm(
+        model=MODELS[settings.model],
+        drives=tuple(Drive(node_id, settings.eds, settings.emulated, serial) for node_id, serial in nodes),
+        q_start=np.radians(settings.start_deg),
+        missed_syncs=settings.missed_syncs,
+        grouped=settings.grouped_rpdo,
+    )
+
+
+def _array(settings: SensorSettings) -> Array:
+    return Array(
+        node_id=settings.node_id,
+        channel=settings.channel,
+        eds=settings.eds,
+        emulated=settings.emulated,
+        serial=settings.serial_number,
+        mode=settings.mode,
+        window=settings.window,
+        rate_hz=settings.rate_hz,
+        full_scale=settings.full_scale_kpa * 1e3,
+    )
+
+
+def _limits(settings: LimitSettings) -> SafetyLimits:
+    low, high = settings.workspace_min_mm, settings.workspace_max_mm
+    bounded = low is not None or high is not None
+    return SafetyLimits(
+        force_max=settings.force_max_n,
+        preload_max=settings.preload_max_n,
+        joint_margin=math.radians(settings.joint_margin_deg),
+        speed_share=settings.joint_speed_share,
+        late_share=settings.late_cycles_max_percent / 100,
+        workspace=np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * MM if bounded else None,
+    )
+
+
+def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> Task:
+    """The task's setup; `canprobe.scene.rules` has seen to it that a scene has what its task needs."""
+    settings = scene.task
+    if settings.kind == "free":
+        assert arm is not None
+        return Free(arm, np.radians(settings.swing_deg), settings.swing_period_s, settings.duration_s)
+    assert array is not None
+    if settings.kind == "listen":
+        return Listen(array, probe, settings.duration_s)
+    assert arm is not None
+    approach = Approach(
+        start=np.array(settings.start_mm) * MM,
+        axes=scan_axes(settings),
+        speed=settings.approach_mm_s * MM,
+        clearance=settings.clearance_mm * MM,
+        search=settings.search_mm * MM,
+    )
+    servo = scene.servo or ServoSettings()
+    if settings.kind == "calibrate":
+        radius = settings.ball_radius_mm * MM
+        tilt, beside = math.radians(settings.tilt_deg), math.radians(settings.beside_deg)
+        return Calibrate(
+            arm=arm,
+            array=array,
+            probe=probe,
+            approach=approach,
+            force=settings.force_n,
+            duration_s=settings.duration_s,
+            lag_s=servo.drive_lag_ms * 1e-3,
+            ball_centre=approach.start - radius * approach.normal,  # its top is expected at the start
+            ball_radius=radius,
+            ball_sigma=settings.ball_sigma_mm * MM,
+            approaches=ball_approaches(settings.touches, tilt, beside, approach.normal),
+        )
+    return Touch(
+        arm=arm,
+        array=array,
+        probe=probe,
+        approach=approach,
+        force=settings.force_n,
+        duration_s=settings.duration_s,
+        lag_s=servo.drive_lag_ms * 1e-3,
+        gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
+        scan=_scan(settings) if settings.kind == "scan" else None,
+        shape=_shape(scene.shape) if settings.kind == "scan" and scene.shape is not None else None,
+    )
+
+
+def _scan(settings: TaskSettings) -> Scan:
+    sizes = (settings.length_mm * MM, settings.width_mm * MM, settings.wavelength_mm * MM)
+    return Scan(
+        strategy=make_strategy(settings.strategy, *sizes),
+        name=settings.strategy,
+        speed=settings.speed_mm_s * MM,
+        rolling_share=settings.rolling_share,
+        regain=settings.regain_mm * MM,
+    )
+
+
+def _shape(settings: ShapeSettings) -> Shape:
+    return Shape(settings.method, settings.also, settings.memory_mm * MM, settings.every_ms * 1e-3, settings.patch)
+
+
+def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
+    plant = scene.plant or PlantSettings()
+    try:
+        shape = true_object(scene.object) if scene.object is not None else None
+    except ValueError as error:
+        raise PlanError([f"object: {error}"]) from error
+    model = MODELS[plant.arm_model] if plant.arm_model is not None else arm.model if arm is not None else None
+    return Truth(
+        object=shape,
+        T_base_object=T_base_object(scene.object) if scene.object is not None else None,
+        model=model if arm is not None else None,
+        T_flange_probe=_displaced(probe.T_flange_probe, np.array(plant.tool_error_mm) * MM),
+        stiffness=plant.stiffness_n_m3 or probe.stiffness,
+        damping=plant.contact_damping_s_m,
+        bandwidth_hz=plant.drive_bandwidth_hz,
+        fidelity=plant.fidelity,
+        dynamics=Dynamics(
+            payload=probe.mass,
+            friction=plant.friction,
+            integral_s=plant.integral_ms * 1e-3,
+            velocity_feed_forward=plant.velocity_feed_forward,
+            torque_limit_permille=plant.torque_limit_permille,
+            integrator=plant.integrator,
+            step_ns=round(plant.step_us * 1000),
+        ),
+        without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
+        adc_bits=plant.adc_bits,
+    )
+
+
+def _displaced(T: Floats, by: Floats) -> Floats:
+    """A frame moved by a vector of the frame that it is expressed in."""
+    moved = T.copy()
+    moved[:3, 3] += by
+    return moved

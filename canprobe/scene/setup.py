@@ -1,0 +1,413 @@
+"""The setup of a cell: a scene in SI units, whole, with exactly what its task needs.
+
+`canprobe.scene.resolve.resolve` makes it from a `Scene`, the user's words and units; behind it nobody reads a
+millimetre or a degree. Planning, cell, tasks and emulator read a `Setup`, or the `Plan` that carries one. Hardware
+stands beside the task because planning, bring-up and emulator do not ask what is done; a task holds the same objects
+again, so that it has no optional part (`setup.task.arm is setup.arm`). What a scene leaves to the plan says "auto"
+until `make_plan` has closed it.
+
+Lengths are in m, angles in rad, forces in N, pressures in Pa, times in s unless a name says otherwise. Sections of a
+scene whose values are SI already (`[bus]`, `[bring_up]`, `[bridge]`) are taken over as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.robot.kinematics import PumaModel
+from canprobe.robot.tool_calibration import BallApproach
+from canprobe.scene.model import (
+    Auto,
+    BridgeSettings,
+    BringUpSettings,
+    BusSettings,
+    Scene,
+    ShapeMethod,
+    TactileModeName,
+    TaskKind,
+)
+from canprobe.touch.servo import Strategy, SurfaceGains
+from canprobe.touch.shapes import PlacedShape
+
+Floats = NDArray[np.float64]
+Bus = BusSettings
+BringUp = BringUpSettings
+Bridges = BridgeSettings
+ArrayMode = TactileModeName
+Fidelity = Literal["ideal", "dynamic"]
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """One joint drive.
+
+    Attributes:
+        node_id: 1–126.
+        eds: name or path of its EDS.
+        emulated: served by the emulator.
+        serial: what 1018h:04 must answer; None: anything.
+    """
+
+    node_id: int
+    eds: str
+    emulated: bool
+    serial: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Arm:
+    """The arm: its chain, and a drive for each of its n joints.
+
+    Attributes:
+        model: geometry, limits and motor counts.
+        drives: one a joint, from the base.
+        q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
+        missed_syncs: SYNC periods without a sign of life after which drive and master take each other for dead.
+        grouped: two targets share an RPDO through dummy mapping.
+    """
+
+    model: PumaModel
+    drives: tuple[Drive, ...]
+    q_start: Floats
+    missed_syncs: int
+    grouped: bool | Auto
+
+    @property
+    def node_ids(self) -> tuple[int, ...]:
+        """Of the drives, joint by joint."""
+        return tuple(drive.node_id for drive in self.drives)
+
+
+@dataclass(frozen=True, slots=True)
+class Array:
+    """The tactile array.
+
+    Attributes:
+        node_id: 1–126.
+        channel: of its bus; None: the arm's.
+        eds: name or path of its EDS.
+        emulated: served by the emulator.
+        serial: what 1018h:04 must answer; None: anything.
+        mode: what it sends.
+        window: taxels along the window that follows the contact.
+        rate_hz: of its frames.
+        full_scale: pressure of a full count, Pa.
+    """
+
+    node_id: int
+    channel: str | None
+    eds: str
+    emulated: bool
+    serial: int | None
+    mode: ArrayMode
+    window: int | Auto
+    rate_hz: float
+    full_scale: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Probe:
+    """The sphere that carries the array, with its elastic layer.
+
+    Attributes:
+        T_flange_probe: (4, 4) of its centre on the flange; z is the pole.
+        radius: m.
+        stiffness: K/h of the layer, N/m³.
+        mass: kg.
+    """
+
+    T_flange_probe: Floats
+    radius: float
+    stiffness: float
+    mass: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SafetyLimits:
+    """Where the cell is stopped.
+
+    Attributes:
+        force_max: N.
+        preload_max: N before the run, which the array's tare takes for zero.
+        joint_margin: kept from every joint stop, rad.
+        speed_share: of the joints' speed limits.
+        late_share: of the last second's cycles, late by half a period.
+        workspace: box (2, 3) of the probe's tip in base, m; an open side is infinite; None without any.
+    """
+
+    force_max: float
+    preload_max: float
+    joint_margin: float
+    speed_share: float
+    late_share: float
+    workspace: Floats | None
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """The surface estimator.
+
+    Attributes:
+        method: in the loop.
+        also: methods on the same data afterwards.
+        memory: of path, m, whatever the time.
+        every_s: between two answers; every sample is taken in.
+        patch: complete what the path leaves open by the second moments of the images.
+    """
+
+    method: ShapeMethod
+    also: tuple[ShapeMethod, ...]
+    memory: float
+    every_s: float
+    patch: bool
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Approach:
+    """The way to the first contact.
+
+    Attributes:
+        start: expected contact point (3,), base frame, approached along −normal.
+        axes: (3, 3) rows heading, across, approach normal (outward); base frame, right-handed.
+        speed: m/s.
+        clearance: of the probe's surface from `start` before it, m.
+        search: beyond `start` where it gives up, m.
+    """
+
+    start: Floats
+    axes: Floats
+    speed: float
+    clearance: float
+    search: float
+
+    @property
+    def normal(self) -> Floats:
+        """Outward unit normal that it expects, (3,)."""
+        normal: Floats = self.axes[2]
+        return normal
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """The path of a scan.
+
+    Attributes:
+        strategy: closed curve in the scan plane.
+        name: of the strategy.
+        speed: of the contact, m/s.
+        rolling_share: 0: the pad follows the normal, 1: it keeps its orientation.
+        regain: towards the object where contact is lost, m; 0: give up.
+    """
+
+    strategy: Strategy
+    name: str
+    speed: float
+    rolling_share: float
+    regain: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touch:
+    """Approach, touch, and follow the surface; without a scan hold the force.
+
+    Attributes:
+        force: target, N.
+        duration_s: of the scan, or of the hold.
+        lag_s: of the drives behind a ramp.
+        gains: of the servo's surface.
+        shape: the estimator; None where no shape is estimated.
+    """
+
+    arm: Arm
+    array: Array
+    probe: Probe
+    approach: Approach
+    force: float
+    duration_s: float
+    lag_s: float
+    gains: SurfaceGains
+    scan: Scan | None
+    shape: Shape | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Calibrate:
+    """Touch a ball of known radius from several sides to find the probe's centre on the flange.
+
+    Attributes:
+        force: of each touch, N.
+        duration_s: the scene's; what the plan reckons with.
+        lag_s: of the drives behind a ramp.
+        ball_centre: expected (3,), base frame.
+        ball_radius: m.
+        ball_sigma: of the expected centre per axis, m.
+        approaches: the touches in their order.
+    """
+
+    arm: Arm
+    array: Array
+    probe: Probe
+    approach: Approach
+    force: float
+    duration_s: float
+    lag_s: float
+    ball_centre: Floats
+    ball_radius: float
+    ball_sigma: float
+    approaches: Sequence[BallApproach]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Listen:
+    """Read the array only."""
+
+    array: Array
+    probe: Probe
+    duration_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Free:
+    """Swing the joints about `arm.q_start` without a sensor.
+
+    Attributes:
+        swing: amplitude of each joint (n,), rad.
+        period_s: of the swing.
+    """
+
+    arm: Arm
+    swing: Floats
+    period_s: float
+    duration_s: float
+
+
+Task = Touch | Calibrate | Listen | Free
+
+
+@dataclass(frozen=True, slots=True)
+class Dynamics:
+    """A dynamic arm beyond its geometry.
+
+    Attributes:
+        payload: mass of the probe, kg.
+        friction: Coulomb coefficient between probe and object.
+        integral_s: reset time of the velocity loops; 0: none.
+        velocity_feed_forward: share of the reference's speed that the drives add.
+        torque_limit_permille: of the continuous torque.
+        integrator: a key of the plant's integrators.
+        step_ns: its longest step.
+        hold_ns: how long mass matrix, bias and contact geometry are held.
+    """
+
+    payload: float = 0.3
+    friction: float = 0.3
+    integral_s: float = 0.02
+    velocity_feed_forward: float = 0.0
+    torque_limit_permille: int = 2000
+    integrator: str = "rosenbrock"
+    step_ns: int = 625_000
+    hold_ns: int = 2_500_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Truth:
+    """What is really there: for the emulator, the check of the motion and the scores. The controller never sees it.
+
+    Attributes:
+        object: None where nothing can be touched.
+        T_base_object: (4, 4) of the object's frame; None without an object.
+        model: the arm; None without one.
+        T_flange_probe: (4, 4) of the probe's centre.
+        stiffness: K/h of its layer, N/m³.
+        damping: Hunt–Crossley α, s/m.
+        bandwidth_hz: −3 dB of every drive.
+        fidelity: of the plant.
+        dynamics: of a dynamic arm.
+        without: effects of the array that are switched off.
+        adc_bits: of the array.
+    """
+
+    object: PlacedShape | None
+    T_base_object: Floats | None
+    model: PumaModel | None
+    T_flange_probe: Floats
+    stiffness: float
+    damping: float
+    bandwidth_hz: float
+    fidelity: Fidelity
+    dynamics: Dynamics
+    without: tuple[str, ...]
+    adc_bits: int
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Setup:
+    """One experiment, whole.
+
+    Attributes:
+        scene: the user's words, for who writes, sends or changes them. Nobody who plans, drives or emulates reads it.
+        name, title, seed: of the scene.
+        figures: whether its run is drawn.
+        bus: interface, channel, bit rates and what a lockstep bus is like.
+        rate_hz: of SYNC and servo.
+        realtime: SCHED_FIFO, a processor of its own, locked memory, on a real interface.
+        compute_ns: that the plan leaves to the controller in each cycle.
+        kind: of the task, as scenes say it.
+        truth: what is really there.
+    """
+
+    scene: Scene
+    name: str
+    title: str
+    seed: int
+    figures: bool
+    bus: Bus
+    rate_hz: float
+    realtime: bool
+    compute_ns: int
+    limits: SafetyLimits
+    bring_up: BringUp
+    bridge: Bridges | None
+    arm: Arm | None
+    array: Array | None
+    probe: Probe
+    kind: TaskKind
+    task: Task
+    truth: Truth
+
+    @property
+    def touch(self) -> Touch | Calibrate | None:
+        """The task, where it touches an object."""
+        return self.task if isinstance(self.task, Touch | Calibrate) else None
+
+    @property
+    def shape(self) -> Shape | None:
+        """The estimator; None where no shape is estimated."""
+        return self.task.shape if isinstance(self.task, Touch) else None
+
+    @property
+    def emulated_node_ids(self) -> tuple[int, ...]:
+        """The nodes that are emulated, ascending."""
+        nodes = (*(self.arm.drives if self.arm is not None else ()), *((self.array,) if self.array is not None else ()))
+        return tuple(sorted(node.node_id for node in nodes if node.emulated))
+
+    def with_bus(self, **values: Any) -> Setup:
+        """With other values of the bus."""
+        return replace(self, bus=replace(self.bus, **values))
+
+    def with_arm(self, **values: Any) -> Setup:
+        """With other values of the arm, in the task too."""
+        assert self.arm is not None and not isinstance(self.task, Listen)
+        arm = replace(self.arm, **values)
+        return replace(self, arm=arm, task=replace(self.task, arm=arm))
+
+    def with_array(self, **values: Any) -> Setup:
+        """With other values of the array, in the task too."""
+        assert self.array is not None and not isinstance(self.task, Free)
+        array = replace(self.array, **values)
+        return replace(self, array=array, task=replace(self.task, array=array))

@@ -1,0 +1,1 @@
+"""The composition root: a cell with everything round it, the emulated nodes and bridges in their processes."""

@@ -1,0 +1,234 @@
+"""Emulated nodes on a real interface: those of a scene, or one from each EDS file."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import zip_longest
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.bus.disk import write_npz
+from canprobe.errors import NodeError, UsageError
+from canprobe.protocol.frames import UNCONFIGURED
+from canprobe.scene.model import Scene
+from canprobe.session.links import Expected, check_links
+from canprobe.session.session import Say, data_bitrate, quiet, rehearse, resolve_scene
+
+if TYPE_CHECKING:
+    from canprobe.bus.port import Port
+    from canprobe.emulator.node.slave_node import SlaveNode
+    from canprobe.emulator.serve import Participant
+
+
+def emulate(
+    scene: Scene,
+    *,
+    interface: str,
+    channel: str,
+    bitrate: int,
+    node_ids: tuple[int, ...],
+    seed: int | None = None,
+    truth_path: Path | None = None,
+    origin_ns: int | None = None,
+    store_folder: Path | None = None,
+    without_id: tuple[int, ...] = (),
+    say: Say = quiet,
+) -> None:
+    """Serve emulated nodes on a real interface until interrupted, for any master.
+
+    Args:
+        scene: whose nodes.
+        interface, channel, bitrate: of the bus.
+        node_ids: which nodes.
+        seed: in the place of the scene's.
+        truth_path: file for the plant's true values, written at the end.
+        origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
+        store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
+        without_id: which of the nodes start without a node id, for LSS to give them one.
+        say: called when the nodes are about to be served.
+
+    Raises:
+        UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+        OSError: `truth_path` or `store_folder` cannot be there; told before anything is served.
+    """
+    from canprobe.emulator.world import make_world
+    from canprobe.planning.make import make_plan
+    from canprobe.scene.resolve import resolve
+
+    split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
+    name = None if split else channel
+    resolved = resolve_scene(scene, interface=interface, channel=name, bitrate=bitrate, seed=seed)
+    plan = make_plan(resolve(resolved))
+    fast = data_bitrate(plan.scene.bus)
+    way_out = "end that node, or name others with --nodes"
+    busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
+    _make_places(truth_path, store_folder)
+    wanted = Expected(bitrate, fast)
+    with _free_port(interface, channel, wanted, busy, way_out=way_out, say=say) as port:
+        rehearse(plan)
+        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
+        if world.recorder is not None:
+            world.recorder.origin_ns = port.clock.now_ns() if origin_ns is None else origin_ns
+        _keep(world.nodes, store_folder)
+        try:
+            _serve(
+                world.participants,
+                world.nodes,
+                port,
+                say=say,
+                in_realtime=resolved.cycle.realtime,
+                cycles_kept=plan.cycles if truth_path is not None else 0,
+            )
+        finally:
+            if truth_path is not None and world.recorder is not None:
+                write_npz(truth_path, world.recorder.arrays())
+
+
+def emulate_eds(
+    files: Sequence[tuple[str | Path, int]],
+    *,
+    interface: str,
+    channel: str,
+    bitrate: int,
+    store_folder: Path | None = None,
+    serial_numbers: Sequence[int | None] = (),
+    in_realtime: bool = False,
+    say: Say = quiet,
+) -> None:
+    """Serve a node from each EDS file on a real interface until interrupted, for any master.
+
+    Args:
+        files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS to give it one.
+        interface, channel, bitrate: of the bus.
+        store_folder: as for :func:`emulate`.
+        serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
+        in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
+        say: called with what is odd about the files, and when the nodes are there.
+
+    Raises:
+        EdsError: a file cannot be served; one line a fault.
+        UsageError: a node id is given twice, two nodes without one are the same device, or a file of `store_folder` is
+            not of its node.
+        InterfaceError: no such interface.
+        NodeError: somebody on the bus has one of the node ids already.
+        OSError: `store_folder` cannot be there.
+    """
+    from canprobe.eds.packaged import check_eds
+    from canprobe.emulator.world import make_eds_node
+
+    node_ids = tuple(node_id for _, node_id in files if node_id != UNCONFIGURED)
+    if twice := sorted({node_id for node_id in node_ids if node_ids.count(node_id) > 1}):
+        raise UsageError(f"node id {twice[0]} is given to more than one EDS file")
+    nodes: list[SlaveNode] = []
+    for (name, node_id), serial in zip_longest(files, serial_numbers):
+        reading = check_eds(name, 1 if node_id == UNCONFIGURED else node_id)
+        od = reading.usable()
+        speaks_lss = node_id == UNCONFIGURED or od.device_information.LSS_supported
+        nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
+        if warnings := len(reading.warnings):
+            check = f"canprobe eds check {name} --node-id {od.node_id}"
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` tells them")
+    _check_addresses(nodes)
+    _make_places(None, store_folder)
+    wanted, way_out = Expected(bitrate, of_scene=False), "end that node, or give another --node-id"
+    with _free_port(interface, channel, wanted, node_ids, way_out=way_out, say=say) as port:
+        for node in nodes:
+            if node.lss is not None:
+                node.lss.bitrate = bitrate
+        _keep(nodes, store_folder)
+        _serve(nodes, nodes, port, say=say, in_realtime=in_realtime)
+
+
+def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
+    """Where the files will go: what cannot be written at the end is told at the beginning."""
+    if store_folder is not None:
+        store_folder.mkdir(parents=True, exist_ok=True)
+    if truth_path is not None:
+        truth_path.parent.mkdir(parents=True, exist_ok=True)
+        if truth_path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(truth_path))
+
+
+@contextlib.contextmanager
+def _free_port(
+    interface: str, channel: str, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
+) -> Iterator[Port]:
+    """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
+    from canprobe.bus.interfaces import open_port
+    from canprobe.bus.network import answering_nodes
+    from canprobe.bus.port import MonotonicClock, Reports
+
+    check_links(interface, {channel: wanted}, say)
+    port = open_port(
+        interface,
+        channel,
+        wanted.bitrate,
+        MonotonicClock(),
+        data_bitrate=wanted.data_bitrate,
+        waits=True,
+        reports=Reports(say=say),
+    )
+    try:
+        if busy := answering_nodes(port, node_ids, 0.1):
+            raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")
+        yield port
+    finally:
+        port.close()
+
+
+def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
+    """Nodes without an id can only be told apart by their LSS addresses."""
+    addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
+    for address in addresses:
+        if addresses.count(address) > 1:
+            raise UsageError(f"two nodes without an id are the device {address}: give each its --serial")
+
+
+def _serve(
+    participants: Sequence[Participant],
+    nodes: Sequence[SlaveNode],
+    port: Port,
+    *,
+    say: Say,
+    in_realtime: bool,
+    cycles_kept: int = 0,
+) -> None:
+    from canprobe.bus.scheduling import DEVICE_PRIORITY, ask_for_processor, realtime, reserve_memory
+    from canprobe.emulator.serve import serve
+
+    reserve_memory(cycles_kept)
+    port.drain()  # what passed meanwhile
+    ask_for_processor()
+    favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
+    say(f"serving {_named(nodes)} on {port.channel}; Ctrl-C stops them")
+    with favour:
+        serve(participants, port, lambda: False)
+
+
+def _named(nodes: Sequence[SlaveNode]) -> str:
+    """Nodes by their ids, those without one by their LSS addresses."""
+    ids = sorted(node.node_id for node in nodes if node.node_id != UNCONFIGURED)
+    blank = [str(node.lss.address) for node in nodes if node.lss is not None and node.lss.unconfigured]
+    with_ids = [f"nodes {', '.join(map(str, ids))}"] if ids else []
+    return ", and ".join(with_ids + ([f"without an id {', '.join(blank)}"] if blank else []))
+
+
+def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
+    """Let each node keep what a master stores by 1010h in a file of its own."""
+    from canprobe.emulator.serve import keep_in_file
+
+    if folder is not None:
+        for node in nodes:
+            keep_in_file(node, folder / _file_name(node))
+
+
+def _file_name(node: SlaveNode) -> str:
+    """By node id; one that has none yet is told by its serial number."""
+    if node.node_id != UNCONFIGURED:
+        return f"node{node.node_id:03}.json"
+    return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

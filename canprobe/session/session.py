@@ -1,0 +1,528 @@
+"""A cell with everything round it: buses, recording, emulated nodes, and the way out of all of them.
+
+The composition root: the only place, besides studies and tests, that sees both sides of the bus.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.bus.disk import CandumpWriter, RecordingPort, write_npz, write_text
+from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
+from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
+from canprobe.cell.assembly import make_cell
+from canprobe.cell.cell import Cell
+from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.cell.cycle import Observation, Observer, Observers
+from canprobe.errors import CanprobeError, UsageError
+from canprobe.planning.bridges import check_bridges
+from canprobe.planning.make import make_plan
+from canprobe.planning.measured import TrafficMeter
+from canprobe.planning.model import Plan
+from canprobe.planning.traffic import exact_frame_bits
+from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
+from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
+from canprobe.scene.load import dump_scene
+from canprobe.scene.model import BridgeSettings, BusSettings, Scene
+from canprobe.scene.resolve import resolve
+from canprobe.scene.rules import need_scene, with_values
+from canprobe.session.links import check_links, expected_of, need_controllers
+from canprobe.tasks.from_plan import make_task
+
+if TYPE_CHECKING:
+    from canprobe.emulator.world import World
+
+
+# What a session opens: buses in virtual time, the routes between several of them, and what counts their frames.
+
+
+class TrafficCounter:
+    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
+
+    Args:
+        write: of the log.
+        speed_up: data bit rate of CAN FD over the nominal one.
+
+    Attributes:
+        error_frames: bus errors, to be counted by who hears of them.
+    """
+
+    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
+        self._write = write
+        self._by_length = [0] * 65
+        self._speed_up = speed_up
+        self.error_frames = 0
+
+    @property
+    def frames(self) -> int:
+        """Frames so far."""
+        return sum(self._by_length)
+
+    @property
+    def bits(self) -> int:
+        """Bits so far, those of a data phase as bits of the nominal rate."""
+        classic = sum(count * best_case_bits(n) for n, count in enumerate(self._by_length[:9]))
+        long = [(count, best_case_fd_bits(n)) for n, count in enumerate(self._by_length[9:], start=9) if count]
+        return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
+
+    def write(self, can_id: int, data: bytes, t_ns: int) -> None:
+        """Count one frame and pass it on."""
+        self._by_length[len(data)] += 1
+        self._write(can_id, data, t_ns)
+
+
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Of CAN FD frames, None where the scene has none."""
+    return bus.data_bitrate if bus.fd is True else None
+
+
+@contextmanager
+def open_ports(
+    plan: Plan, clock: Clock, reports: Callable[[str], Reports] = lambda _: Reports()
+) -> Iterator[dict[str, Port]]:
+    """The ports of a plan's buses, by channel; closed at the end.
+
+    Args:
+        plan: whose buses.
+        clock: in real time.
+        reports: makes, of a channel, who hears what its port has to report.
+
+    Raises:
+        InterfaceError: one is missing, down, or cannot be opened.
+    """
+    from canprobe.bus.interfaces import open_port
+
+    bus = plan.scene.bus
+    with ExitStack() as stack:
+        ports: dict[str, Port] = {}
+        for planned in plan.buses:
+            name = planned.channel
+            port = open_port(
+                bus.interface, name, bus.bitrate, clock, data_bitrate=data_bitrate(bus), reports=reports(name)
+            )
+            stack.callback(port.close)
+            ports[name] = port
+        yield ports
+
+
+def channel_routes(plan: Plan) -> dict[int, str]:
+    """Which bus each identifier belongs to, of those that one node alone sends or reads."""
+    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    for node in plan.nodes:
+        for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
+            routes[base + node.node_id] = node.channel
+    return routes
+
+
+def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus:
+    """A bus in virtual time, with the bit rate of the scene or without one."""
+    if not scene.bus.timed:
+        return LockstepBus(clock, channel, fd=scene.bus.fd is True)
+    from canprobe.bus.timed import BitErrors, TimedBus
+
+    rate = scene.bus.bit_error_rate
+    errors = BitErrors(rate, scene.seed) if rate > 0 else None
+    bus = scene.bus
+    length = partial(exact_frame_bits, bus=bus) if bus.fd is True else exact_bits
+    timed = TimedBus(clock, channel, bitrate=bus.bitrate, queue=bus.transmit_queue, errors=errors, length=length)
+    timed.fd = bus.fd is True
+    return timed
+
+
+class Sink:
+    """What a RecordingPort writes to."""
+
+    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
+        self.write = write
+
+
+# A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
+
+Array = NDArray[np.float64]
+LOCKSTEP = "lockstep"
+LEFT_BY_RUNS = (
+    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("surface.png", "tool.toml", "truth.npz"),
+)
+"""Files of a run's folder besides ``bus.log``."""
+Write = Callable[[int, bytes, int], None]
+Say = Callable[[str], None]
+"""Is told each step, in words."""
+
+
+def quiet(_: str) -> None:
+    """Tell nobody."""
+
+
+def resolve_scene(
+    scene: Scene,
+    *,
+    interface: str | None = None,
+    channel: str | None = None,
+    bitrate: int | None = None,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    sensor_channel: str | None = None,
+    bridge: Sequence[str] = (),
+) -> Scene:
+    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added.
+
+    Raises:
+        UsageError: this is no scene, or a value is none that its file could have.
+    """
+    need_scene(scene)
+    bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
+    info = with_values(scene.scene, seed=seed)
+    task = with_values(scene.task, duration_s=duration_s)
+    sensor = scene.sensor if scene.sensor is None else with_values(scene.sensor, channel=sensor_channel)
+    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+
+
+def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
+    """The section with more bridges in use; an unknown one is a `UsageError`."""
+    if not names:
+        return settings
+    names = (names,) if isinstance(names, str) else names
+    check_bridges(names)
+    known = settings or BridgeSettings()
+    return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
+
+
+def hush_canopen() -> None:
+    """Keep canopen's warnings off a terminal that asked for no log: errors are raised and said once, by us.
+
+    Where somebody has set up logging, nothing changes.
+    """
+    logger = logging.getLogger("canopen")
+    if not logger.handlers:
+        logger.addHandler(logging.NullHandler())
+
+
+class Session:
+    """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
+
+    Args:
+        scene: what to bring up, resolved; or the plan of it.
+        out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
+        say: called with each step.
+        observers: called after each cycle with what it saw, said and had on the bus.
+        rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+
+    Attributes:
+        origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
+        unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
+        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
+    """
+
+    def __init__(
+        self,
+        scene: Scene | Plan,
+        out: Path | None = None,
+        say: Say = quiet,
+        observers: Sequence[Observer | Callable[[Observation], None]] = (),
+        rows_kept: int | None = None,
+    ) -> None:
+        self._rows_kept = rows_kept
+        self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
+        self.scene = self.plan.scene
+        self.out = out
+        self.started_ns = 0
+        self.wall_ns = 0
+        self.origin_ns = 0
+        self._bus_start_ns = 0
+        self._bus_time_ns = 0
+        self.traffic: dict[str, TrafficCounter | TrafficMeter] = {}
+        self.meters: dict[str, TrafficMeter] = {}
+        self.truth: dict[str, Array] = {}
+        self.lockstep: LockstepBus | None = None
+        self._ports: dict[str, Port] = {}
+        self.unwritten: list[str] = []
+        self._candump: CandumpWriter | None = None
+        self.world: World | None = None
+        self.joins: Callable[[Any], Any] = lambda participant: participant
+        self.observers = Observers(observers) if observers else None
+        self._say = say
+        self._stack = ExitStack()
+        self._entered = self._left = False
+        self._cell: Cell | None = None
+
+    @property
+    def cell(self) -> Cell:
+        """The cell, while the session is open or afterwards."""
+        if self._cell is None:
+            raise UsageError("the cell is not open: use `with canprobe.open_cell(scene) as cell:`")
+        return self._cell
+
+    @property
+    def started(self) -> bool:
+        """The buses were opened and the cell was made: there is something to report, if only how bring-up failed."""
+        return self._cell is not None
+
+    @property
+    def opened(self) -> bool:
+        """The nodes were brought up."""
+        return self._cell is not None and self._cell.cycle is not None
+
+    @property
+    def keeps_all(self) -> bool:
+        """Every cycle has its row in the log, and every SYNC one in the truth."""
+        return self._rows_kept is None
+
+    def bus_load(self, channel: str) -> float | None:
+        """Measured share of a bus's bit rate, from the first frame to the last."""
+        if channel not in self.traffic or self._bus_time_ns <= 0:
+            return None
+        return self.traffic[channel].bits / (self.scene.bus.bitrate * self._bus_time_ns * 1e-9)
+
+    def __enter__(self) -> Self:
+        if self._entered:
+            raise UsageError("a session is opened once: open another cell with open_cell(scene)")
+        self._entered = True
+        self.started_ns = elapsed_ns()
+        hush_canopen()
+        for warning in self.plan.warnings:
+            self._say(f"warning: {warning}")
+        try:
+            port = self._open()
+            self._cell = make_cell(
+                self.plan,
+                port,
+                say=self._say,
+                log_failure=self._log_failure,
+                observers=self.observers,
+                rows_kept=self._rows_kept,
+                origin_ns=self.origin_ns,
+            )
+            if self.scene.bus.interface != LOCKSTEP:
+                self._get_ready(port)
+            self._bus_start_ns = port.clock.now_ns()
+            self._stack.callback(self._stop_watch, port)
+            self._stack.enter_context(garbage_collection_paused(collect=self.scene.bus.interface != LOCKSTEP))
+            self._stack.callback(self._observe_frames, port)
+            self._stack.enter_context(self._cell)
+            self._observe_frames(port)
+        except BaseException as error:
+            self._close()
+            need_controllers(self.scene.bus.interface, self._ports, error)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._close()
+
+    def run(
+        self,
+        controller: Controller | Callable[[Measurement], Command],
+        progress: Callable[[Measurement], None] = lambda _: None,
+    ) -> None:
+        """Run a controller until it is done; see :meth:`canprobe.cell.cell.Cell.run`."""
+        if self._left:
+            raise UsageError("the cell is closed: open another one with `with canprobe.open_cell(scene) as cell:`")
+        self.cell.run(controller, progress)
+
+    def _close(self) -> None:
+        try:
+            self._stack.close()
+        finally:
+            self._left = True
+            self.wall_ns = elapsed_ns() - self.started_ns
+            self._note_unwritten(self._log_failure())
+
+    def _note_unwritten(self, told: str | None) -> None:
+        if told is not None and self._cell is not None:
+            self.unwritten.append(told)
+            self._note(told)
+
+    def _note(self, fault: str) -> None:
+        if self._cell is not None:
+            self._cell.notes.add(fault)
+
+    def _log_failure(self) -> str | None:
+        return self._candump.failure if self._candump is not None else None
+
+    def _stop_watch(self, port: Port) -> None:
+        self._bus_time_ns = port.clock.now_ns() - self._bus_start_ns
+
+    # the two kinds of bus
+
+    def _open(self) -> Port:
+        return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
+
+    def _writer(self, channel: str) -> Write:
+        write: Write = lambda _id, _data, _t: None  # noqa: E731
+        if self.out is not None:
+            if self._candump is None:
+                self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
+                self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
+                for name in LEFT_BY_RUNS:
+                    (self.out / name).unlink(missing_ok=True)  # of an earlier run
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
+                    write_text(self.out / "scene.toml", dump_scene(self.scene))
+            write = self._candump.on(channel)
+        if self.observers is not None:
+            self.observers.origin_ns = self.origin_ns
+            write = self.observers.tap(write)
+        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
+            return self._metered(channel, write if self.out is not None or self.observers is not None else None)
+        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        self.traffic[channel] = counter
+        return counter.write
+
+    def _metered(self, channel: str, write: Write | None) -> Write:
+        meter = self.traffic[channel] = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+        if write is None:
+            return meter.write
+        count, pass_on = meter.write, write
+
+        def both(can_id: int, data: bytes, t_ns: int) -> None:
+            count(can_id, data, t_ns)
+            pass_on(can_id, data, t_ns)
+
+        return both
+
+    def _error_writer(self, channel: str) -> Write:
+        """Error frames go into the log, and beside the plan."""
+
+        def note(can_id: int, data: bytes, t_ns: int) -> None:
+            self.traffic[channel].error_frames += is_bus_error(can_id)
+            if self._candump is not None:
+                self._candump.on(channel)(can_id, data, t_ns)
+
+        return note
+
+    def _join(self, ports: dict[str, Port]) -> Port:
+        """One port for the cell, whatever the number of buses."""
+        return ports.popitem()[1] if len(ports) == 1 else JoinedPort(ports, channel_routes(self.plan))
+
+    def _observe_frames(self, port: Port) -> None:
+        """What was on the bus at bring-up, and after the last cycle."""
+        if self.observers is not None:
+            self.observers.frames_alone(port.clock.now_ns())
+
+    def _open_lockstep(self) -> Port:
+        from canprobe.emulator.world import make_world
+
+        missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
+        if missing:
+            raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
+        clock = VirtualClock()
+        buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
+        for channel, bus in buses.items():
+            bus.recorder = self._writer(channel)
+            bus.error_recorder = self._error_writer(channel)
+        self.lockstep = buses[self.plan.buses[0].channel]
+        self.world = make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
+        self._stack.callback(self._keep_truth)
+        channel_of = {node.node_id: node.channel for node in self.plan.nodes}
+        for node in self.world.nodes:
+            buses[channel_of[node.node_id]].attach(self.joins(node))
+        if self.world.recorder is not None:
+            self.lockstep.attach(self.joins(self.world.recorder))
+        return self._join({channel: bus.port() for channel, bus in buses.items()})
+
+    def _keep_truth(self) -> None:
+        assert self.world is not None
+        if self.world.recorder is not None:
+            self.truth = self.world.recorder.arrays()
+            if self.out is not None:
+                try:
+                    write_npz(self.out / "truth.npz", self.truth)
+                except CanprobeError as error:
+                    self._note_unwritten(str(error))
+
+    def _open_real(self) -> Port:
+        bus = self.scene.bus
+        if bus.interface == "virtual" and self.scene.emulated_node_ids:
+            raise UsageError(
+                "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
+                " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
+            )
+        if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
+            raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
+        check_links(bus.interface, expected_of(self.plan), self._say)
+        clock = MonotonicClock()
+        self.origin_ns = clock.now_ns()
+        real = self._ports = self._stack.enter_context(
+            open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
+        )
+        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
+
+    def _get_ready(self, port: Port) -> None:
+        """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
+        from canprobe.session.children import EmulatorChild
+
+        child = None
+        if self.scene.emulated_node_ids:
+            self.cell.listen()  # they would boot beside those of another master
+            self._say("start the emulated nodes")
+            emulated = next(node.channel for node in self.plan.nodes if node.emulated)
+            child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
+            self._stack.callback(self._end_child, child)
+            child.start()
+        self._say("rehearse in lockstep")
+        rehearse(self.plan)
+        reserve_memory(self.plan.cycles if self._rows_kept is None else self._rows_kept)
+        if child is not None:
+            child.await_boot_ups(port, self._say, self.cell.hear)
+        if self.scene.cycle.realtime:
+            self._stack.enter_context(realtime(MASTER_PRIORITY, self._say))
+
+    def _end_child(self, child: Any) -> None:
+        self.truth = child.end()
+        self._note_unwritten(child.unwritten)
+
+
+# A short run on the lockstep bus before a real one, so that nothing happens for the first time in a 2.5 ms cycle.
+#
+# The first call of everything is slow: libraries are paged in, tables filled, the interpreter specialises its code.
+# On one slow processor first cycles took 3 to 10 ms each, and the drives stopped by themselves for want of SYNC.
+
+REHEARSED_S = 0.3
+"""Length of the scene's phase in a rehearsal: time for some answers of an estimator."""
+CLEARANCE_MM = 0.5
+"""The way to the object is the same in every cycle."""
+TOUCHES = 2
+
+
+def rehearse(plan: Plan) -> None:
+    """Run the beginning of a plan with every node emulated; what goes wrong in it is of no interest here.
+
+    Args:
+        plan: what is about to run on a real bus.
+    """
+    with (
+        contextlib.suppress(CanprobeError),
+        Session(replace(plan, setup=resolve(shortened(plan.scene)), choices=())) as session,
+    ):
+        session.run(make_task(session.plan))
+
+
+def shortened(scene: Scene) -> Scene:
+    """The scene on a lockstep bus that takes no time, with all that its cycles do in as few of them as will do."""
+    task = replace(
+        scene.task,
+        duration_s=min(scene.task.duration_s, REHEARSED_S),
+        clearance_mm=min(scene.task.clearance_mm, CLEARANCE_MM),
+        touches=min(scene.task.touches, TOUCHES),
+    )
+    return replace(
+        scene,
+        bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
+        task=task,
+        arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
+        sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
+    )

@@ -1,0 +1,342 @@
+"""What a study is: a table with its facts and findings, and a picture; its files, and the store of its finished
+cells.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import fcntl
+import functools
+import hashlib
+import importlib.util
+import json
+import math
+import platform
+import subprocess
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from types import MappingProxyType
+from typing import IO, Any
+
+import numpy as np
+
+import canprobe
+from canprobe.bus.disk import whole_file, write_text
+from canprobe.errors import ResultsError, StudyError
+
+# What a study is: a table with its facts and findings, and a picture. `canprobe study` runs and writes them.
+
+Say = Callable[[str], None]
+Row = Mapping[str, Any]
+
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {
+        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
+        "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
+        "region": "a pilot of `bound`: how far out the bound means something, by what limits it",
+        "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
+        "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
+        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
+        "faults": "what the cell does about thousands of random faults of its nodes and their links",
+    }
+)
+"""Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of a study's table.
+
+    Attributes:
+        key: of the rows, and the heading in the CSV; ends in the unit.
+        heading: in the printed table.
+        form: how a value is printed, as for `format`.
+    """
+
+    key: str
+    heading: str
+    form: str = ""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class StudyResult:
+    """What a study found.
+
+    Attributes:
+        name: of the study.
+        columns: of the table.
+        rows: one a case; None where a value does not apply.
+        findings: plain sentences with figures, right or wrong ones.
+        facts: what it was measured with.
+        draw: writes the picture to a path; needs matplotlib.
+        more: further tables of the study, each with findings, files and a picture of its own.
+    """
+
+    name: str
+    columns: Sequence[Column]
+    rows: Sequence[Row]
+    findings: Sequence[str]
+    facts: Mapping[str, Any]
+    draw: Callable[[Path], None]
+    more: Sequence[StudyResult] = ()
+
+
+# Finished cells of a sweep on disk: one line each, checked when read, found again by what made them.
+#
+# A line of `cells.jsonl` is the SHA-256 of its document, a space, and the document: the cell's key, what it was
+# measured by and at, and the answer. Lines are added whole and at once; one that was cut short or changed is left out
+# and counted. The key is a digest of the measuring function, the cell and the model (`model_digest`), so that an answer
+# of other code is never taken for one of this code.
+
+PACKAGE = Path(canprobe.__file__).parent
+_SOURCES = (".py", ".toml", ".eds")
+
+
+def as_json(value: object) -> str:
+    """Canonical JSON: dataclasses are objects, arrays and tuples lists, keys sorted; NaN and infinity are kept."""
+    return json.dumps(value, sort_keys=True, default=_as_json_type, ensure_ascii=False)
+
+
+def _as_json_type(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+    if hasattr(value, "tolist"):  # numpy's scalars and arrays
+        return value.tolist()
+    raise TypeError(f"expected numbers, text, lists, mappings, arrays or dataclasses of them, got {type(value)}")
+
+
+@functools.cache
+def model_digest(parts: tuple[str, ...] = ()) -> str:
+    """Digest of the code that answers rest on, of Python and of numpy.
+
+    Args:
+        parts: files and folders of the package, such as "touch" or "studies/bound.py"; the whole package by default.
+
+    Raises:
+        StudyError: a part is not there.
+    """
+    found: set[Path] = set()
+    for part in parts or (".",):
+        where = PACKAGE / part
+        inside = [where] if where.is_file() else [p for p in where.rglob("*") if p.suffix in _SOURCES]
+        if not inside:
+            raise StudyError(f"model: expected a file or folder of the package, got {part!r}")
+        found.update(inside)
+    digest = hashlib.sha256(f"{platform.python_version()} {version('numpy')}".encode())
+    for path in sorted(found):
+        digest.update(f"\n{path.relative_to(PACKAGE)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def cell_key(measure: str, cell: object, model: str) -> str:
+    """What an answer is found by."""
+    return hashlib.sha256(as_json([measure, cell, model]).encode()).hexdigest()[:32]
+
+
+class CellStore:
+    """The finished cells in a folder; open in one process at a time.
+
+    Args:
+        folder: made if it is not there.
+        fresh: forget what is kept.
+
+    Attributes:
+        path: of the file.
+        damaged: lines that were left out because they were cut short or changed.
+
+    Raises:
+        StudyError: another process has it open.
+    """
+
+    def __init__(self, folder: Path, *, fresh: bool = False) -> None:
+        folder.mkdir(parents=True, exist_ok=True)
+        self.path = folder / "cells.jsonl"
+        self.damaged = 0
+        self._answers: dict[str, str] = {}
+        self._file: IO[str] = self.path.open("a+", encoding="utf-8", errors="replace")
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            self._file.close()
+            raise StudyError(
+                f"{self.path}: another study is writing here; wait for it, or give another --out"
+            ) from error
+        self._file.seek(0)
+        if fresh:
+            self._file.truncate()
+        self._read()
+
+    def close(self) -> None:
+        """Let others open it."""
+        with contextlib.suppress(OSError):  # `put` has told of it
+            self._file.close()
+
+    def keys(self) -> Set[str]:
+        """Of all answers."""
+        return self._answers.keys()
+
+    def get(self, key: str) -> str | None:
+        """The answer as JSON text, None where there is none."""
+        return self._answers.get(key)
+
+    def put(self, key: str, what: object, answer: str) -> None:
+        """Keep an answer (JSON text) together with what it is an answer to.
+
+        Raises:
+            ResultsError: it cannot be written; what was kept before is whole.
+        """
+        document = as_json({"key": key, "what": what, "answer": json.loads(answer)})
+        try:
+            self._file.write(f"{_checksum(document)} {document}\n")
+            self._file.flush()
+        except OSError as error:
+            raise ResultsError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+        self._answers[key] = answer
+
+    def _read(self) -> None:
+        last = "\n"
+        for last in self._file:
+            checksum, _, document = last.rstrip("\n").partition(" ")
+            if checksum != _checksum(document):
+                self.damaged += 1
+                continue
+            found = json.loads(document)
+            self._answers[found["key"]] = as_json(found["answer"])
+        if not last.endswith("\n"):  # the next answer must not be written on to what was cut short
+            self._file.write("\n")
+            self._file.flush()
+
+
+def _checksum(document: str) -> str:
+    return hashlib.sha256(document.encode()).hexdigest()[:16]
+
+
+# A study's result as text, CSV, JSON and picture, and the facts that go with every measurement.
+
+SIGMA_COLUMNS = (
+    Column("sigma_point_um", "σp µm", ".0f"),
+    Column("sigma_normal_mrad", "σn mrad", ".1f"),
+)
+"""Noise of a row, filled by `sigma_values`."""
+
+
+def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
+    """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
+    return {
+        "canprobe": canprobe.__version__,
+        "commit": _commit(),
+        "model": model_digest(tuple(model)),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "machine": _processor(),
+        "quick": quick,
+        "seeds": seeds,
+    }
+
+
+def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
+    """The values of `SIGMA_COLUMNS`, from m and rad."""
+    return {"sigma_point_um": sigma_point * 1e6, "sigma_normal_mrad": sigma_normal * 1e3}
+
+
+def table_lines(result: StudyResult) -> list[str]:
+    """The table, one line a row, numbers flush right."""
+    cells = [[c.heading for c in result.columns]]
+    cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    words = [bool(result.rows) and isinstance(result.rows[0].get(c.key), str) for c in result.columns]
+    return [
+        "  ".join(
+            t.ljust(w) if is_word else t.rjust(w) for t, w, is_word in zip(line, widths, words, strict=True)
+        ).rstrip()
+        for line in cells
+    ]
+
+
+def text_of(result: StudyResult) -> str:
+    """Facts, table and findings, of all its tables."""
+    facts = ", ".join(f"{name} {value}" for name, value in result.facts.items() if value is not None)
+    own = [f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""]
+    return "\n".join([*own, *(f"\n{text_of(more)}" for more in result.more)])
+
+
+def as_document(result: StudyResult) -> dict[str, Any]:
+    """For `--json`: no NaN, what does not apply is null."""
+    more = {"more": [as_document(part) for part in result.more]} if result.more else {}
+    return {
+        "study": result.name,
+        "facts": dict(result.facts),
+        "findings": list(result.findings),
+        "rows": [{key: _plain(value) for key, value in row.items()} for row in result.rows],
+        **more,
+    }
+
+
+def write_study(result: StudyResult, out: Path) -> list[Path]:
+    """Write `<name>.csv`, `.txt`, `.json` and, where matplotlib is installed, `.png`.
+
+    Returns:
+        The files of each table, its picture last where there is one.
+
+    Raises:
+        ResultsError: one cannot be written.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
+        _write_csv(csv.writer(file), result)
+    write_text(paths[1], text_of(result))
+    document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
+    write_text(paths[2], document + "\n")
+    if importlib.util.find_spec("matplotlib") is not None:
+        paths.append(out / f"{result.name}.png")
+        with whole_file(paths[-1]) as part:
+            result.draw(part)
+    return [*paths, *(path for more in result.more for path in write_study(more, out))]
+
+
+def _write_csv(writer: Any, result: StudyResult) -> None:
+    keys: Sequence[str] = list(dict.fromkeys(key for row in result.rows for key in row))
+    writer.writerow(keys)
+    for row in result.rows:
+        writer.writerow(["" if (v := _plain(row.get(key))) is None else v for key in keys])
+
+
+def _shown(value: Any, form: str) -> str:
+    value = _plain(value)
+    if value is None:
+        return "–"
+    return "yes" if value is True else "no" if value is False else format(value, form)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.generic):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _commit() -> str | None:
+    where = Path(canprobe.__file__).parent
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(where), "describe", "--always", "--dirty"],
+            capture_output=True, text=True, check=False, timeout=5.0,
+        )  # fmt: skip
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.machine()

@@ -1,0 +1,185 @@
+"""From a measurement to a contact: joints at the sample's instant, patch, and the squeezed layer."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.assembly import patch_of
+from canprobe.cell.controller import Measurement, TactileSample
+from canprobe.robot.kinematics import PumaModel, count_sigma, forward
+from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
+from canprobe.touch.patch.image import Patch, PatchCalibration, mended
+from canprobe.touch.patch.moments import Lag, MomentImage, Moments, PadLag
+
+if TYPE_CHECKING:
+    from canprobe.touch.estimate.answer import SurfaceEstimate
+
+
+Vector = NDArray[np.float64]
+SETTLING = 0.08
+"""Uncertainty of the curvatures over that of the probe at which they tell the layer's stiffness from the touch."""
+MOST_RATIO = 6.0
+"""Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
+REFUTED = 0.25
+"""Difference of the logarithms of two stiffnesses that the error of a touch does not explain."""
+HOLLOWEST = 0.9
+"""Least curvature over −1/radius of the probe at which a patch still makes sense."""
+
+
+class JointHistory:
+    """The last joint angles with their times, to be interpolated at a tactile sample's instant."""
+
+    def __init__(self, length: int = 64) -> None:
+        self._times: deque[int] = deque(maxlen=length)
+        self._joints: deque[Vector] = deque(maxlen=length)
+
+    def add(self, t_ns: int, q: Vector) -> None:
+        """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""
+        self._times.append(t_ns)
+        self._joints.append(q)
+
+    @property
+    def newest(self) -> Vector:
+        """Joint angles (6,), rad, that were added last."""
+        return self._joints[-1]
+
+    def at(self, t_ns: int) -> Vector | None:
+        """Joint angles (6,), rad, at ``t_ns``, linear between SYNCs; None outside the history."""
+        if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
+            return None
+        for i in range(len(self._times) - 1, -1, -1):
+            t = self._times[i]
+            if t <= t_ns:
+                if t == t_ns:
+                    return self._joints[i]
+                share = (t_ns - t) / (self._times[i + 1] - t)
+                return self._joints[i] + share * (self._joints[i + 1] - self._joints[i])
+        return None
+
+
+def is_too_hollow(estimate: SurfaceEstimate, radius: float) -> bool:
+    """Whether the object is, beyond doubt (3σ), as hollow as a probe of ``radius`` (m): no contact of one patch."""
+    if not estimate.observed.all():
+        return False
+    x, y = (estimate.T_frame_contact[:3, :2].T @ estimate.directions[1]).tolist()
+    weight = np.array([x * x, 2.0 * x * y, y * y])
+    sigma = math.sqrt(max(float(weight @ estimate.covariance @ weight), 0.0))
+    return float(estimate.kappa[1]) + 3.0 * sigma < -HOLLOWEST / radius
+
+
+class ContactSensing:
+    """Turns tactile samples into contacts in the base frame.
+
+    Args:
+        model: the arm.
+        flange_probe: transform (4, 4) from the probe's centre frame (z = pole) to the flange.
+        calibration: of the array.
+        radius: of the probe, m.
+        stiffness: K/h of the layer, N/m³.
+        moment_image: gives the contacts the second moments of their images; None leaves them out.
+        lag: how far the array's centroids trail the contact; None: they do not.
+    """
+
+    def __init__(
+        self,
+        model: PumaModel,
+        flange_probe: Vector,
+        calibration: PatchCalibration,
+        radius: float,
+        stiffness: float,
+        *,
+        moment_image: MomentImage | None = None,
+        lag: Lag | None = None,
+    ) -> None:
+        self.model = model
+        self.flange_probe = flange_probe
+        self.radius = radius
+        self.stiffness = stiffness
+        self._slope: float | None = None
+        self.set_kappa(np.zeros(2))
+        self.patch: Patch | None = None
+        self.dropped = 0
+        self._calibration = calibration
+        self._moment_image = moment_image
+        self._lag = None if lag is None else PadLag(lag)
+        self._history = JointHistory()
+
+    def step(self, measurement: Measurement) -> Patch | None:
+        """Take one measurement; the patch of a new tactile sample, or None where there is none."""
+        if measurement.q is not None:
+            self._history.add(measurement.t_ns, measurement.q)
+        if measurement.tactile is None:
+            return None
+        self.patch = patch_of(measurement.tactile, self._calibration)
+        return self.patch
+
+    def position_sigma(self, direction: Vector) -> float:
+        """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
+        return count_sigma(self.model, self._history.newest, self.flange_probe, direction)
+
+    def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
+        """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
+
+        An estimate that is no contact of one patch any more (a hollow as tight as the probe) is taken at the limit.
+        Where the stiffness of this very touch was felt, curvatures that are known less well are of no use.
+
+        Args:
+            kappa: 1/m.
+            sigma: standard deviation of the less certain one, 1/m.
+        """
+        possible = np.maximum(kappa, -HOLLOWEST / self.radius)
+        if self._slope is not None:
+            if sigma > SETTLING / self.radius:
+                return
+            self._settle_stiffness(stiffness_from_slope(self._slope, self.radius, possible))
+        self._depth_at_1_n = float(indentation_from_force(1.0, self.stiffness, self.radius, possible))
+
+    def set_depth_at_1_n(self, depth: float) -> None:
+        """Place contacts as another sensing did that had this depth at 1 N, m."""
+        self._depth_at_1_n = depth
+
+    def set_slope(self, slope: float) -> None:
+        """Take how √F grows with the indentation on this object, √N per m, until its curvature is known."""
+        flat = 1.0 / float(indentation_from_force(1.0, self.stiffness, self.radius, np.zeros(2)))
+        self._slope = min(max(slope, flat / MOST_RATIO), flat * MOST_RATIO)
+        self._depth_at_1_n = 1.0 / self._slope
+
+    def _settle_stiffness(self, felt: float) -> None:
+        """What was felt, now that the curvature is known: believed where it refutes the stiffness that was stated."""
+        self._slope = None
+        if abs(math.log(felt / self.stiffness)) > REFUTED:
+            self.stiffness = felt
+
+    def depth(self, force: float) -> float:
+        """Indentation (m) of the layer at ``force`` (N) on the curvature known so far: the root of the force."""
+        return self._depth_at_1_n * math.sqrt(force) if force > 0 else 0.0
+
+    def contact(self, sample: TactileSample, patch: Patch) -> ContactSample | None:
+        """The contact at the sample's instant, or None (counted) where the joints of that instant are unknown."""
+        q = self._history.at(sample.t_sample_ns)
+        if q is None:
+            self.dropped += 1
+            return None
+        T_base_probe = forward(self.model, q) @ self.flange_probe
+        t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
+        return contact_sample(
+            t_s=t_s,
+            T_base_probe=T_base_probe,
+            uv=uv if self._lag is None else self._lag.step(t_s, *uv),
+            depth=self.depth(patch.force),
+            radius=self.radius,
+            force_n=patch.force,
+            moments=self._moments(sample, patch),
+            doubts=patch.doubts,
+        )
+
+    def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
+        """Second moments of the image; None where nobody asked, or they are not those of the whole patch."""
+        if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
+            return None
+        return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)

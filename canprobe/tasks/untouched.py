@@ -1,0 +1,317 @@
+"""The tasks without touch: hold, swing the joints, only listen to the sensor, or check each joint's first motion."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.cell.assembly import patch_of
+from canprobe.cell.controller import Command, Measurement
+from canprobe.cell.supervision import Contact, Limits
+from canprobe.cell.supervisor import outside_workspace, touch_finding
+from canprobe.robot.kinematics import PumaModel, joints_to_counts
+from canprobe.tasks.probing import smooth_step
+from canprobe.touch.patch.image import PatchCalibration
+
+# The tasks without touch: swing the joints, or only listen to the sensor.
+
+Vector = NDArray[np.float64]
+
+
+class FreeTask:
+    """Swing every joint sinusoidally about where it stood, with a soft start and end.
+
+    Args:
+        amplitude: of each joint (6,), rad.
+        swing_period_s: of the swing.
+        duration_s: of the whole task.
+        period_s: of the cycle.
+    """
+
+    def __init__(self, amplitude: Vector, swing_period_s: float, duration_s: float, period_s: float) -> None:
+        self._amplitude = amplitude
+        self._omega = 2 * math.pi / swing_period_s
+        self._duration = duration_s
+        self._soft = min(1.0, duration_s / 4)
+        self._period = period_s
+        self._t = 0.0
+        self._q0: Vector | None = None
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        if self._q0 is None:
+            assert measurement.q is not None
+            self._q0 = measurement.q
+        left = self._duration - self._t
+        envelope = smooth_step(min(self._t, left) / self._soft)
+        target = self._q0 + self._amplitude * (envelope * math.sin(self._omega * self._t))
+        self._t += self._period
+        return Command(q_target=target, done=left <= 0)
+
+
+class ListenTask:
+    """Read the sensor and do nothing.
+
+    Args:
+        calibration: of the array.
+        duration_s: how long.
+        period_s: of the cycle.
+        limits: of the cell.
+    """
+
+    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float, limits: Limits) -> None:
+        self._calibration = calibration
+        self._left = duration_s
+        self._period = period_s
+        self._limits = limits
+        self.taxels: NDArray[np.uint8] | None = None
+        self._columns: dict[str, float | Vector] = {}
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        self._left -= self._period
+        if measurement.tactile is not None:
+            self.taxels = measurement.tactile.frame.taxels
+            patch = patch_of(measurement.tactile, self._calibration)
+            self._columns = {
+                "sample_cycle": float(measurement.tactile.cycle),
+                "force_n": patch.force,
+                "pad_u_mm": patch.u * 1e3,
+                "pad_v_mm": patch.v * 1e3,
+            }
+        finding = touch_finding(Contact(self._limits, 0.0, measurement.tactile_age))
+        silent = str(finding.error) if finding is not None else None
+        return Command(done=self._left <= 0, stop_reason=silent, columns=self._columns)
+
+
+class _Hold:
+    """Stay where the drives are."""
+
+    def step(self, _: Measurement) -> Command:
+        """Nothing to do."""
+        return Command()
+
+
+# What a joint's first motion showed, and the operator who looks at it.
+
+TOLERANCE, TOLERANCE_COUNTS = 0.05, 4
+"""How far an encoder's way may be from what was asked: this share, but at least so many counts."""
+
+
+class Answer(Enum):
+    """What an operator says."""
+
+    YES = "yes"
+    NO = "no"
+    QUIT = "quit"
+
+
+class Operator(Protocol):
+    """Somebody who looks at the arm. The cell goes on meanwhile: `answer` never waits."""
+
+    def ask(self, question: str) -> None:
+        """Put a question."""
+
+    def answer(self) -> Answer | None:
+        """The answer to it, None as long as there is none."""
+
+
+@dataclass(frozen=True, slots=True)
+class JointFinding:
+    """What became of one joint.
+
+    Attributes:
+        joint: 0 to 5.
+        start_deg: where it stood.
+        asked_deg: how far it was told to turn; 0 where it was not moved.
+        moved_deg: how far it turned, by its own motor's encoder.
+        fault: what is wrong; None where nothing is.
+        skipped: why it was not moved; None where it was.
+    """
+
+    joint: int
+    start_deg: float
+    asked_deg: float = 0.0
+    moved_deg: float = 0.0
+    fault: str | None = None
+    skipped: str | None = None
+
+    def __str__(self) -> str:
+        where = f"joint {self.joint + 1} at {self.start_deg:.2f} deg: "
+        if self.skipped is not None:
+            return where + f"not moved, {self.skipped}"
+        way = f"told {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
+        return where + way + (f": {self.fault}" if self.fault is not None else ", as it must")
+
+
+def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
+    """What is wrong with the motors' ways, the joint's own first; None where nothing is.
+
+    Args:
+        joint: that was to turn, 0 to 5.
+        asked, moved: ways of the motors (6,), counts.
+    """
+    tolerance = np.maximum(TOLERANCE * np.abs(asked), TOLERANCE_COUNTS)
+    wrong = np.abs(moved - asked) > tolerance
+    if wrong[joint]:
+        share = float(moved[joint] / asked[joint])
+        if abs(moved[joint]) <= TOLERANCE_COUNTS:
+            return "it did not turn"
+        if share < 0:
+            return "it turned the wrong way"
+        return f"it turned {share:.2f} times as far: gear or encoder resolution"
+    if wrong.any():
+        other = int(np.argmax(wrong))
+        return (
+            f"the motor of joint {other + 1} turned by {moved[other]:.0f} counts,"
+            f" {asked[other]:.0f} are due to joint {joint + 1}"
+        )
+    return None
+
+
+# First motion: each joint alone by a small angle, slowly, and what every encoder made of it.
+#
+# Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
+# even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
+# can tell, as a drive's polarity turns target and feedback round together: that is what the operator is asked.
+
+Script = Generator[Command, Measurement, Measurement]
+ANGLE_DEG, SPEED_DEG_S = 1.0, 2.0
+SETTLE_S = 0.25
+_PEAK = 15 / 8  # of the quintic's speed over its mean
+
+
+class JointCheck:
+    """The controller that moves one joint after the other, forth and back.
+
+    Args:
+        model: the arm.
+        limits: of the cell; a joint that would leave them is moved the other way, or not at all.
+        period_s: of the cycle.
+        operator: asked before each motion, and after it whether the joint turned the right way; None asks nobody.
+        angle_deg: of each motion.
+        speed_deg_s: highest speed of it.
+
+    Attributes:
+        findings: one for each joint that its turn has come to.
+        start: joint angles (6,), rad, before any motion; None as long as they are not known.
+    """
+
+    def __init__(
+        self,
+        model: PumaModel,
+        limits: Limits,
+        period_s: float,
+        operator: Operator | None,
+        *,
+        angle_deg: float = ANGLE_DEG,
+        speed_deg_s: float = SPEED_DEG_S,
+    ) -> None:
+        assert limits.joint_low is not None and limits.joint_high is not None
+        self._low, self._high, self._limits = limits.joint_low, limits.joint_high, limits
+        self._model, self._period_s, self._operator = model, period_s, operator
+        self._angle = math.radians(angle_deg)
+        self._move_s = _PEAK * angle_deg / speed_deg_s
+        self.findings: list[JointFinding] = []
+        self.start: Vector | None = None
+        self._quits = False
+        self._script: Generator[Command, Measurement, None] = self._all_joints()
+        next(self._script)
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        try:
+            return self._script.send(measurement)
+        except StopIteration:
+            return Command(done=True)
+
+    def inspect(self, q: Vector) -> str | None:
+        """Why an arm that stands at joint angles (6,), rad, must not be enabled."""
+        self.start = q
+        outside = np.flatnonzero((q < self._low) | (q > self._high))
+        if not outside.size:
+            return None
+        joint = int(outside[0])
+        low, high = np.degrees((self._low[joint], self._high[joint]))
+        return (
+            f"joint {joint + 1} stands at {math.degrees(q[joint]):.1f} deg, outside {low:.1f} to {high:.1f} deg:"
+            " move it there by hand, or its zero is wrong"
+        )
+
+    def _all_joints(self) -> Generator[Command, Measurement, None]:
+        measurement = yield Command()
+        assert measurement.q is not None
+        start = self.start = measurement.q
+        for joint in range(len(start)):
+            finding = yield from self._joint(joint, start)
+            if finding is not None:
+                self.findings.append(finding)
+            if self._quits:
+                return
+
+    def _joint(self, joint: int, start: Vector) -> Generator[Command, Measurement, JointFinding | None]:
+        """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
+        degrees = math.degrees(start[joint])
+        way = self._way(joint, start)
+        if way is None:
+            return JointFinding(joint, degrees, skipped="either way it would leave its limits or the workspace")
+        told = math.degrees(way[joint])
+        question = f"joint {joint + 1} at {degrees:.2f} deg: turn it by {told:+.2f} deg?"
+        if (yield from self._asked(question, start)) is not Answer.YES:
+            return None if self._quits else JointFinding(joint, degrees, skipped="as the operator wished")
+        before = yield from self._hold(start)
+        measured = yield from self._move(start, start + way)
+        assert before.q is not None and measured.q is not None
+        moved = joints_to_counts(self._model, measured.q - before.q)
+        fault = find_fault(joint, joints_to_counts(self._model, way), moved)
+        seen = f"did joint {joint + 1} turn by about {told:+.1f} deg, positive by the right hand round its axis?"
+        answer = yield from self._asked(seen, start + way)
+        yield from self._move(start + way, start)
+        if answer is Answer.NO and fault is None:
+            fault = "the operator did not see it turn that way: polarity, gear or another joint's drive"
+        turned = math.degrees(float(moved[joint] / self._model.counts[joint, joint]))
+        return JointFinding(joint, degrees, told, turned, fault)
+
+    def _way(self, joint: int, start: Vector) -> Vector | None:
+        """The change of the joint angles (6,), rad: forwards, or else backwards; None where there is no room."""
+        for angle in (self._angle, -self._angle):
+            way = np.zeros_like(start)
+            way[joint] = angle
+            goal = start + way
+            if self._low[joint] <= goal[joint] <= self._high[joint] and not self._leaves_workspace(goal):
+                return way
+        return None
+
+    def _leaves_workspace(self, q: Vector) -> bool:
+        limits = self._limits
+        if limits.workspace is None or limits.T_base_tip_of is None:
+            return False
+        return outside_workspace(limits.T_base_tip_of(q)[:3, 3], limits.workspace) is not None
+
+    # ------------------------------------------------------------------ parts of the script
+
+    def _asked(self, question: str, q: Vector) -> Generator[Command, Measurement, Answer]:
+        if self._operator is None:
+            return Answer.YES
+        self._operator.ask(question)
+        while (answer := self._operator.answer()) is None:
+            yield Command(q_target=q)
+        self._quits = answer is Answer.QUIT
+        return answer
+
+    def _hold(self, q: Vector) -> Script:
+        for _ in range(max(1, round(SETTLE_S / self._period_s))):
+            measurement = yield Command(q_target=q)
+        return measurement
+
+    def _move(self, q_from: Vector, q_to: Vector) -> Script:
+        cycles = max(1, round(self._move_s / self._period_s))
+        for k in range(1, cycles + 1):
+            yield Command(q_target=q_from + smooth_step(k / cycles) * (q_to - q_from))
+        return (yield from self._hold(q_to))

@@ -1,0 +1,1 @@
+"""Local shape from contacts: the model, what is assumed, batch fits, online estimators, their answers and bound."""

@@ -1,0 +1,476 @@
+"""A square-root information filter for the nine-parameter model and the terms that a quadric leaves out.
+
+Forgetting makes samples count for less than they know: with weights w they leave the variance that `(Σ w)² / Σ w²` of
+them would in full, and count for `Σ w`. A prior in full would outweigh them by more than was stated, twice as much
+after a long path. So it counts by `Σ w² / Σ w`: the least mean square of the errors, over surfaces as it says they are.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch.estimate.answer import foot
+from canprobe.touch.estimate.noise import Correlation, Noise, Prior, mixed
+from canprobe.touch.estimate.nonlinear import (
+    CHI2_999,
+    DIFFUSE,
+    averaged,
+    basis,
+    monomials,
+    scales,
+    sharpest,
+    shifted,
+    size_of,
+)
+from canprobe.touch.estimate.quadric import Design, design, sample_rows, transport
+from canprobe.touch.linear_algebra import (
+    Array,
+    eigen,
+    homogeneous,
+    inverted,
+    inverted_upper,
+    solved,
+    transported_rotation,
+    upper_root,
+)
+
+# Whitened equations of single contacts in a filter's frame, and how well they agree with what it says.
+
+
+class Touch(NamedTuple):
+    """What a contact gives the filter: place (3,) m and outward unit normal (3,) in base, and their noise.
+
+    The noise is in m, rad and, what couples them (`Noise.coupling`), 1/m.
+    """
+
+    point: Array
+    normal: Array
+    sigma_point: float
+    sigma_normal: float
+    coupling: float = 0.0
+
+
+class Equations(NamedTuple):
+    """Of n contacts in a filter's frame.
+
+    Attributes:
+        rows: (n, 3, 18) whitened: of the parameters and of the terms that a quadric leaves out.
+        residuals: (n, 3) their signs turned.
+    """
+
+    rows: Array
+    residuals: Array
+
+
+def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Touch]) -> Equations:
+    """The rows of contacts at parameters (9,).
+
+    Args:
+        c: parameters in the working frame, in units of `length`.
+        T_base_work: (4, 4), m.
+        length: m.
+        touches: the contacts.
+    """
+    points, normals = _in_frame(T_base_work, length, touches)
+    at, square = c.tolist(), 1.0 / length**2
+    found = [
+        sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
+        for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
+    ]
+    table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
+    return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
+
+
+def squared_innovations(rows: Array, residuals: Array, inverse: Array) -> list[float]:
+    """Squared innovation of contacts with rows (n, 3, 18) and residuals (n, 3), χ² of 3.
+
+    Args:
+        rows, residuals: as of `Equations`.
+        inverse: (9, 9) of the root of the information.
+    """
+    predicted = rows[:, :, :9] @ inverse
+    variance = 1.0 + np.square(predicted).sum(axis=2)
+    found: list[float] = (np.square(residuals) / variance).sum(axis=1).tolist()
+    return found
+
+
+def weight_of(square: float) -> float:
+    """Weight of a contact with a squared innovation: 1 up to the 99.9 % point of χ², then as in `nonlinear.robust`."""
+    ratio = CHI2_999 / max(square, CHI2_999)
+    return ratio * ratio
+
+
+def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
+    """The constant parts of many contacts at once (`quadric.design`)."""
+    points, normals = _in_frame(T_base_work, length, touches)
+    sigma_point = np.array([t.sigma_point for t in touches]) / length
+    sigma_normal = np.array([t.sigma_normal for t in touches])
+    return design(points, normals, Noise(sigma_point, sigma_normal, touches[0].coupling * length))
+
+
+def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tuple[Array, Array]:
+    """Places, dimensionless, and normals (n, 3) in the working frame."""
+    R = T_base_work[:3, :3]
+    points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]) @ R / length
+    return points, np.array([t.normal for t in touches]) @ R
+
+
+# What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
+#
+# An answer `c = A⁻¹ Jᵀ W e` has the covariance `A⁻¹ (Jᵀ W R W J) A⁻¹`, not `A⁻¹`: forgetting weighs rows without making
+# them noisier, so weights enter squared, and correlated rows add what they share.
+#
+# Source: Huber, "The behavior of maximum likelihood estimates under nonstandard conditions", 1967; White 1980.
+
+
+class Score:
+    """Covariance of the score `Jᵀ W e` of a filter that forgets along the path.
+
+    Args:
+        prior: (k, k) information of what is always known about the k parameters.
+        correlation: of the rows along the path; None for independent samples.
+
+    Attributes:
+        matrix: (k, k).
+    """
+
+    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+        self._prior = prior
+        self._correlation = correlation
+        self.reset()
+
+    def reset(self) -> None:
+        """Only the prior is left."""
+        self.matrix = self._prior.copy()
+        self._recent = np.zeros((3, len(self.matrix)))
+
+    def start(self, J: Array, travelled: float) -> None:
+        """Take a batch solution whose rows all count in full.
+
+        Args:
+            J: (n, 3, k) its whitened rows, evenly spread over the path.
+            travelled: length of the path, m.
+        """
+        self.reset()
+        k = len(self.matrix)
+        rows = J.reshape(-1, k)
+        if self._correlation is None:
+            self.matrix += rows.T @ rows
+            return
+        places = np.linspace(0.0, travelled, len(J))
+        self.matrix += rows.T @ mixed(self._correlation.matrix(places), J).reshape(-1, k)
+        fades = np.exp((places - travelled) / self._correlation.length)
+        self._recent = self._correlation.shares[:, None] * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
+
+    def take(self, J: Array, moved: float, kept: float, known: float) -> None:
+        """Take new whitened rows over a step of the path.
+
+        Args:
+            J: (3n, k).
+            moved: m.
+            kept: what the step leaves of the information.
+            known: what of the prior is put back into the matrix, over the whole prior.
+        """
+        self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
+
+    def carry(self, back: Array) -> None:
+        """Go over to other parameters; back (k, k) is d(old)/d(new)."""
+        self.matrix = back.T @ self.matrix @ back
+        self._recent = self._recent @ back
+
+    def _added(self, J: Array, moved: float, kept: float) -> Array:
+        """What new rows add: with each other, and with earlier ones that they resemble."""
+        if self._correlation is None:
+            return np.asarray(J.T @ J, dtype=np.float64)
+        n, k = len(J) // 3, J.shape[1]
+        fade = math.exp(-moved / (n * self._correlation.length))
+        shared = self._correlation.shares[:, None] * J.reshape(n, 3, k)
+        recent, past = kept * self._recent, np.empty((n, 3, k))
+        for i in range(n):
+            recent *= fade
+            past[i] = recent
+            recent += shared[i]
+        self._recent = recent
+        cross = J.T @ past.reshape(-1, k)
+        return np.asarray(J.T @ J + cross + cross.T, dtype=np.float64)
+
+
+# What a filter knows about the terms that a quadric leaves out, in constant time and memory.
+#
+# The filter fits a quadric. Beside it, its samples' rows of the cubic and quartic terms are summed with those of its
+# parameters, forgotten alike and carried from frame to frame: as much as `nonlinear` needs of a batch. The terms are
+# what the samples say at terms of zero; they are never put into the filter, only into its answers.
+
+_REGULAR = 1e-9
+"""What keeps the covariance of the terms' score regular, over its mean."""
+
+
+class Amended(NamedTuple):
+    """An answer of a filter, averaged over what its quadric leaves out.
+
+    Attributes:
+        c: (9,) parameters.
+        covariance: (9, 9) of what the terms add to that of the noise; symmetric, not definite by itself.
+        misfit: probability of there being one.
+        trusted: the change of K is small enough for a linear step.
+    """
+
+    c: Array
+    covariance: Array
+    misfit: float
+    trusted: bool
+
+
+class Expected(NamedTuple):
+    """What is known beforehand of what a filter is given.
+
+    Attributes:
+        noise: variance of the residuals over what is stated. Generous deviations make a misfit look like noise.
+        curvature: least ‖K‖ · length whose usual changes are reckoned with: a flat place need not lie on a plane.
+        sigma_point: stated standard deviation of a point over the length.
+    """
+
+    noise: float = 1.0
+    curvature: float = 0.0
+    sigma_point: float = 0.0
+
+
+AS_STATED = Expected()
+
+
+class _Along(NamedTuple):
+    """The terms along directions in which what the samples say about them is independent.
+
+    Attributes:
+        information, score: (9,) as for `averaged`.
+        off: (9, 9) what a unit along each does to the parameters.
+        terms: (9, 9) the terms of such a unit.
+        shared: (18, 9) covariance of the score with that of the terms.
+        weighted: (9, 9) weights of what the samples say.
+        curvature, blur: as for `averaged`.
+    """
+
+    information: Array
+    score: Array
+    off: Array
+    terms: Array
+    shared: Array
+    weighted: Array
+    curvature: float
+    blur: float
+
+
+class LeftOut:
+    """Sums over the rows of parameters and terms.
+
+    Args:
+        prior: (9, 9) information of what is always known about the parameters.
+        correlation: of the rows along the path; None for independent samples.
+
+    Attributes:
+        score: (`Score`) covariance of the score of parameters and terms.
+    """
+
+    def __init__(self, prior: Array, correlation: Correlation | None) -> None:
+        wide = np.zeros((18, 18))
+        wide[:9, :9] = prior
+        self.score = Score(wide, correlation)
+        self.reset()
+
+    def reset(self) -> None:
+        """No samples."""
+        self.score.reset()
+        self._information = np.zeros((18, 18))
+        self._slope = np.zeros(9)
+
+    def start(self, rows: Array, residuals: Array, travelled: float) -> None:
+        """Take a batch's rows (n, 3, 18) and minus residuals (n, 3), evenly spread over a path (m)."""
+        self.score.start(rows, travelled)
+        flat = rows.reshape(-1, 18)
+        self._information = flat.T @ flat
+        self._slope = flat[:, 9:].T @ residuals.reshape(-1)
+
+    def take(  # noqa: PLR0917 - as `Score.take`, and what the sums need
+        self, rows: Array, residuals: Array, step: Array, moved: float, kept: float, known: float
+    ) -> None:
+        """Take new rows (3n, 18), minus their residuals (3n,) before the parameters made a step (9,)."""
+        self.score.take(rows, moved, kept, known)
+        self._information = kept * self._information + rows.T @ rows
+        self._slope = kept * self._slope + rows[:, 9:].T @ residuals - self._information[9:, :9] @ step
+
+    def carry(self, back: Array, x: float, y: float) -> None:
+        """Go over to a frame at (x, y); back (9, 9) is d(old)/d(new) of the parameters."""
+        A, Q = shifted(x, y)
+        away = 2.0 * np.eye(9) - A  # its inverse: a quartic term leaves cubic ones behind, a cubic one none
+        wide = np.zeros((18, 18))
+        wide[:9, :9], wide[:9, 9:], wide[9:, 9:] = back, -(back @ Q) @ away, away
+        self.score.carry(wide)
+        self._information = wide.T @ self._information @ wide
+        self._slope = away.T @ self._slope
+
+    def amend(self, c: Array, H: Array, place: Array, expected: Expected = AS_STATED) -> Amended:
+        """Average an answer over the terms.
+
+        Args:
+            c: (9,) parameters of the filter.
+            H: (9, 9) inverse of their information.
+            place: (3,) where the answer is wanted, in the filter's frame.
+            expected: of the samples.
+        """
+        a = self._along(c, H, expected)
+        off = a.off.copy()
+        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ a.terms
+        found = averaged(a.information, a.score, -off, a.curvature, a.blur)
+        both = H @ a.shared[:9] @ (a.weighted * found.share) @ off.T
+        return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
+
+    def explanation(self, c: Array, H: Array, expected: Expected = AS_STATED) -> Array:
+        """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
+        a = self._along(c, H, expected)
+        found = averaged(a.information, a.score, -a.off, a.curvature, a.blur)
+        return np.concatenate([found.shift, a.terms @ found.terms])
+
+    def _along(self, c: Array, H: Array, expected: Expected) -> _Along:
+        """The terms along directions in which the samples know them independently."""
+        curvature = max(size_of(c), expected.curvature)
+        D = scales(curvature)
+        X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
+        X[:9] = H @ self._information[:9, 9:] * -D
+        X[9:].flat[::10] = D
+        shared = self.score.matrix @ X
+        V = X.T @ shared  # of y = m a + noise, all that the samples say about the terms
+        V.flat[::10] += _REGULAR * V.trace()
+        m = D[:, None] * (self._information[9:] @ X)
+        weighted = solved(V, m)
+        values, U = eigen(m @ weighted)
+        information = np.maximum(values, 0.0) / expected.noise
+        s = U.T @ (weighted.T @ (D * self._slope)) / expected.noise
+        blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
+        return _Along(information, s, X[:9] @ U, D[:, None] * U, shared, weighted @ U, curvature, blur)
+
+
+# A square-root information filter for the nine-parameter model, and how it is carried from frame to frame.
+
+ANCHOR = 0.05
+"""Travel between two changes of the working frame over the memory."""
+
+
+class _Path(NamedTuple):
+    """What the path counts for, m: the sums of its pieces' weights and of their squares."""
+
+    weight: float = 0.0
+    square: float = 0.0
+
+    @property
+    def share(self) -> float:
+        """By how much the prior counts."""
+        return self.square / self.weight if self.weight else 1.0
+
+    def on(self, moved: float, kept: float) -> _Path:
+        """With a new piece (m), after which the others count `kept` times what they did."""
+        return _Path(kept * self.weight + moved, kept**2 * self.square + moved)
+
+
+class InformationFilter:
+    """Parameters with a root of their information in a working frame; rows come in, old ones fade.
+
+    Args:
+        length: the memory, and the unit of length of the problem, m.
+        prior: counts as the samples do, which are new and in full at first and faded to a half after a long path.
+        correlation: of the rows along the path; only the covariance of the answer knows of it.
+
+    Attributes:
+        length: m.
+        T: (4, 4) working frame to base, m.
+        c: (9,) parameters (`quadric`).
+        root: (9, 9) `rootᵀ root` is their information.
+        inverse: (9, 9) of `root`.
+        left_out: what the rows say about the terms that a quadric has not, and what their noise does.
+    """
+
+    def __init__(self, length: float, prior: Prior, correlation: Correlation | None) -> None:
+        self.length = length
+        self.root: Array
+        self.inverse: Array
+        self._prior_rows = _prior_rows(prior, length)
+        self.left_out = LeftOut(self._prior_rows.T @ self._prior_rows, correlation)
+        self.begin(np.eye(4))
+
+    def begin(self, T: Array) -> None:
+        """Know nothing but the prior: a plane in a frame (4, 4)."""
+        self.T = T
+        self.c = np.zeros(9)
+        self._path = _Path()
+        self._set_root(self._prior_rows)
+        self.left_out.reset()
+
+    def adopt(  # noqa: PLR0917 - what a batch solution is
+        self, T: Array, c: Array, root: Array, rows: Array, residuals: Array, travelled: float
+    ) -> None:
+        """Take over a batch solution.
+
+        Args:
+            T: (4, 4) its working frame.
+            c: (9,) its parameters.
+            root: (9, 9) of its information.
+            rows: (n, 3, 18) its whitened, weighted rows, evenly spread over the path.
+            residuals: (n, 3) minus theirs, at c.
+            travelled: length of that path, m.
+        """
+        self.T, self.c = T, c.copy()
+        self._path = _Path(travelled, travelled)
+        self._set_root(upper_root(np.concatenate([root, DIFFUSE * np.eye(9)])))
+        self.left_out.start(rows, residuals, travelled)
+
+    def take(self, rows: Array, residuals: Array, moved: float) -> None:
+        """Forget over a step of the path (m), then take in weighted rows (n, 3, 18), minus residuals (n, 3): one QR."""
+        rows, residuals = rows.reshape(-1, 18), residuals.reshape(-1)
+        kept = math.exp(-moved / self.length)
+        left = kept * self._path.share
+        self._path = self._path.on(moved, kept)
+        share = self._path.share
+        lost = math.sqrt(share - left) * self._prior_rows
+        stacked = np.empty((18 + len(rows), 10))
+        stacked[:9, :9], stacked[:9, 9] = math.sqrt(kept) * self.root, 0.0
+        stacked[9:18, :9], stacked[9:18, 9] = lost, -(lost @ self.c)
+        stacked[18:, :9], stacked[18:, 9] = rows[:, :9], residuals
+        full = upper_root(stacked)
+        self._set_root(full[:9, :9])
+        step = self.inverse @ full[:9, 9]
+        self.c = self.c + step
+        self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
+
+    def place(self, point: Array) -> Array:
+        """A point (3,) of base in the working frame, dimensionless."""
+        result: Array = (point - self.T[:3, 3]) @ self.T[:3, :3] / self.length
+        return result
+
+    def follow(self, point: Array) -> None:
+        """Carry everything to a contact frame at the foot of a point (3,) of base, once that is far enough away."""
+        x = self.place(point)
+        if float(x @ x) < ANCHOR**2:
+            return
+        x, z = foot(self.c, x)
+        turned = transported_rotation(np.eye(3), z)
+        self.c, M = transport(self.c, homogeneous(turned, x))
+        self.c[:3] = 0.0
+        back = inverted(M)
+        self.root, self.inverse = self.root @ back, M @ self.inverse
+        self.left_out.carry(back, float(x[0]), float(x[1]))
+        R = self.T[:3, :3]
+        self.T = homogeneous(R @ turned, self.T[:3, 3] + R @ (self.length * x))
+
+    def _set_root(self, root: Array) -> None:
+        """Take an upper triangular root."""
+        self.root, self.inverse = root, inverted_upper(root)
+
+
+def _prior_rows(prior: Prior, length: float) -> Array:
+    """(9, 9) root of what is always known."""
+    own = DIFFUSE * np.eye(9)
+    own[3:6] = prior.rows(length)[0][:3]
+    return own

@@ -1,0 +1,223 @@
+"""Small matrices, input checks, and frames on a tangent plane, as all of touch uses them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev, dtrtri
+
+from canprobe.errors import UsageError
+
+# Array types and input checks that the touch modules share.
+
+Array = NDArray[np.float64]
+_UPPER = np.triu(np.ones((16, 16)))
+
+# LAPACK is called by its own names: on matrices as small as these, numpy's wrappers cost four times the decomposition.
+
+
+def upper_root(A: Array) -> Array:
+    """The upper triangular R of a QR decomposition, Rᵀ R = Aᵀ A."""
+    qr, _, _, _ = dgeqrf(A)
+    R = qr[: min(A.shape)]
+    n, m = R.shape
+    return R * _UPPER[:n, :m] if m <= len(_UPPER) else np.triu(R)
+
+
+def solved(A: Array, B: Array) -> Array:
+    """A⁻¹ B.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is singular.
+    """
+    _, _, X, info = dgesv(A, B)
+    if info > 0:
+        raise np.linalg.LinAlgError("singular matrix")
+    result: Array = X
+    return result
+
+
+def inverted(A: Array) -> Array:
+    """A⁻¹.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is singular.
+    """
+    return solved(A, np.eye(len(A)))
+
+
+def inverted_upper(R: Array) -> Array:
+    """R⁻¹ of an upper triangular R.
+
+    Raises:
+        numpy.linalg.LinAlgError: where R is singular.
+    """
+    result, info = dtrtri(R)
+    if info > 0:
+        raise np.linalg.LinAlgError("singular matrix")
+    found: Array = result
+    return found
+
+
+def eigen(A: Array) -> tuple[Array, Array]:
+    """Eigenvalues of a symmetric matrix, the least first, and its eigenvectors as columns.
+
+    Raises:
+        numpy.linalg.LinAlgError: where it is not finite.
+    """
+    values, vectors, info = dsyev(A, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("eigenvalues did not converge")
+    return values, vectors
+
+
+def lower_root(A: Array) -> Array:
+    """The lower triangular L of a Cholesky decomposition, L Lᵀ = A.
+
+    Raises:
+        numpy.linalg.LinAlgError: where A is not positive definite.
+    """
+    L, info = dpotrf(A, lower=1)
+    if info != 0:
+        raise np.linalg.LinAlgError("matrix is not positive definite")
+    result: Array = L
+    return result
+
+
+def read_only(values: ArrayLike) -> Array:
+    """A private copy that nobody can write to."""
+    array = np.array(values, dtype=np.float64)
+    array.flags.writeable = False
+    return array
+
+
+def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
+    """Values as floats of the wanted shape, all finite.
+
+    Args:
+        name: the field, for the message.
+        values: what the caller gave.
+        shape: expected shape; None stands for any length.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+    """
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise UsageError(f"{name}: expected numbers of shape {_spell(shape)}, got {values!r}") from error
+    if len(array.shape) != len(shape) or any(e is not None and e != g for e, g in zip(shape, array.shape, strict=True)):
+        raise UsageError(f"{name}: expected shape {_spell(shape)}, got {array.shape}")
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise UsageError(f"{name}: expected numbers, got masked ones; leave those rows out")
+    if not np.isfinite(array).all():
+        first = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise UsageError(f"{name}: expected finite numbers, got {array[tuple(first)]} at index {first}")
+    return array
+
+
+def positive(name: str, value: Any) -> float:
+    """A finite number above zero.
+
+    Raises:
+        UsageError: naming the field, what was expected and what was got.
+    """
+    number = float(checked(name, value, ()))
+    if not number > 0.0:
+        raise UsageError(f"{name}: expected a number above 0, got {number}")
+    return number
+
+
+def _spell(shape: Sequence[int | None]) -> str:
+    return (
+        "(" + ", ".join("n" if side is None else str(side) for side in shape) + ("," if len(shape) == 1 else "") + ")"
+    )
+
+
+# Frames on a tangent plane, and small rotations.
+
+_AXIS_LIMIT = 0.95
+"""Above this |component| of the normal the frame's own x axis is too close to it, and y is used."""
+
+
+def tangent_rotation(z_axis: Array) -> Array:
+    """Right-handed axes with the given z; x is the parent frame's x axis laid on the tangent plane.
+
+    Where z is within 18° of the parent's x axis, the parent's y axis is laid on the plane instead. The choice depends
+    on z alone, so that two nearly equal normals give nearly equal axes.
+
+    Args:
+        z_axis: (3,) unit vector.
+
+    Returns:
+        (3, 3), columns x, y, z.
+    """
+    zx, zy, zz = float(z_axis[0]), float(z_axis[1]), float(z_axis[2])
+    if abs(zx) <= _AXIS_LIMIT:
+        scale = 1.0 / math.sqrt(max(zy * zy + zz * zz, 1e-300))
+        xx, xy, xz = (zy * zy + zz * zz) * scale, -zx * zy * scale, -zx * zz * scale
+    else:
+        scale = 1.0 / math.sqrt(zx * zx + zz * zz)
+        xx, xy, xz = -zy * zx * scale, (zx * zx + zz * zz) * scale, -zy * zz * scale
+    return np.array(
+        [
+            [xx, zy * xz - zz * xy, zx],
+            [xy, zz * xx - zx * xz, zy],
+            [xz, zx * xy - zy * xx, zz],
+        ]
+    )
+
+
+def transported_rotation(R: Array, z_axis: Array) -> Array:
+    """Axes turned the shortest way so that z becomes `z_axis` (parallel transport over a small step).
+
+    Args:
+        R: (3, 3) axes, columns x, y, z.
+        z_axis: (3,) the new unit z.
+
+    Returns:
+        (3, 3).
+    """
+    x, y, z = R[:, 0].tolist()
+    u, v, w = z_axis.tolist()
+    along = x * u + y * v + z * w
+    x, y, z = x - along * u, y - along * v, z - along * w
+    size = math.sqrt(x * x + y * y + z * z)
+    if size < 1e-6:
+        return tangent_rotation(z_axis)
+    x, y, z = x / size, y / size, z / size
+    return np.array([[x, v * z - w * y, u], [y, w * x - u * z, v], [z, u * y - v * x, w]])
+
+
+def homogeneous(R: Array, origin: Array) -> Array:
+    """The 4x4 matrix of a rotation and an origin."""
+    T = np.zeros((4, 4))
+    T[:3, :3] = R
+    T[:3, 3] = origin
+    T[3, 3] = 1.0
+    return T
+
+
+def inverse_transform(T: Array) -> Array:
+    """The inverse of a rigid 4x4 transform."""
+    R = T[:3, :3].T
+    return homogeneous(R, -R @ T[:3, 3])
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of two (3,) vectors without the overhead of `numpy.cross`."""
+    a0, a1, a2 = float(a[0]), float(a[1]), float(a[2])
+    b0, b1, b2 = float(b[0]), float(b[1]), float(b[2])
+    return np.array([a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0])
+
+
+def rotation_vector(R: Array) -> Array:
+    """The rotation vector (angle times axis, rad) of a rotation below a half turn."""
+    w = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = 0.5 * math.sqrt(float(w @ w))
+    angle = math.atan2(sine, 0.5 * (float(np.trace(R)) - 1.0))
+    return w * (0.5 if sine < 1e-12 else 0.5 * angle / sine)

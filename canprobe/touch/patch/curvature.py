@@ -1,0 +1,439 @@
+"""The contact patch as a second sensor: curvature from the second moments of tactile images, fused with the motion's.
+
+The moments are averaged over the last frames, in axes that follow the contact normal, and compared with a calibrated
+model of the sensor (`moments`). What gains, hysteresis and blur do to them is common to all images of a contact:
+however many are averaged, the patch never knows more than the calibration's floor.
+
+The fusion is that of two measurements: the informations of motion and patch are added, each with its whole
+covariance, so the patch fades where a path excites all of K and speaks where it does not. Two things bound what it can
+do: outside the calibrated range it counts less and less, and so it does the further it is from what the motion
+knows, by the weight of an outlier.
+
+Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
+tells: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
+
+The layer's model is stated in `moments`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from canprobe.touch.contact import ContactSample, direction_to_pad
+from canprobe.touch.estimate.answer import TO_Q, CurvatureInformation, Solution, SurfaceEstimate, build_estimate
+from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.online import Dropped, Estimator
+from canprobe.touch.estimate.quadric import SIGMA_LIMIT, UNIT, Decision, parameters_of, turned
+from canprobe.touch.linear_algebra import Array, eigen, homogeneous, inverted, positive, solved, tangent_rotation
+from canprobe.touch.patch.moments import MomentModel, Moments, PadMemory
+
+LEAST_FRAMES = 8
+"""Fewer frames make no estimate."""
+MOST_FRAMES = 32
+"""Frames that the running mean reaches back: 0.16 s at 200 Hz, 4 mm at 25 mm/s."""
+FEW_FRAMES = 8
+"""The same of the shorter mean."""
+FINE = 0.05
+"""`GROSS` of the shorter mean, in which one image weighs more: four times the noise of a frame."""
+YOUNGER = 4.0
+"""Frames by which the shorter mean must be the younger one to tell a drift."""
+GROSS = 0.2
+"""Departure from the mean, over its trace, beyond which one image counts less: ten times the noise of a frame."""
+MOST_ROUNDS = 6
+"""Gauss–Newton steps; from the last answer one or two do."""
+SETTLED, UNSETTLED = 0.002, 0.05
+"""Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
+_ROOT2 = math.sqrt(2.0)
+
+
+class Fused(NamedTuple):
+    """What patch and motion say together about q in a contact frame.
+
+    Attributes:
+        q: (3,) 1/m.
+        patch: (3, 3) the patch's part of the information, m².
+        weight: of the patch, 1 unless it is far from what the motion knows.
+    """
+
+    q: Array
+    patch: Array
+    weight: float
+
+
+class _Seen(NamedTuple):
+    """Moments in their principal axes, and how far they are off by what changed along the path."""
+
+    moments: Moments
+    drift: Moments
+
+
+class _Mean:
+    """Running mean of moments over so many frames at most, and how old it is; `gross`: as `GROSS`."""
+
+    def __init__(self, most: int, gross: float) -> None:
+        self.moments: Moments = (0.0, 0.0, 0.0)
+        self.age = 0.0
+        self._most, self._gross = most, gross
+        self._frames = 0
+        self._apart = 0
+
+    @property
+    def frames(self) -> int:
+        """How many the mean stands for."""
+        return self._frames
+
+    def add(self, xx: float, xy: float, yy: float) -> float:
+        """Take the moments of a frame; its share in the mean, small where it is far from it."""
+        self._frames = min(self._frames + 1, self._most)
+        share = 1.0 / self._frames
+        mxx, mxy, myy = self.moments
+        dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
+        if self._frames >= LEAST_FRAMES:
+            nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
+            self._apart = self._apart + 1 if nearness < 1.0 else 0
+            if self._apart == LEAST_FRAMES:
+                return self._restart(xx, xy, yy)
+            share *= min(1.0, nearness)
+        self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
+        self.age = (1.0 - share) * (self.age + 1.0)
+        return share
+
+    def _restart(self, *moments: float) -> float:
+        """So many in a row are no outliers: what was before them is not what is felt now."""
+        xx, xy, yy = moments
+        self.moments, self.age, self._frames, self._apart = (xx, xy, yy), 0.0, 1, 0
+        return 1.0
+
+    def drift_from(self, younger: _Mean) -> Moments:
+        """How far this is off by what changed since, if it went on as a younger mean says."""
+        apart = self.age - younger.age
+        if apart < YOUNGER:
+            return 0.0, 0.0, 0.0
+        times = self.age / apart
+        xx, xy, yy = (times * (now - then) for now, then in zip(younger.moments, self.moments, strict=True))
+        return xx, xy, yy
+
+
+class PatchCurvature:
+    """Running mean of second moments in axes that are carried along with the contact normal.
+
+    Args:
+        model: of the sensor.
+        spread: variance of the moments over what the model's calibration found.
+
+    Attributes:
+        frames: how many the mean stands for, at most `MOST_FRAMES`.
+        refused: contacts without moments (saturated, at the pad's edge, hardly any taxel, or a sensor that sends none).
+    """
+
+    def __init__(self, model: MomentModel, spread: float = 1.0) -> None:
+        self.model = model
+        self._spread = positive("spread", spread)
+        self.refused = 0
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images: contact was lost."""
+        self.frames = 0
+        self.force = 0.0
+        self._memory = PadMemory()
+        self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+        self._last: tuple[float, float, float] | None = None
+        self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
+
+    def add(self, sample: ContactSample) -> None:
+        """Take the image of one contact."""
+        x, y, z = sample.r_probe.tolist()
+        k = 1.0 / math.sqrt(x * x + y * y + z * z)
+        direction = k * x, k * y, k * z
+        was = self._memory.add(sample.t_s, *direction_to_pad(direction, self.model.radius))
+        if sample.moments is None:
+            self.refused += 1
+            return
+        self._carry(*(-sample.n_base).tolist())
+        (uu, uv, vv), memory = sample.moments, self.model.fit.memory
+        uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
+        xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
+        self._recent.add(xx, xy, yy)
+        share = self._mean.add(xx, xy, yy)
+        self.frames = self._mean.frames
+        self.force += share * (sample.force_n - self.force)
+
+    def _carry(self, zx: float, zy: float, zz: float) -> None:
+        """Turn the axes the shortest way so that z is the inward normal."""
+        if not self.frames:
+            self._x, self._y, _ = tangent_rotation(np.array([zx, zy, zz])).T.tolist()
+            return
+        x, y, z = self._x
+        along = x * zx + y * zy + z * zz
+        x, y, z = x - along * zx, y - along * zy, z - along * zz
+        size = 1.0 / math.sqrt(x * x + y * y + z * z)
+        x, y, z = size * x, size * y, size * z
+        self._x, self._y = [x, y, z], [zy * z - zz * y, zz * x - zx * z, zx * y - zy * x]
+
+    def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
+        """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
+        x, y, z = direction
+        bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
+        ux, uy, uz = 1.0 - bend * x, -bend * y, -x
+        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
+        return self._in_axes(
+            [a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz],
+        )
+
+    def _in_axes(self, u: list[float]) -> tuple[float, float]:
+        """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
+        (x0, x1, x2), (y0, y1, y2), (u0, u1, u2) = self._x, self._y, u
+        cx, cy = x0 * u0 + x1 * u1 + x2 * u2, y0 * u0 + y1 * u1 + y2 * u2
+        size = 1.0 / math.hypot(cx, cy)
+        return cx * size, cy * size
+
+    def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
+        """Patch and motion together in a contact frame.
+
+        Args:
+            T_base_contact: (4, 4) contact frame, z inward.
+            motion: what else is known about q there.
+
+        Returns:
+            None from too few frames, and where the patch has nothing to say.
+        """
+        if self.frames < LEAST_FRAMES:
+            return None
+        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
+        xx, xy, yy = _turned(*self._mean.moments, c, -s)
+        angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
+        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
+        turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
+        known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
+        known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
+        found = self._solve(_Seen((mean + half, 0.0, mean - half), drift), known)
+        return None if found is None else Fused(turn.T @ found.q, turn.T @ found.patch @ turn, found.weight)
+
+    def _solve(self, seen: _Seen, motion: CurvatureInformation) -> Fused | None:
+        """From the last answer, and where that fails from the ideal layer; again where patch and motion disagree."""
+        last, self._last = self._last, None
+        found = None if last is None else self._iterated(last, seen, motion, 1.0)
+        if found is None and (start := self.model.start(seen.moments, self.force)) is not None:
+            found = self._iterated(start, seen, motion, 1.0)
+        if found is None:
+            return None
+        k, patch, cost = found
+        self._last = k
+        ratio = CHI2_999 / max(cost, CHI2_999)
+        weight = ratio * ratio
+        if weight < 1.0:
+            found = self._iterated(k, seen, motion, weight)
+            if found is None:
+                return None
+            k, patch, _ = found
+        return Fused(TO_Q * k, patch, weight)
+
+    def _iterated(
+        self, k: Moments, seen: _Seen, motion: CurvatureInformation, weight: float
+    ) -> tuple[Moments, Array, float] | None:
+        """Gauss–Newton from K: K, the patch's information and the cost; None where it does not settle."""
+        step = math.inf
+        try:
+            for _ in range(MOST_ROUNDS):
+                J, r, W = self.model.linearised(seen.moments, self.force, self.frames, k)
+                W = _less_certain(W, seen)
+                W *= weight * self.model.trust(k, self.force) / self._spread
+                JW, q = J.T @ W, TO_Q * k
+                patch = JW @ J
+                off = motion.q - q
+                pull = motion.information @ off
+                way = solved(patch + motion.information, JW @ r + pull)
+                cost = float(r @ W @ r + off @ pull)
+                k = _entries(q + way)
+                step = max(map(abs, way.tolist()))
+                if step < SETTLED / self.model.radius:
+                    break
+        except (ValueError, np.linalg.LinAlgError):
+            return None
+        if step > UNSETTLED / self.model.radius or not patch.any():
+            return None
+        return k, patch, cost
+
+
+def _less_certain(W: Array, seen: _Seen) -> Array:
+    """Information (3, 3) of relative moments that are also off by a drift of unknown sign."""
+    (v1, _, v2), (xx, xy, yy) = seen.moments, seen.drift
+    relative = np.array([xx / v1, xy / math.sqrt(v1 * v2), yy / v2])
+    b = W @ relative
+    size = float(b @ relative)
+    result: Array = W - np.outer(b, b) / (1.0 + size)
+    return result
+
+
+def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float, float, float]:
+    """A symmetric tensor in other axes, in which the old x axis has the components c, s."""
+    cc, cs, ss = c * c, c * s, s * s
+    return cc * xx - 2.0 * cs * xy + ss * yy, cs * (xx - yy) + (cc - ss) * xy, ss * xx + 2.0 * cs * xy + cc * yy
+
+
+def _entries(q: Array) -> tuple[float, float, float]:
+    q1, q2, q3 = q.tolist()
+    return q1, q2 / _ROOT2, q3
+
+
+# The answer of patch and motion together, and of the patch alone.
+
+NAMED = 0.1
+"""Share of the information about K that the patch gives from which on the estimate's method names it."""
+DOUBTED = 0.5
+"""Weight of the patch below which the estimate says that it contradicts the motion."""
+_TO_K = 1.0 / np.outer(TO_Q, TO_Q)
+
+
+def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
+    """A motion estimate with what was found with the patch.
+
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them.
+
+    Args:
+        motion: with its `evidence`.
+        found: of the patch and that evidence.
+        length: m, `quadric` takes curvatures below 1/length for flat; the memory of the estimator.
+
+    Returns:
+        The estimate; its `method` ends in "+patch" where the patch gave at least `NAMED`, and a note says how much.
+    """
+    assert motion.evidence is not None
+    has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
+    data = motion.information if has_prior else motion.evidence.information
+    decision = _decide(data + found.patch, found.q, length)
+    root = None if motion.model_root is None else _joined(motion.model_root, found.patch)
+    total = motion.evidence.information + found.patch
+    inverse = inverted(total)
+    share = float((inverse * found.patch).sum()) / 3.0
+    return build_estimate(
+        _solution(motion.S, found.q, inverse, decision, has_prior=has_prior, root=root),
+        length=1.0,
+        T_frame_contact=motion.T_frame_contact,
+        problem_root=motion.problem_root,
+        innovation=motion.innovation,
+        distance=motion.distance,
+        samples=motion.samples,
+        method=motion.method + "+patch" if share >= NAMED else motion.method,
+        prior=motion.prior,
+        notes=(*motion.notes, *_notes(found, share)),
+    )
+
+
+def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
+    """Shape from the patch alone, as of a touch that stands still; None where it says nothing.
+
+    Args:
+        contact: the last one; place and normal are its.
+        patch: the images.
+        length: m, see `with_patch`.
+    """
+    T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
+    found = patch.fuse(T)
+    if found is None:
+        return None
+    plane = np.zeros((4, 4))
+    plane[2, 3] = plane[3, 2] = -0.5
+    return build_estimate(
+        _solution(plane, found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        length=1.0,
+        T_frame_contact=T,
+        problem_root=_root(found.patch),
+        innovation=1.0,
+        distance=0.0,
+        samples=float(patch.frames),
+        method="patch",
+        prior="none",
+    )
+
+
+def _notes(found: Fused, share: float) -> tuple[str, ...]:
+    said = (f"{100.0 * share:.0f} % of the curvature from the patch",)
+    return said if found.weight >= DOUBTED else (*said, "the patch contradicts the motion")
+
+
+def _joined(model_root: Array, patch: Array) -> Array:
+    """(n + 3, 9) root of the information about the entries of S with the patch's part about K."""
+    rows = np.zeros((3, 9))
+    rows[:, 6:] = _root(patch) / UNIT
+    return np.concatenate([model_root, rows])
+
+
+def _root(information: Array) -> Array:
+    """(3, 3) root of the patch's information, which may be singular."""
+    values, vectors = eigen(information)
+    result: Array = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return result
+
+
+def _decide(information: Array, q: Array, length: float) -> Decision:
+    """The rank decision's second rule on what patch and motion together know; the first is about motion alone."""
+    values, vectors = eigen(information)
+    size = max(math.sqrt(float(q @ q)), 1.0 / length)
+    return Decision(np.maximum(values, 0.0), vectors, values >= 1.0 / (SIGMA_LIMIT * size) ** 2)
+
+
+def _solution(
+    S: Array, q: Array, covariance: Array, decision: Decision, *, has_prior: bool = False, root: Array | None = None
+) -> Solution:
+    """From q and its covariance (3, 3)."""
+    c = parameters_of(S)
+    if has_prior or decision.rank == 3:
+        c[6:] = UNIT * q
+        return Solution(c, covariance * _TO_K, decision, has_prior, root)
+    V = decision.vectors[:, decision.passed]
+    c[6:] = UNIT * (V @ (V.T @ q))
+    return Solution(c, np.full((3, 3), math.nan), decision, has_prior, root)
+
+
+# An estimator of motion with the contact patch as its second sensor.
+
+
+class PatchedEstimator:
+    """Any estimator, its answers completed by the patch (`with_patch`); before the contact moves, the patch alone.
+
+    Args:
+        motion: the estimator of points and normals.
+        patch: the images.
+        length: memory of `motion`, m.
+    """
+
+    def __init__(self, motion: Estimator, patch: PatchCurvature, length: float) -> None:
+        self.patch = patch
+        self._motion = motion
+        self._length = length
+        self._last: ContactSample | None = None
+
+    @property
+    def dropped(self) -> Dropped:
+        """Samples that were not used, by neither sensor."""
+        return self._motion.dropped
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact with its moments."""
+        before = self._motion.dropped.total
+        self._motion.add(sample)
+        if self._motion.dropped.total == before:
+            self._last = sample
+            self.patch.add(sample)
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer at the last contact, or None before there is any."""
+        motion = self._motion.estimate()
+        if motion is None:
+            return None if self._last is None else patch_estimate(self._last, self.patch, self._length)
+        if motion.evidence is None:
+            return motion
+        found = self.patch.fuse(motion.T_frame_contact, motion.evidence)
+        return motion if found is None else with_patch(motion, found, self._length)
+
+    def reset(self) -> None:
+        """Forget everything but the settings."""
+        self._motion.reset()
+        self.patch.reset()
+        self._last = None

@@ -1,0 +1,143 @@
+"""The EDS files of the cell's nodes: the contract from which master and emulator are both configured.
+
+    puma260_joint      nodes 1..6, a CiA 402 drive a joint    vendor CA5Eh, product 0260h, revision 0001_0000h
+    tactile_array      node 16, 16 × 16 taxels                vendor CA5Eh, product 1616h, revision 0001_0000h
+    tactile_array_fd   the same with PDOs of up to 64 bytes   vendor CA5Eh, product 161Fh, revision 0001_0000h
+
+The vendor number is this project's own choice; CiA has not assigned it. Source of the format: CiA 306-1.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.errors import EdsError
+
+if TYPE_CHECKING:
+    import canopen
+
+    from canprobe.eds.reading import Reading
+
+
+MISSED_SYNCS = 0x2000
+"""Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
+MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
+LONG_PDOS = 0x2007
+"""Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
+LONG_PDOS_NAME = "Long PDOs (CAN FD)"
+FULL_SCALE = 0x2004
+"""Of the tactile array: the pressure of its largest count, Pa."""
+FULL_SCALE_NAME = "Full scale pressure"
+WINDOW_SIZE = 0x2008
+"""Manufacturer's object of our arrays: taxels along the window that follows the contact."""
+WINDOW_SIZE_NAME = "Window size"
+_FOLDER = Path(__file__).resolve().parent
+
+
+def eds_names() -> tuple[str, ...]:
+    """Names of the packaged EDS files, sorted, without the suffix."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.eds")))
+
+
+def eds_path(name: str) -> Path:
+    """Path of a packaged EDS file.
+
+    Args:
+        name: with or without the suffix .eds.
+
+    Raises:
+        EdsError: no packaged file has this name.
+    """
+    names = eds_names()
+    stem = name.removesuffix(".eds")
+    if stem in names:
+        return _FOLDER / f"{stem}.eds"
+    near = difflib.get_close_matches(stem, names, n=1)
+    hint = f"did you mean {near[0]!r}?" if near else f"packaged are {', '.join(names)}; another file needs its path"
+    raise EdsError(f"EDS {name!r}: no such file, and no such packaged file: {hint}")
+
+
+def has_missed_syncs(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2000h is that object here: another maker's drive may mean something else by the same index."""
+    return MISSED_SYNCS in od and od[MISSED_SYNCS].name == MISSED_SYNCS_NAME
+
+
+def has_long_pdos(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2007h is that object here: the device can send PDOs in CAN FD frames."""
+    return LONG_PDOS in od and od[LONG_PDOS].name == LONG_PDOS_NAME
+
+
+def has_window_size(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2008h is that object here; without it the window has 8×8 taxels."""
+    return WINDOW_SIZE in od and od[WINDOW_SIZE].name == WINDOW_SIZE_NAME
+
+
+def has_full_scale(od: canopen.ObjectDictionary) -> bool:
+    """Whether 2004h is that object here; without it the device cannot tell the pressure of its largest count."""
+    return FULL_SCALE in od and od[FULL_SCALE].name == FULL_SCALE_NAME
+
+
+def eds_file(source: str | os.PathLike[str]) -> Path:
+    """The file that a name or path means: a bare word names a packaged one, unless a file of that name lies here.
+
+    Raises:
+        EdsError: no such file.
+    """
+    path = Path(source)
+    if path.is_file():
+        return path
+    if isinstance(source, str) and path.name == source:
+        return eds_path(source)
+    raise EdsError(f"EDS {str(source)!r}: no such file")
+
+
+def _check_node_id(source: str | os.PathLike[str], node_id: int) -> None:
+    if not 1 <= node_id <= 127:
+        raise EdsError(f"EDS {str(source)!r}: node id {node_id} is not 1..127")
+
+
+def load_eds(name_or_path: str | os.PathLike[str], node_id: int) -> canopen.ObjectDictionary:
+    """Load an EDS or DCF file into canopen's object dictionary for one node.
+
+    Planner, master and emulator each ask for the same file, and parsing costs 60 ms: they get one object. Treat it as
+    read-only; a node's values live elsewhere.
+
+    Args:
+        name_or_path: a packaged name (see `eds_names`) or the path of any EDS file.
+        node_id: 1..127, put in for $NODEID.
+
+    Raises:
+        EdsError: missing, unreadable or with faults that prevent its use; names the file and each fault. What is
+            merely untidy is accepted, see `check_eds`.
+    """
+    _check_node_id(name_or_path, node_id)
+    path = eds_file(name_or_path)
+    return _parse(path, path.stat().st_mtime_ns, node_id)
+
+
+def check_eds(name_or_path: str | os.PathLike[str], node_id: int | None = None) -> Reading:
+    """Read an EDS or DCF file with everything that is wrong with it.
+
+    Args:
+        name_or_path: as for `load_eds`.
+        node_id: 1..127, put in for $NODEID; None for that of the DCF, or else 1.
+
+    Raises:
+        EdsError: missing or unreadable, or no such node id.
+    """
+    if node_id is not None:
+        _check_node_id(name_or_path, node_id)
+    from canprobe.eds.reading import read_eds  # late, as it imports canopen: --help must not pay for it
+
+    return read_eds(eds_file(name_or_path), node_id)
+
+
+@lru_cache(maxsize=64)
+def _parse(path: Path, _mtime_ns: int, node_id: int) -> canopen.ObjectDictionary:
+    from canprobe.eds.reading import read_eds
+
+    return read_eds(path, node_id, serving=False).usable()

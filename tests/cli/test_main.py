@@ -1,0 +1,466 @@
+"""The command line: what is parsed, what is called, what is printed where, and the exit status."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+from command_lines import command_lines, parse
+
+import canprobe
+from canprobe import api
+from canprobe.bus.scheduling import Terminated
+from canprobe.cell.monitor import Monitor
+from canprobe.cli import COMMANDS, main
+from canprobe.cli.output import print_json, progress_bar, termination_interrupts
+from canprobe.cli.parser import channel, node_ids
+from canprobe.eds.packaged import eds_path
+from canprobe.errors import InterfaceError, NodeError, PlanError, SafetyStop, SceneError, UsageError
+from canprobe.scene.load import load_scene, packaged_scenes
+
+SUMMARY = {"scene": "free", "completed": True, "shape": {"method": None}}
+
+
+class FakeResult:
+    """As much of a RunResult as the command line asks for."""
+
+    def __init__(self):
+        self.summary = SUMMARY
+
+    def text(self):
+        return "all went well"
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """Replace the API by functions that remember how they were called."""
+    seen = []
+
+    def fake(name, answer=None):
+        def call(*args, **kwargs):
+            seen.append((name, args, kwargs))
+            return answer
+
+        monkeypatch.setattr(api, name, call)
+
+    fake("run", FakeResult())
+    fake("up")
+    fake("emulate")
+    fake("scan", [{"node_id": 1, "state": "pre-operational", "vendor_id": 0xCA5E, "product_code": None}])
+    return seen
+
+
+@pytest.mark.parametrize(
+    "command", [(), *((command,) for command in COMMANDS), ("eds", "list"), ("eds", "path"), ("eds", "check")]
+)
+def test_help_has_examples_of_its_command_that_parse(command, capsys):
+    assert main([*command, "--help"]) == 0
+    _, _, examples = capsys.readouterr().out.partition("example")
+    lines = command_lines(examples)
+    assert any(tuple(line[: len(command)]) == command for line in lines)
+    for line in lines:
+        parse(line)
+
+
+def test_help_lists_every_command(capsys):
+    main(["--help"])
+    out = capsys.readouterr().out
+    assert all(f"    {command}" in out for command in COMMANDS)
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"canprobe {canprobe.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], ("COMMAND",)),
+        (["runn"], ("unknown command 'runn'", "did you mean run?")),
+        (["run"], ("SCENE",)),
+        (["run", "cylinder", "--sead", "3"], ("--sead",)),
+        (["run", "cylinder", "--seed", "-1"], ("--seed", "'-1'")),
+        (["run", "cylinder", "--seed", "x"], ("--seed", "an integer from 0")),
+        (["run", "cylinder", "--duration", "0"], ("--duration", "seconds above 0")),
+        (["run", "cylinder", "--duration", "nan"], ("--duration",)),
+        (["run", "cylinder", "--duration", "inf"], ("--duration",)),
+        (["run", "cylinder", "--bitrate", "5"], ("--bitrate", "from 10000")),
+        (["run", "cylinder", "--channel", "=vcan0"], ("--channel", "NAME=CH")),
+        (["run", "cylinder", "--channel", "can0="], ("--channel", "NAME=CH")),
+        (["run", "cylinder", "--channel", "can1=vcan0"], ("no channel can1", "only can0", "did you mean can0?")),
+        (["run", "cylinder", "--channel", "vcan0", "--channel", "vcan1"], ("given 2 times",)),
+        (["run", "cilinder"], ("no such scene", "did you mean cylinder?")),
+        (["plan", "none.toml"], ("none.toml", "cannot be read")),
+        (["plan", "free", "--measured", "run", "--export", "dcf"], ("--measured", "no --export or --figure")),
+        (["emulate", "cylinder"], ("--channel", "missing")),
+        (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "6-1"], ("--nodes", "1-6,16")),
+        (["emulate", "cylinder", "--channel", "vcan0", "--nodes", "1,17"], ("no node [17]", "[1, 2, 3, 4, 5, 6, 16]")),
+        (["scan", "--bus", "lockstep"], ("lockstep",)),
+        (["eds", "path", "puma260"], ("puma260", "puma260_joint")),
+        (["eds"], ("ACTION",)),
+    ],
+)
+def test_wrong_usage_is_one_clear_line_and_status_2(argv, words, capsys, calls):
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("canprobe")
+    assert all(word in captured.err for word in words), captured.err
+    assert not calls
+
+
+def test_every_problem_of_a_scene_has_its_line(tmp_path, capsys):
+    path = tmp_path / "bad.toml"
+    path.write_text("[scene]\nname = 'bad'\n[arm]\nmodle = 3\n[task]\nkind = 'free'\nduration_s = -1\n")
+    assert main(["plan", str(path)]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all(line.startswith(f"canprobe: {path}: ") for line in lines)
+
+
+@pytest.mark.parametrize(
+    ("error", "status"),
+    [
+        (UsageError("wrong"), 2),
+        (SceneError(["one", "two"]), 2),
+        (PlanError(["one"]), 2),
+        (InterfaceError("no vcan9"), 3),
+        (NodeError(3, "absent"), 3),
+        (SafetyStop("force 7 N above 5 N"), 1),
+        (PermissionError(13, "Permission denied", "/nowhere"), 2),
+        (PermissionError(1, "Operation not permitted"), 3),
+        (OSError(28, "No space left on device", "bus.log"), 3),
+        (KeyboardInterrupt(), 130),
+        (Terminated(), 143),
+    ],
+)
+def test_exit_status_of_every_error(error, status, monkeypatch, capsys):
+    def fail(*_, **__):
+        raise error
+
+    monkeypatch.setattr(api, "run", fail)
+    assert main(["run", "free"]) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert "Traceback" not in captured.err
+    expected = ["interrupted"] if status > 100 else str(error).splitlines()
+    assert len(captured.err.splitlines()) == len(expected)
+
+
+def test_an_error_that_nobody_foresaw_is_no_safety_stop(monkeypatch, capsys):
+    monkeypatch.setattr(api, "run", lambda *_, **__: 1 / 0)
+    assert main(["run", "free"]) == 70
+    assert "ZeroDivisionError" in (err := capsys.readouterr().err)
+    assert err.endswith("canprobe: this is a fault of canprobe itself: please report it with the lines above\n")
+
+
+def test_a_run_hears_sigterm_from_its_beginning(monkeypatch, tmp_path):
+    def load(_):
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr("canprobe.scene.load.load_scene", load)
+    assert main(["run", "free"]) == 143
+
+
+BUSY = {
+    "run": ("run", "free"),
+    "up": ("up", "free"),
+    "check_joints": ("up", "free", "--check-joints", "--yes"),
+    "emulate": ("emulate", "free", "--channel", "vcan0"),
+    "emulate_eds": ("emulate", "--eds", "puma260_joint.eds", "--node-id", "5", "--channel", "vcan0"),
+    "monitor": ("monitor", "free", "--channel", "vcan0"),
+    "scan": ("scan", "--channel", "vcan0"),
+    "commission": ("scan", "--lss", "--channel", "vcan0"),
+}
+"""Command lines by the function of the API that keeps each of them busy."""
+UNTIL_CTRL_C = ("up", "emulate", "emulate_eds", "monitor")
+
+
+@pytest.mark.parametrize("name", BUSY)
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_a_signal_ends_has_its_status(name, number, monkeypatch, capsys):
+    """Ctrl-C is the normal end of what only holds or shows; SIGTERM is 143 everywhere."""
+    monkeypatch.setattr(api, name, lambda *_, **__: signal.raise_signal(number))
+    assert main(BUSY[name]) == (143 if number == signal.SIGTERM else 0 if name in UNTIL_CTRL_C else 130)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("recorded.replay", ("replay", "log")), ("studies.study.run_study", ("study", "bound"))]
+)
+def test_sigterm_ends_what_computes(name, words, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(f"canprobe.{name}", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
+    assert main(words) == 143
+
+
+@pytest.mark.parametrize("json_too", [[], ["--json"]])
+def test_a_monitor_that_is_ended_shows_what_it_knows(json_too, monkeypatch, capsys):
+    """`timeout 5 canprobe monitor …` is a way to look for five seconds."""
+
+    def views(*_, **__):
+        plan = canprobe.plan(canprobe.load_scene("free"))
+        yield Monitor(plan).view(0)
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(api, "monitor", views)
+    assert main(["monitor", "free", "--channel", "vcan0", *json_too]) == 143
+    assert "can0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("command", ["run press", "up press", "emulate press", "monitor press", "view press", "scan"])
+def test_a_bus_that_python_can_does_not_know_is_wrong_usage(command, monkeypatch, tmp_path, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = [*command.split(), "--bus", "token-ring", "--channel", "x"]
+    assert main(words + (["--html", "page.html"] if command.startswith("view") else [])) == 2
+    err = capsys.readouterr().err.splitlines()[-1]
+    assert err.startswith("canprobe: x: no interface 'token-ring'; python-can has: ") and "socketcan" in err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_run_passes_everything_on(calls, tmp_path, capsys):
+    argv = ["--bus", "socketcan", "--channel", "can0=vcan3", "--bitrate", "500000", "--seed", "7", "--duration", "2.5"]
+    assert main(["run", "free", *argv, "--out", str(tmp_path / "out")]) == 0
+    ((name, (scene,), kwargs),) = calls
+    assert (name, scene.name) == ("run", "free")
+    given = {key: kwargs[key] for key in ("interface", "channel", "bitrate", "seed", "duration_s", "out")}
+    assert given == {
+        "interface": "socketcan",
+        "channel": "vcan3",
+        "bitrate": 500_000,
+        "seed": 7,
+        "duration_s": 2.5,
+        "out": tmp_path / "out",
+    }
+    assert capsys.readouterr().out == "all went well\n"
+
+
+@pytest.mark.parametrize("command", ["run", "up"])
+def test_patience_is_what_is_asked_for_and_for_emulated_nodes_only(command, calls, tmp_path, capsys):
+    def limits(*words):
+        assert main([command, "cylinder", "--bus", "socketcan", *words]) == 0
+        _, (scene,), _ = calls.pop()
+        return scene.arm.missed_syncs, scene.limits.late_cycles_max_percent
+
+    assert limits() == (5, 10.0)
+    assert limits("--patient") == (40, 100.0)
+    path = tmp_path / "real.toml"
+    path.write_text("[scene]\nname = 'real'\n[arm]\nemulated = false\n[task]\nkind = 'free'\n")
+    assert main([command, str(path), "--bus", "socketcan", "--patient"]) == 2
+    assert "--patient is for emulated nodes" in capsys.readouterr().err and not calls
+
+
+def test_run_takes_the_scenes_bus_by_default(calls):
+    assert main(["run", "free"]) == 0
+    ((_, _, kwargs),) = calls
+    assert (kwargs["interface"], kwargs["channel"], kwargs["bitrate"]) == ("lockstep", "can0", 1_000_000)
+    assert (kwargs["seed"], kwargs["duration_s"]) == (None, None)
+    assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
+
+
+def test_run_json_is_one_document(calls, capsys):
+    assert main(["run", "free", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == SUMMARY
+    assert captured.err == ""
+
+
+def test_a_stopped_run_still_prints_its_summary(monkeypatch, capsys):
+    def stop(*_, **__):
+        error = SafetyStop("contact lost")
+        error.summary = {"completed": False}
+        raise error
+
+    monkeypatch.setattr(api, "run", stop)
+    assert main(["run", "free", "--json"]) == 1
+    captured = capsys.readouterr()
+    assert json.loads(captured.out) == {"completed": False}
+    assert captured.err == "canprobe: contact lost\n"
+
+
+def test_json_refuses_what_is_no_number():
+    with pytest.raises(ValueError, match="Out of range"):
+        print_json({"value": float("nan")})
+
+
+def test_up_and_emulate_pass_everything_on(calls, tmp_path):
+    assert main(["up", "free", "--bus", "socketcan", "--channel", "vcan0"]) == 0
+    truth = tmp_path / "truth.npz"
+    argv = ["--channel", "vcan0", "--nodes", "16,1-2", "--seed", "4", "--truth", str(truth)]
+    assert main(["emulate", "cylinder", *argv]) == 0
+    (_, _, up), (_, _, emulate) = calls
+    assert (up["interface"], up["channel"], up["bitrate"]) == ("socketcan", "vcan0", 1_000_000)
+    assert (emulate["interface"], emulate["channel"], emulate["node_ids"]) == ("socketcan", "vcan0", (1, 2, 16))
+    assert (emulate["seed"], emulate["truth_path"]) == (4, truth)
+
+
+@pytest.mark.parametrize(("scene", "nodes"), [("cylinder", (1, 2, 3, 4, 5, 6, 16)), ("listen", (16,))])
+def test_emulate_serves_what_the_scene_marks(scene, nodes, calls):
+    assert main(["emulate", scene, "--channel", "vcan0"]) == 0
+    assert calls[0][2]["node_ids"] == nodes
+
+
+ON_TWO_BUSES = """\
+[scene]
+name = "two"
+[bus]
+channel = "arm"
+[arm]
+[sensor]
+channel = "touch"
+[object]
+kind = "plane"
+[task]
+kind = "press"
+"""
+
+
+@pytest.mark.parametrize(
+    ("words", "channel", "nodes"),
+    [
+        ("--channel vcan0", "vcan0", (1, 2, 3, 4, 5, 6, 16)),
+        ("--channel vcan0 --nodes 16", "vcan0", (16,)),
+        ("--channel arm=x --channel touch=y --nodes 1-6", "x", (1, 2, 3, 4, 5, 6)),
+        ("--channel arm=x --channel touch=y --nodes 16", "y", (16,)),
+        ("--channel touch=y --nodes 16", "y", (16,)),
+        ("--channel arm=x --nodes 2", "x", (2,)),
+        ("--channel arm=x --channel touch=x", "x", (1, 2, 3, 4, 5, 6, 16)),
+    ],
+)
+def test_emulate_serves_each_node_on_its_own_bus(words, channel, nodes, calls, tmp_path):
+    (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
+    assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 0
+    assert (calls[0][2]["channel"], calls[0][2]["node_ids"]) == (channel, nodes)
+
+
+@pytest.mark.parametrize(
+    "words", ["--channel arm=x --channel touch=y", "--channel touch=y", "--channel arm=x --nodes 1,16"]
+)
+def test_emulate_drops_no_bus_without_a_word(words, calls, tmp_path, capsys):
+    (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
+    assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "on two buses" in line and "share one plant" in line and "--nodes" in line and calls == []
+
+
+def test_scan_prints_a_table_or_json(calls, capsys):
+    assert main(["scan", "--channel", "vcan0", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["vendor_id"] == 0xCA5E
+    assert main(["scan", "--channel", "vcan0"]) == 0
+    header, row = capsys.readouterr().out.splitlines()
+    assert header.split() == ["node_id", "state", "vendor_id", "product_code"]
+    assert row.split() == ["1", "pre-operational", "0xca5e", "-"]
+    assert calls[0][:2] == ("scan", ("socketcan", "vcan0", 1_000_000))
+
+
+def test_scenes(capsys):
+    assert main(["scenes"]) == 0
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == [n for n, _ in packaged_scenes()]
+    folder = Path(last.removeprefix("in ").partition(";")[0])
+    assert main(["scenes", "--json"]) == 0
+    scenes = json.loads(capsys.readouterr().out)
+    assert [scene["name"] for scene in scenes] == [n for n, _ in packaged_scenes()]
+    for scene in scenes:
+        path = Path(scene["path"])
+        assert path.parent == folder and load_scene(path) == load_scene(scene["name"])
+
+
+def test_plan_text_and_json(capsys):
+    assert main(["plan", "free"]) == 0
+    assert "leaves out:" in capsys.readouterr().out
+    assert main(["plan", "free", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scene"] == "free"
+
+
+def test_eds(capsys):
+    assert main(["eds", "list"]) == 0
+    assert {"puma260_joint", "tactile_array"} <= set(capsys.readouterr().out.split())
+    assert main(["eds", "path", "puma260_joint.eds"]) == 0
+    assert capsys.readouterr().out == f"{eds_path('puma260_joint')}\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "ids"), [("16", (16,)), ("1-6,16", (1, 2, 3, 4, 5, 6, 16)), ("3,1-2, 2", (1, 2, 3)), ("126", (126,))]
+)
+def test_node_ids(text, ids):
+    assert node_ids(text) == ids
+
+
+@pytest.mark.parametrize(("text", "parsed"), [("vcan0", (None, "vcan0")), ("can0=vcan0", ("can0", "vcan0"))])
+def test_channel(text, parsed):
+    assert channel(text) == parsed
+
+
+def test_sigterm_is_an_interrupt_only_inside():
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(Terminated), termination_interrupts():
+        os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_sigterm_is_left_alone_outside_the_main_thread():
+    def enter():
+        with termination_interrupts():
+            pass
+
+    thread = threading.Thread(target=enter)
+    thread.start()
+    thread.join()
+    assert signal.getsignal(signal.SIGTERM) is not None
+
+
+class Terminal:
+    """A stream that remembers what is written to it."""
+
+    def __init__(self, tty):
+        self.tty, self.text = tty, ""
+
+    def isatty(self):
+        return self.tty
+
+    def write(self, text):
+        self.text += text
+
+    def flush(self):
+        pass
+
+
+def test_progress_bar_draws_on_terminals_only():
+    assert progress_bar(Terminal(False)) is None
+    terminal = Terminal(True)
+    show = progress_bar(terminal, width=4)
+    for done in (0, 0.01, 5, 10):
+        show(done, 10)
+    assert terminal.text.count("\r") == 3, "drawn again only when the picture changes"
+    assert "██░░  50 %" in terminal.text
+    assert terminal.text.endswith("\n")
+
+
+def run_python(*argv, **kwargs):
+    return subprocess.run(
+        [sys.executable, "-m", "canprobe", *argv], capture_output=True, text=True, check=False, **kwargs
+    )
+
+
+def test_module_is_the_command():
+    done = run_python("eds", "list")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "puma260_joint" in done.stdout
+
+
+def test_a_reader_that_goes_away_is_quiet():
+    read, write = os.pipe()
+    os.close(read)
+    try:
+        command = [sys.executable, "-m", "canprobe", "plan", "free"]
+        done = subprocess.run(command, stdout=write, stderr=subprocess.PIPE, text=True, check=False)
+    finally:
+        os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -1,0 +1,168 @@
+"""Homing, CiA 402-2: methods 33, 34, 35, 37, the three bits, home offset, errors."""
+
+from __future__ import annotations
+
+import pytest
+
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.drive.drive import make_drive_node
+from canprobe.emulator.plant.config import PlantConfig
+from canprobe.emulator.plant.plant import Plant
+from canprobe.robot.kinematics import UPENN
+
+START, HALT = 0x1F, 0x10F
+UNDER_WAY, NOT_STARTED, DONE = (0, 0, 0), (0, 0, 1), (0, 1, 1)
+ERROR_MOVING, ERROR_AT_REST = (1, 0, 0), (1, 0, 1)
+
+
+def bits(rig):
+    return rig.bits(13, 12, 10)
+
+
+@pytest.fixture
+def homing(rig):
+    """The motor stands 250.25 counts behind an index pulse; a turn is 1000."""
+    rig.plant.ramps.clear()
+    rig.plant.counts[0] = 250.25
+    rig.put(_6099_2=4000, _609A=100_000).enable(6).run(10)
+    return rig
+
+
+@pytest.mark.parametrize(("method", "home"), [(33, 0.0), (34, 1000.0)])
+@pytest.mark.parametrize("offset", [0, 70, -70])
+def test_cia402_55_first_index_pulse_in_a_direction(homing, method, home, offset):
+    homing.put(_6098=method, _607C=offset)
+    assert bits(homing) == NOT_STARTED
+    homing.word(START)
+    assert bits(homing) == UNDER_WAY
+    homing.run(600)
+    assert bits(homing) == DONE
+    assert homing.counts == pytest.approx(home, abs=1e-9)
+    assert homing.signed(0x6064) == -offset  # zero is home + offset
+    assert homing.signed(0x607A) == -offset
+
+
+@pytest.mark.parametrize(("method", "pulse"), [(33, -1000), (34, 1000)])
+def test_cia402_55_a_pulse_right_here_has_been_passed(rig, method, pulse):
+    rig.put(_6098=method).enable(6).word(START).run(1200)
+    assert (rig.counts, bits(rig)) == (pulse, DONE)
+
+
+@pytest.mark.parametrize("method", [35, 37])
+@pytest.mark.parametrize("offset", [0, 123, -123])
+def test_cia402_55_the_present_position_is_home(homing, method, offset):
+    homing.put(_6098=method, _607C=offset).word(START)
+    assert bits(homing) == DONE
+    homing.run(50)
+    assert (homing.counts, homing.signed(0x6064)) == (250.25, -offset)
+
+
+def test_cia402_55_search_with_6099_and_609a(homing):
+    homing.put(_6098=34).word(START).run(100)
+    ramp_s = 4000 / 100_000
+    assert homing.counts - 250.25 == pytest.approx(4000 * (0.1 - ramp_s / 2))
+    steps = [b - a for (_, a), (_, b) in zip(homing.trace, homing.trace[1:], strict=False)]
+    assert max(steps) == pytest.approx(4000 * 0.5e-3)
+
+
+def test_cia402_55_it_overshoots_the_pulse_and_comes_back(homing):
+    homing.put(_6098=34).word(START).run(600)
+    assert 1000 + 4000**2 / 2e5 <= max(counts for _, counts in homing.trace) <= 1000 + 4000**2 / 2e5 + 4000 * 2.5e-3
+
+
+@pytest.mark.parametrize("method", [1, 2, 17, 18, 19, 30, 36])
+def test_cia402_55_methods_that_need_switches_are_refused(homing, method):
+    assert homing.drive.write(0x6098, 0, method, 1) == 0x06090030
+
+
+@pytest.mark.parametrize("wrong", [{"_6098": 0}, {"_6098": 34, "_6099_2": 0}])
+def test_cia402_55_what_cannot_be_searched_is_an_error(homing, wrong):
+    homing.put(**wrong).word(START)
+    assert bits(homing) == ERROR_MOVING  # until it is known to be at rest
+    homing.run(5)
+    assert bits(homing) == ERROR_AT_REST
+    homing.put(_6098=35, _6099_2=100).word(0x0F).word(START)
+    assert bits(homing) == DONE
+
+
+def test_cia402_55_no_pulse_within_two_turns_is_an_error(homing):
+    homing.put(_6098=34).plant.stuck = True
+    homing.word(START).run(560)
+    assert (bits(homing), homing.drive.read(0x6062)) == (ERROR_AT_REST, 2250)
+    assert homing.drive.read(0x6041) & 0x6F == 0x27
+
+
+@pytest.mark.parametrize("word", [0x0F, HALT, HALT | 0x10])
+def test_cia402_55_60_taking_bit_4_away_or_halt_interrupts(homing, word):
+    homing.put(_6098=34).word(START).run(60)
+    homing.word(word)
+    assert bits(homing) == UNDER_WAY
+    homing.run(100)
+    assert bits(homing) == NOT_STARTED
+    assert homing.counts < 800
+    homing.word(0x0F)
+    assert homing.run(300).counts < 800
+    homing.word(START).run(600)
+    assert (homing.counts, bits(homing)) == (1000, DONE)
+
+
+def test_cia402_55_60_with_bit_4_kept_homing_starts_again_after_halt(homing):
+    homing.put(_6098=34).word(START).run(60).word(HALT | 0x10).run(100).word(START)
+    assert bits(homing) == UNDER_WAY
+    assert homing.run(600).counts == 1000
+
+
+def test_cia402_55_moves_and_limits_refer_to_the_new_zero(homing):
+    homing.put(_6098=35, _607C=-50, _607D_1=-40, _607D_2=40).word(START).word(0x0F)
+    homing.put(_6060=1).run(5)
+    homing.put(_607A=0).word(0x1F).run(400)
+    assert homing.counts == pytest.approx(250.25 - 50)
+    homing.word(0x0F).put(_607A=1000).word(0x1F).run(400)
+    assert homing.counts == pytest.approx(250.25 - 50 + 40)
+
+
+def test_cia402_55_homed_until_the_node_is_reset(homing):
+    homing.put(_6098=37).word(START).word(0x06).word(0x07).word(0x0F)
+    assert bits(homing) == DONE
+    homing.drive.nmt(0x82)
+    assert homing.signed(0x6064) == 0
+    homing.drive.nmt(0x81)
+    assert homing.signed(0x6064) == 250
+    homing.enable(6).run(10)
+    assert bits(homing) == NOT_STARTED
+
+
+def test_cia402_55_leaving_the_mode_gives_the_run_up(homing):
+    homing.put(_6098=34).word(START).run(60).put(_6060=1).run(800)
+    assert homing.counts < 800
+    homing.put(_6060=6).run(10)
+    assert bits(homing) == NOT_STARTED
+
+
+def test_cia402_55_a_lagging_wrist_motor_stands_on_its_pulse():
+    """Axis 5 of the ideal arm, 800 counts a turn, 8 ms behind its reference: the pulse is caught where it is."""
+    plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    node = make_drive_node(load_eds("puma260_joint", 5), 5, 4, plant)
+    node.start(0)
+    t_ns = 0
+    for text in (
+        "238f600120030000",  # 608Fh:01 = 800
+        "2392600120030000",  # 6092h:01 = 800
+        "2398600022000000",  # wrong length: refused
+        "2f98600022000000",  # method 34
+        "2f60600006000000",
+        *("2b40600006000000", "2b40600007000000", "2b4060000f000000", "2b4060001f000000"),
+    ):
+        t_ns += 1_000_000
+        node.receive(0x605, bytes.fromhex(text), t_ns)
+        node.advance(t_ns)
+    start = plant.motor_counts(4)
+    others = [plant.motor_counts(axis) for axis in (0, 1, 2, 3, 5)]
+    for k in range(1, 500):
+        node.advance(t_ns + k * 2_500_000)
+    pulse = (start // 800 + 1) * 800
+    assert plant.motor_counts(4) == pytest.approx(pulse, abs=0.5)
+    assert node.dictionary.values[0x6041 << 8] >> 10 & 7 == 0b101
+    answer = node.receive(0x605, bytes.fromhex("4064600000000000"), t_ns + 1250 * 10**6)[0][1]
+    assert abs(int.from_bytes(answer[4:], "little", signed=True)) <= 1
+    assert [plant.motor_counts(axis) for axis in (0, 1, 2, 3, 5)] == pytest.approx(others, abs=1e-6)

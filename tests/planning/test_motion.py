@@ -1,0 +1,168 @@
+"""Reach, joint speeds and geometry of a plan."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from scenes import change, reasons
+
+import canprobe
+from canprobe.planning.motion import surface_path
+from canprobe.scene.geometry import true_object
+from canprobe.scene.load import load_scene, packaged_scenes
+from canprobe.scene.model import ObjectSettings
+from canprobe.scene.resolve import resolve
+
+
+@pytest.fixture(scope="module")
+def cylinder():
+    return load_scene("cylinder")
+
+
+@pytest.mark.parametrize("name", [name for name, _ in packaged_scenes()])
+def test_packaged_scenes_fit(name):
+    plan = canprobe.plan(load_scene(name))
+    if plan.joint_speeds is not None:
+        pairs = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
+        assert all(needed <= 0.6 * limit for needed, limit in pairs), "a packaged scene keeps clear of the limits"
+
+
+@pytest.mark.parametrize(
+    "obj",
+    [
+        ObjectSettings("bowl", radius_mm=40),
+        ObjectSettings("bowl", radius_mm=30),
+        ObjectSettings("saddle", radius_x_mm=60, radius_y_mm=-35),
+    ],
+)
+def test_hollow_tighter_than_the_probe_is_refused(cylinder, obj):
+    scene = dataclasses.replace(change(cylinder, task={"length_mm": 10.0, "width_mm": 4.0}), object=obj)
+    assert any("tighter than the probe of radius 40 mm" in problem for problem in reasons(scene))
+
+
+def test_wider_hollow_and_tight_ridge_are_no_problem(cylinder):
+    small = change(cylinder, task={"length_mm": 10.0, "width_mm": 4.0})
+    assert canprobe.plan(dataclasses.replace(small, object=ObjectSettings("bowl", radius_mm=60)))
+    ridge = ObjectSettings("cylinder", radius_mm=12, rotation_deg=(0, 0, 20))
+    assert canprobe.plan(dataclasses.replace(small, object=ridge))
+
+
+def test_object_out_of_reach_names_point_and_why(cylinder):
+    far = (-400.0, -400.0, 374.0)
+    (problem,) = reasons(change(cylinder, object={"position_mm": far}, task={"start_mm": far}))
+    assert "contact at (-4" in problem
+    assert "out of reach of the upenn arm" in problem
+
+
+def test_joint_at_its_stop_is_named(cylinder):
+    (problem,) = reasons(change(cylinder, object={"rotation_deg": (0, 0, -48.81)}, task={"heading_deg": 41.19}))
+    assert "joint 1" in problem
+    assert "110" in problem
+
+
+def test_start_posture_outside_the_range(cylinder):
+    problems = reasons(change(cylinder, arm={"start_deg": (109.5, 65.0, 15.0, 0.0, 100.0, 300.0)}))
+    assert any("arm.start_deg: joint 1 at 109.5 deg, allowed -179 to 109" in problem for problem in problems)
+    assert any("joint 6 at 300" in problem for problem in problems)
+
+
+def test_speed_beyond_the_joints_is_refused_with_a_speed_that_fits(cylinder):
+    fast = change(cylinder, task={"speed_mm_s": 200.0})
+    problems = reasons(fast)
+    assert any("joint 1 would need" in problem for problem in problems)
+    fitting = float(problems[0].split("task.speed_mm_s to ")[1].split(",")[0])
+    assert canprobe.plan(change(cylinder, task={"speed_mm_s": fitting}))
+
+
+def test_joint_speeds_scale_with_the_contact_speed(cylinder):
+    slow, fast = (canprobe.plan(change(cylinder, task={"speed_mm_s": v})).joint_speeds for v in (10.0, 30.0))
+    np.testing.assert_allclose(np.array(fast.needed_deg_s), 3 * np.array(slow.needed_deg_s), atol=0.01)
+
+
+def test_rolling_share_lowers_joint_speeds(cylinder):
+    pure, half = (canprobe.plan(change(cylinder, task={"rolling_share": v})).joint_speeds for v in (0.0, 0.5))
+    assert max(half.needed_deg_s) < max(pure.needed_deg_s)
+
+
+def test_swing_of_a_free_scene():
+    scene = load_scene("free")
+    speeds = canprobe.plan(scene).joint_speeds
+    assert speeds.needed_deg_s[0] == pytest.approx(5 * 2 * math.pi / 4, abs=1e-3)
+    assert any("joint 1 would move" in p for p in reasons(change(scene, task={"swing_deg": (25.0, 5, 5, 5, 5, 5)})))
+    assert any("swing slower" in p for p in reasons(change(scene, task={"swing_period_s": 0.1})))
+
+
+@pytest.mark.parametrize(("rise", "where"), [(10.0, "10.0 mm above"), (-12.0, "12.0 mm below")])
+def test_object_that_the_approach_does_not_find(cylinder, rise, where):
+    (problem,) = reasons(change(cylinder, object={"position_mm": (-120.0, -122.5, 374.0 + rise)}))
+    assert where in problem
+
+
+def test_approach_beside_the_object(cylinder):
+    (problem,) = reasons(change(cylinder, task={"start_mm": (-120.0, -222.5, 374.0)}))
+    assert "does not meet the object" in problem
+
+
+def test_path_that_leaves_the_object(cylinder):
+    (problem,) = reasons(change(cylinder, task={"length_mm": 80.0}))
+    assert "leaves the object" in problem
+
+
+def test_matrix_that_is_no_surface_at_the_origin(cylinder):
+    rows = ((1.0, 0, 0, 0), (0, 1.0, 0, 0), (0, 0, 1.0, 0), (0, 0, 0, -1.0))
+    (problem,) = reasons(dataclasses.replace(cylinder, object=ObjectSettings("quadric", matrix=rows)))
+    assert problem.startswith("object: matrix must pass through the origin")
+
+
+@pytest.mark.parametrize("name", ["cylinder", "sphere", "saddle", "plane"])
+def test_path_lies_on_the_object_and_spans_the_region(name):
+    scene = load_scene(name)
+    setup = resolve(scene)
+    path, problems = surface_path(setup.task, setup.truth.object)
+    assert not problems
+    shape = true_object(scene.object)
+    assert max(abs(shape.closest(point).distance) for point in path.points) < 1e-9
+    heading = np.radians(scene.task.heading_deg)
+    along = (path.points[:, :2] - np.array(scene.task.start_mm[:2]) * 1e-3) @ [np.cos(heading), np.sin(heading)]
+    assert 1e3 * np.ptp(along) == pytest.approx(scene.task.length_mm, abs=0.1)
+    assert np.all(path.normals[:, 2] > 0.5), "outward normals look at the approaching probe"
+
+
+def test_without_an_object_the_expected_plane_is_checked(cylinder):
+    real = dataclasses.replace(
+        change(cylinder, arm={"emulated": False}, sensor={"emulated": False}), object=None, plant=None
+    )
+    plan = canprobe.plan(real)
+    assert plan.fidelity is None
+    assert plan.joint_speeds.needed_deg_s[0] > 0
+    path, _ = surface_path(resolve(real).task, None)
+    np.testing.assert_allclose(path.normals, np.tile([0, 0, 1], (len(path.normals), 1)))
+
+
+def test_all_reasons_come_at_once(cylinder):
+    scene = change(cylinder, sensor={"mode": "image"}, cycle={"rate_hz": 400.0}, task={"length_mm": 80.0})
+    problems = reasons(change(scene, arm={"start_deg": (200.0, 65.0, 15.0, 0.0, 100.0, 0.0)}))
+    for word in ("worst-case load", "leaves the object", "arm.start_deg"):
+        assert any(word in problem for problem in problems)
+
+
+def tilted(scene, degrees, clearance_mm=3.0):
+    plane = ObjectSettings("plane", rotation_deg=(degrees, 0.0, 0.0))
+    small = change(scene, task={"length_mm": 6.0, "width_mm": 3.0, "clearance_mm": clearance_mm})
+    return dataclasses.replace(small, object=plane)
+
+
+def test_a_first_touch_beside_the_array_is_refused(cylinder):
+    """A probe of 40 mm meets a tilted plane 40 mm · tilt beside its pole; the array ends at 12.7 mm, 18.2 degrees."""
+    assert canprobe.plan(tilted(cylinder, 17.9))
+    (problem,) = reasons(tilted(cylinder, 18.5))
+    assert "would be 12.9 mm beside the middle of the array, which reaches 12.7 mm" in problem
+    assert "turn task.approach_normal by 18 deg" in problem or "turn task.approach_normal by 19 deg" in problem
+
+
+def test_a_probe_that_would_be_in_the_object_before_its_approach_is_refused(cylinder):
+    (problem,) = reasons(tilted(cylinder, 25.0))
+    deep = 40.0 - 43.0 * math.cos(math.radians(25.0))
+    assert f"the probe would be {deep:.1f} mm in the object before its approach, 25 deg beside it" in problem
+    assert "first touch would be" in reasons(tilted(cylinder, 25.0, clearance_mm=6.0))[0]

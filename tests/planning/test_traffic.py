@@ -1,0 +1,386 @@
+"""The bus part of a plan against the budget table of the cell, and what does not fit."""
+
+import importlib.resources
+import math
+import re
+from types import SimpleNamespace
+
+import pytest
+from scenes import change, reasons, refused, ways_out, without_torque
+
+import canprobe
+from canprobe.planning.devices import Abilities, identifier_problems
+from canprobe.planning.model import PlannedPdo
+from canprobe.planning.report import plan_dict
+from canprobe.planning.traffic import controller_starts
+from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.scene.load import dump_scene, load_scene, parse_scene
+
+
+@pytest.fixture(scope="module")
+def cylinder():
+    return load_scene("cylinder")
+
+
+@pytest.fixture(scope="module")
+def cylinder_plan(cylinder):
+    return canprobe.plan(cylinder)
+
+
+# Independent truth: 55 + 10 n bits a frame, counted by hand from the mapping table; shares of 1 Mbit/s.
+SYNC, DRIVE_TPDO, DRIVE_RPDO, FULL, CONTROLWORD = 65, 135, 115, 135, 75
+
+
+@pytest.mark.parametrize(
+    ("name", "sections", "part", "bits_per_second", "percent"),
+    [
+        ("free", {}, ("SYNC", "drives"), 400 * (SYNC + 6 * (DRIVE_TPDO + DRIVE_RPDO)), 63),
+        (
+            "free",
+            {"arm": {"grouped_rpdo": True}},
+            ("SYNC", "drives"),
+            400 * (SYNC + 6 * DRIVE_TPDO + 3 * FULL) + 10 * 6 * CONTROLWORD,
+            51.65,
+        ),
+        ("listen", {"sensor": {"mode": "image"}}, ("tactile",), 200 * 33 * FULL, 89),
+        ("listen", {}, ("tactile",), 200 * 9 * FULL, 24),
+        ("listen", {"sensor": {"mode": "features"}}, ("tactile",), 200 * 2 * FULL, 5.4),
+        ("cylinder", {}, ("SYNC", "drives", "tactile"), 626_000 + 243_000, 87),
+    ],
+)
+def test_budget_table(name, sections, part, bits_per_second, percent):
+    plan = canprobe.plan(change(load_scene(name), **sections))
+    load = sum(share for what, share in plan.traffic.parts if what in part)
+    assert load == pytest.approx(bits_per_second / 1e6)
+    assert 100 * load == pytest.approx(percent, abs=0.5)
+    heartbeats = 10 * 65 * (len(plan.nodes) + 1) / 1e6
+    assert plan.traffic.load == pytest.approx(sum(share for _, share in plan.traffic.parts), abs=1e-6)
+    assert dict(plan.traffic.parts)["heartbeats"] == pytest.approx(heartbeats)
+
+
+@pytest.mark.parametrize(
+    ("sections", "drives_us", "tactile_us"),
+    [({}, 1565, 4345), ({"arm": {"grouped_rpdo": True}}, 1280, 3775)],
+)
+def test_peak_demand_behind_one_sync(cylinder, sections, drives_us, tactile_us):
+    plan = canprobe.plan(change(cylinder, **sections))
+    one, two = plan.traffic.demands
+    assert (one.cycles, one.used_ns, one.available_ns) == (1, drives_us * 1000, 2_500_000)
+    assert (two.cycles, two.used_ns, two.available_ns) == (2, tactile_us * 1000, 5_000_000)
+
+
+def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
+    error = refused(change(cylinder, sensor={"mode": "image"}))
+    assert any("worst-case load 152 %" in problem for problem in error.problems)
+    assert any("7585 µs of the 5000 µs in 2 cycles" in problem for problem in error.problems)
+    assert error.ways_out == (
+        'sensor.mode = "window": load 87 %, peak 4345 of 5000 µs',
+        'sensor.mode = "features": load 69 %, peak 3400 of 5000 µs',
+        'a bus of its own for the sensor (sensor.channel = "can1"): load 92 %, peak 4585 of 5000 µs',
+        'CAN FD: bus.fd = true and sensor.eds = "tactile_array_fd.eds": load 79 %, peak 3937 of 5000 µs',
+        "cycle.rate_hz = 250 with sensor.rate_hz = 125: load 95 %, peak 7585 of 8000 µs",
+    ), "grouping alone does not make it fit and must not be named"
+    assert str(error).splitlines()[-1] == f"  {error.ways_out[-1]}"
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"sensor": {"mode": "image"}},
+        {"sensor": {"window": 12}},
+        {"bus": {"transmit_queue": "fifo"}},
+        {"cycle": {"rate_hz": 500.0}, "sensor": {"rate_hz": 250.0}},
+    ],
+)
+def test_ways_out_written_into_the_scene_file_make_it_fit(cylinder, sections):
+    """As a user would: what a way out names goes into the file, nothing else."""
+    scene = change(cylinder, **sections)
+    for way in ways_out(scene):
+        text, numbers = way.rsplit(": ", 1)
+        file = dump_scene(scene)
+        for section, key, value in re.findall(r'(\w+)\.(\w+) = ("[^"]*"|[\w.]+)', text):
+            head, name, tail = file.partition(f"[{section}]\n")
+            file = f"{head}{name}{key} = {value}\n" + re.sub(rf"^{key} = .*\n", "", tail, count=1, flags=re.M)
+        for key in re.findall(r"without sensor\.(\w+)", text):
+            file = re.sub(rf"^{key} = .*\n", "", file, count=1, flags=re.M)
+        plan = canprobe.plan(parse_scene(file))
+        assert f"load {100 * max(bus.traffic.load for bus in plan.buses):.0f} %" in numbers, way
+
+
+def test_average_below_one_but_peak_too_high_is_refused(cylinder):
+    """At 50 Hz the image takes 85 % on average, yet a frame is not through before its deadline of two cycles."""
+    problems = reasons(change(cylinder, sensor={"mode": "image", "rate_hz": 50.0}))
+    assert not any("load" in problem for problem in problems)
+    assert any("7585 µs of the 5000 µs" in problem for problem in problems)
+
+
+def test_slower_bus_is_refused_and_the_faster_one_named(cylinder):
+    assert ways_out(change(cylinder, bus={"bitrate": 500_000}))[0].startswith("bus.bitrate = 1000000: ")
+
+
+def test_six_drives_alone_end_at_500_hz():
+    """At 625 Hz 1565 of 1600 µs would do for the bus, but the controller needs its time between TPDOs and RPDOs."""
+    free = load_scene("free")
+    assert canprobe.plan(change(free, cycle={"rate_hz": 500.0})).traffic.load < 0.8
+    error = refused(change(free, cycle={"rate_hz": 625.0}))
+    (problem,) = error.problems
+    assert "takes 200 µs (cycle.compute_us)" in problem and "behind the next SYNC" in problem
+    assert error.ways_out[-1].startswith("cycle.rate_hz = 500: ")
+    assert any("worst-case load" in problem for problem in reasons(change(free, cycle={"rate_hz": 1000.0})))
+
+
+@pytest.mark.parametrize(
+    ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
+)
+def test_sync_period(rate, period_us, units):
+    sync = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)})).sync
+    assert (sync.period_us, sync.period_ns, sync.interpolation_100us) == (period_us, period_us * 1000, units)
+    assert sync.overflow == 240
+
+
+@pytest.mark.parametrize(("rate", "near"), [(300.0, "294.118 or 303.03"), (440.0, "434.783 or 454.545")])
+def test_sync_period_that_60c2h_cannot_hold(rate, near):
+    (problem,) = reasons(change(load_scene("free"), cycle={"rate_hz": rate}))
+    assert near in problem
+
+
+def test_sync_period_of_a_sensor_alone_needs_only_whole_microseconds():
+    scene = change(load_scene("listen"), cycle={"rate_hz": 320.0}, sensor={"rate_hz": 160.0})
+    assert canprobe.plan(scene).sync.period_us == 3125
+    (problem,) = reasons(change(scene, cycle={"rate_hz": 300.0}, sensor={"rate_hz": 150.0}))
+    assert "1006h counts µs" in problem
+
+
+def test_sync_too_slow_for_60c2h():
+    assert any("at most 255" in problem for problem in reasons(change(load_scene("free"), cycle={"rate_hz": 20.0})))
+
+
+@pytest.mark.parametrize("rate", [150.0, 300.0, 400 / 7])
+def test_tactile_rate_that_no_trigger_gives(cylinder, rate):
+    problems = reasons(change(cylinder, sensor={"rate_hz": rate}))
+    assert [problem for problem in problems if "sensor.rate_hz" in problem.split("=")[0]]
+
+
+@pytest.mark.parametrize("ratio", [1, 2, 3, 4, 8, 240])
+def test_tactile_trigger(ratio):
+    plan = canprobe.plan(change(load_scene("listen"), sensor={"rate_hz": 400 / ratio}))
+    assert {pdo.transmission_type for pdo in plan.pdos} == {ratio}
+    assert 240 % ratio == 0
+    assert {pdo.deadline_ns for pdo in plan.pdos} == {min(2, ratio) * 2_500_000}
+
+
+def test_identifiers_and_mappings_of_the_default_cell(cylinder_plan):
+    found = {pdo.cob_id: [(e.index, e.subindex, e.bits) for e in pdo.entries] for pdo in cylinder_plan.pdos}
+    tpdo = [(0x6041, 0, 16), (0x6064, 0, 32), (0x6077, 0, 16)]
+    rpdo = [(0x6040, 0, 16), (0x607A, 0, 32)]
+    window = {0x511: [(0x2120, 0, 64)]} | {0x511 + row: [(0x2110, row, 64)] for row in range(1, 9)}
+    drives = {0x180 + i: tpdo for i in range(1, 7)} | {0x200 + i: rpdo for i in range(1, 7)}
+    assert found == drives | window
+    assert [pdo.cob_id for pdo in cylinder_plan.pdos] == sorted(found)
+    signed = {(e.index, e.signed) for pdo in cylinder_plan.pdos for e in pdo.entries if e.index >= 0x6000}
+    assert signed == {(0x6041, False), (0x6040, False), (0x6064, True), (0x607A, True), (0x6077, True)}
+
+
+@pytest.mark.parametrize(
+    ("mode", "last", "first_object"), [("image", 0x531, (0x2120, 0)), ("features", 0x512, (0x2130, 1))]
+)
+def test_identifiers_of_other_modes(mode, last, first_object):
+    pdos = canprobe.plan(change(load_scene("listen"), sensor={"mode": mode})).pdos
+    assert [pdo.cob_id for pdo in pdos] == list(range(0x511, last + 1))
+    assert (pdos[0].entries[0].index, pdos[0].entries[0].subindex) == first_object
+
+
+def test_grouped_targets_share_an_rpdo_through_dummies():
+    plan = canprobe.plan(change(load_scene("free"), arm={"grouped_rpdo": True}))
+    shared = {(pdo.node_id, pdo.cob_id): [e.index for e in pdo.entries] for pdo in plan.pdos if pdo.number == 2}
+    assert shared == {
+        (1, 0x301): [0x607A, 4], (2, 0x301): [4, 0x607A], (3, 0x303): [0x607A, 4],
+        (4, 0x303): [4, 0x607A], (5, 0x305): [0x607A, 4], (6, 0x305): [4, 0x607A],
+    }  # fmt: skip
+    words = [pdo for pdo in plan.pdos if pdo.direction == "rpdo" and pdo.number == 1]
+    assert {(pdo.transmission_type, pdo.event_timer_ms, pdo.rate_hz, pdo.layout.length) for pdo in words} == {
+        (255, 250, 10, 2)
+    }
+
+
+def test_every_message_meets_its_deadline_and_tactile_waits_for_all_drives(cylinder_plan):
+    assert all(pdo.response_ns <= pdo.deadline_ns for pdo in cylinder_plan.pdos)
+    tactile = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id == 16]
+    drives = [pdo.cob_id for pdo in cylinder_plan.pdos if pdo.node_id != 16]
+    assert min(tactile) > max(drives)
+    assert max(pdo.response_ns for pdo in cylinder_plan.pdos) == (4345 + 200) * 1000  # from the end of a late SYNC
+
+
+def test_nodes_with_identity_and_what_is_switched_off(cylinder_plan):
+    assert cylinder_plan.node_ids == (1, 2, 3, 4, 5, 6, 16)
+    joint, sensor = cylinder_plan.nodes[0], cylinder_plan.nodes[-1]
+    assert (joint.kind, joint.role, joint.emulated) == ("drive", "joint 1", True)
+    assert (joint.identity.vendor_id, joint.identity.product_code) == (0xCA5E, 0x260)
+    assert (sensor.kind, sensor.identity.product_code) == ("tactile", 0x1616)
+    assert ("rpdo", 2) in joint.switched_off
+    assert ("tpdo", 1) not in joint.switched_off
+    assert [number for direction, number in sensor.switched_off if direction == "tpdo"] == list(range(10, 34))
+
+
+def test_frames_that_may_be_on_the_bus(cylinder_plan):
+    ids = cylinder_plan.frame_ids
+    assert {0x000, 0x080, 0x081, 0x090, 0x181, 0x206, 0x519, 0x590, 0x610, 0x701, 0x710, 0x77F} <= ids
+    assert not {0x100, 0x187, 0x190, 0x301, 0x510, 0x51A, 0x711} & ids
+
+
+def test_order_of_node_ids_is_the_order_of_joints():
+    plan = canprobe.plan(change(load_scene("free"), arm={"node_ids": (16, 5, 4, 3, 2, 1)}))
+    assert {node.node_id: node.role for node in plan.nodes}[16] == "joint 1"
+    assert plan.node_ids == (1, 2, 3, 4, 5, 16)
+
+
+def _pdo(cob_id, node_id, direction):
+    layout = PdoLayout(cob_id, (PdoEntry(0x6041, 0, 16),))
+    return PlannedPdo(node_id, direction, 1, layout, 400.0, 75, 2_500_000)
+
+
+@pytest.mark.parametrize(
+    ("pdos", "count"),
+    [
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x182, 2, "tpdo")], 0),
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x181, 2, "tpdo")], 1),
+        ([_pdo(0x181, 1, "tpdo"), _pdo(0x181, 2, "rpdo")], 1),
+        ([_pdo(0x301, 1, "rpdo"), _pdo(0x301, 2, "rpdo")], 0),
+        ([_pdo(0x180, 1, "tpdo")], 1),
+        ([_pdo(0x701, 1, "tpdo"), _pdo(0x6E0, 1, "tpdo"), _pdo(0x101, 1, "rpdo")], 3),
+    ],
+)
+def test_restricted_and_duplicate_identifiers(pdos, count):
+    assert len(identifier_problems(pdos)) == count
+
+
+class TestOtherDevices:
+    """The plan works from what an EDS really offers."""
+
+    @pytest.fixture
+    def edit(self, tmp_path):
+        def edit(*replacements):
+            text = (importlib.resources.files("canprobe.eds") / "puma260_joint.eds").read_text()
+            for pattern, new in replacements:
+                text, count = re.subn(pattern, new, text, flags=re.DOTALL)
+                assert count, pattern
+            path = tmp_path / "other.eds"
+            path.write_text(text)
+            return change(load_scene("free"), arm={"eds": str(path)})
+
+        return edit
+
+    def test_unknown_eds(self):
+        assert "no such packaged file" in reasons(change(load_scene("free"), arm={"eds": "puma261_joint.eds"}))[0]
+
+    def test_without_dummies_targets_stay_single_and_it_says_so(self, edit):
+        scene = change(edit((r"Dummy0004=1", "Dummy0004=0")), arm={"grouped_rpdo": True})
+        plan = canprobe.plan(scene)
+        assert {pdo.number for pdo in plan.pdos} == {1}
+        ((what, why),) = plan.not_available
+        assert what == "two targets in one RPDO"
+        assert "0004h" in why
+
+    @pytest.mark.parametrize(
+        ("fixed", "why"),
+        [
+            (False, ": 6077h is not mappable to a TPDO"),
+            (True, ": TPDO1 has the fixed mapping 60410010h, 60640020h"),
+        ],
+    )
+    def test_torque_that_cannot_be_mapped_is_left_away_and_it_says_so(self, tmp_path, fixed, why):
+        plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
+        assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
+        assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
+
+    def test_target_that_cannot_be_mapped_is_refused(self, edit):
+        problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
+        assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
+
+    def test_fixed_mapping_is_used_where_it_is_the_right_one(self, edit):
+        assert canprobe.plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
+
+    def test_fixed_mapping_that_is_another_is_refused(self, edit):
+        problems = reasons(
+            edit(
+                (r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro"),
+                (r"(\[1600sub2\][^\[]*DefaultValue=)\w+", r"\g<1>0x60FF0020"),
+            )
+        )
+        assert len(problems) == 6
+        assert all("fixed mapping 60400010h, 60FF0020h" in problem for problem in problems)
+
+    def test_missing_objects_are_named(self, edit):
+        problems = reasons(edit((r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")))
+        assert any("60C2h (interpolation time period) is missing" in problem for problem in problems)
+
+    def test_abilities_read_from_the_packaged_eds(self):
+        device = Abilities.of("puma260_joint.eds", 1)
+        assert device.entry(0x6064, 0, "tpdo").signed
+        assert device.entry(0x6064, 0, "rpdo") is None, "a read-only object cannot be received"
+        assert device.entry(0x607A, 0, "rpdo").bits == 32
+        assert device.dummy(4, 32).is_dummy
+        assert device.dummy(1, 8) is None
+        assert device.pdo_numbers("rpdo") == (1, 2, 3, 4)
+        assert device.fixed_mapping("tpdo", 1)[0] == 0x60410010
+        assert device.active_by_default("rpdo", 1)
+
+
+def test_plan_is_finite_everywhere(cylinder_plan):
+    def check(value):
+        if isinstance(value, float):
+            assert math.isfinite(value)
+        for item in value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ():
+            check(item)
+
+    check(plan_dict(cylinder_plan))
+
+
+# --- the budget of one cycle, added up by hand: what each part waits for, in the order of the bus ------------------
+
+HEARTBEAT = 65
+
+
+@pytest.mark.parametrize(
+    ("name", "sections", "sync_blocked", "sneaks_in", "compute"),
+    [
+        ("free", {"cycle": {"rate_hz": 500.0}}, HEARTBEAT, HEARTBEAT, 200),
+        ("free", {"cycle": {"compute_us": 0.0}}, HEARTBEAT, HEARTBEAT, 0),
+        ("cylinder", {}, FULL, FULL, 200),  # a tactile PDO of the cycle before
+    ],
+)
+def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
+    plan = canprobe.plan(change(load_scene(name), **sections))
+    budget = plan.traffic.budget
+    sync = sync_blocked + SYNC
+    feedback = sync + sneaks_in + 6 * DRIVE_TPDO
+    commands = feedback + compute + sneaks_in + 6 * DRIVE_RPDO
+    assert (budget.sync_ns, budget.feedback_ns, budget.commands_ns) == (sync * 1000, feedback * 1000, commands * 1000)
+    assert (budget.start_ns, budget.compute_ns) == (feedback * 1000, compute * 1000)
+    assert budget.slack_ns == plan.sync.period_ns - commands * 1000
+    assert budget.bus_ns + budget.compute_ns + budget.slack_ns == plan.sync.period_ns
+    assert budget.feedback_ns in budget.looks_ns
+
+
+@pytest.mark.parametrize(("best_us", "starts_us"), [(300, (625, 1145)), (900, (900, 1145))])
+def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(best_us, starts_us):
+    messages = SimpleNamespace(feedback=("some",), best_feedback_ns=best_us * 1000)
+    starts = controller_starts(messages, (625_000, 1_145_000, 1_500_000), 1_145_000)
+    assert starts == tuple(us * 1000 for us in starts_us)
+
+
+def test_a_controller_that_takes_too_long_is_refused(cylinder):
+    budget = canprobe.plan(cylinder).traffic.budget
+    longest = (budget.slack_ns + budget.compute_ns) / 1000
+    assert canprobe.plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
+    longer = change(cylinder, cycle={"compute_us": longest + 1})
+    assert "1 µs behind the next SYNC" in reasons(longer)[0]
+    assert f"cycle.compute_us = {longest:.0f}" in [way.partition(":")[0] for way in ways_out(longer)]
+
+
+def test_a_sensor_alone_has_a_budget_too():
+    budget = canprobe.plan(load_scene("listen")).traffic.budget
+    assert (budget.feedback_ns, budget.commands_ns) == (None, None)
+    assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
+    assert budget.looks_ns == (625_000, 1_500_000)
+    assert budget.slack_ns == 2_500_000 - 625_000 - 200_000
