@@ -15,9 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Never, cast
 
 import canopen
-from canopen.emcy import EmcyConsumer, EmcyError
 from canopen.lss import LssError, LssMaster
-from canopen.nmt import NmtError, NmtMaster
 from canopen.node.remote import RemoteNode
 from canopen.sdo.client import SdoClient
 from canopen.sdo.exceptions import SdoCommunicationError
@@ -239,12 +237,7 @@ class PumpedNetwork(canopen.Network):
 
 
 class PumpedNode(RemoteNode):
-    """A canopen `RemoteNode` whose SDO, NMT and EMCY waits pump the network."""
-
-    def __init__(self, node_id: int, object_dictionary: Any, load_od: bool = False) -> None:
-        super().__init__(node_id, object_dictionary, load_od)
-        self.nmt = PumpedNmt(cast(int, self.id))
-        self.emcy = PumpedEmcy(self)
+    """A canopen `RemoteNode` whose SDO waits pump the network."""
 
     def add_sdo(self, rx_cobid: int, tx_cobid: int) -> PumpedSdoClient:
         """Add an SDO client on these identifiers."""
@@ -279,41 +272,6 @@ class PumpedSdoClient(SdoClient):
             raise SdoCommunicationError("No SDO response received")
         response: bytes = super().read_response()  # type: ignore[no-untyped-call]
         return response
-
-
-class PumpedNmt(NmtMaster):
-    """canopen's NMT master with waits that receive."""
-
-    def wait_for_heartbeat(self, timeout: float = 10) -> str:
-        """Wait for a heartbeat or boot-up and return the state it tells; NmtError if none comes in `timeout` s."""
-        self._state_received = None
-        if not cast(PumpedNetwork, self.network).pump_until(lambda: self._state_received is not None, timeout):
-            raise NmtError("No boot-up or heartbeat received")
-        return str(self.state)
-
-    def wait_for_bootup(self, timeout: float = 10) -> None:
-        """Wait for a boot-up message; NmtError if none comes in `timeout` s."""
-        self._state_received = None
-        if not cast(PumpedNetwork, self.network).pump_until(lambda: self._state_received == 0, timeout):
-            raise NmtError("Timeout waiting for boot-up message")
-
-
-class PumpedEmcy(EmcyConsumer):
-    """canopen's EMCY consumer with a wait that receives."""
-
-    def __init__(self, node: PumpedNode) -> None:
-        super().__init__()  # type: ignore[no-untyped-call]
-        self._node = node
-
-    def wait(self, emcy_code: int | None = None, timeout: float = 10) -> EmcyError | None:  # type: ignore[override]
-        """Wait for the next EMCY, of that code if given; `None` if none comes in `timeout` s."""
-        first = len(self.log)
-
-        def new() -> list[EmcyError]:
-            return [e for e in self.log[first:] if emcy_code is None or e.code == emcy_code]
-
-        network = cast(PumpedNetwork, self._node.network)
-        return new()[0] if network.pump_until(lambda: bool(new()), timeout) else None
 
 
 # Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too.

@@ -29,7 +29,6 @@ COMMANDS = (
     "scan",
     "monitor",
     "replay",
-    "log",
     "view",
     "study",
     "vcan",

@@ -262,7 +262,7 @@ REGION: Mapping[str, float] = MappingProxyType(
 point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
 a point over the spread of the points where that is narrowest: beyond, a path is not well excited.
 
-From what a local quadric can mean; `canprobe study region`, a pilot with seeds of its own, says how far in each holds.
+From what a local quadric can mean.
 """
 
 

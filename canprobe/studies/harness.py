@@ -37,7 +37,6 @@ STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
         "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
-        "region": "a pilot of `bound`: how far out the bound means something, by what limits it",
         "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
         "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import canopen
 import pytest
-from canopen.nmt import NmtError
 from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
@@ -178,35 +177,8 @@ def test_foreign_frames_of_a_wait_go_to_the_callback(cell: Cell) -> None:
     slave.say(1 * MS, 0x185, b"pdo")
     slave.say(2 * MS, 0x705 | RTR_FLAG, b"")
     slave.say(3 * MS, 0x705, b"\x05")
-    assert network[5].nmt.wait_for_heartbeat(1.0) == "OPERATIONAL"
+    assert network.pump_until(lambda: network[5].nmt.state == "OPERATIONAL", 1.0)
     assert others == [(0x185, b"pdo", 1 * MS), (0x705 | RTR_FLAG, b"", 2 * MS)]
-
-
-def test_nmt_boot_up_heartbeat_and_command(cell: Cell) -> None:
-    network, slave, bus = cell
-    nmt = network[5].nmt
-    slave.say(2 * MS, 0x705, b"\x7f")
-    slave.say(4 * MS, 0x705, b"\x00")
-    nmt.wait_for_bootup(1.0)
-    assert (bus.clock.now_ns(), nmt.state) == (4 * MS, "PRE-OPERATIONAL")
-    with pytest.raises(NmtError):
-        nmt.wait_for_heartbeat(0.5)
-    with pytest.raises(NmtError):
-        nmt.wait_for_bootup(0.5)
-    assert bus.clock.now_ns() == 1004 * MS
-    nmt.state = "OPERATIONAL"
-    assert slave.node.nmt.state == "OPERATIONAL"
-
-
-def test_emcy_is_waited_for_by_code(cell: Cell) -> None:
-    network, slave, bus = cell
-    slave.say(1 * MS, 0x085, b"\x10\x82\x11abcde")
-    slave.say(2 * MS, 0x085, b"\x11\x86\x21abcde")
-    emcy = network[5].emcy.wait(0x8611, timeout=1.0)
-    assert (emcy.code, emcy.register, emcy.data, emcy.timestamp) == (0x8611, 0x21, b"abcde", pytest.approx(0.002))
-    assert network[5].emcy.wait(timeout=1.0) is None
-    assert bus.clock.now_ns() == 1002 * MS
-    assert [e.code for e in network[5].emcy.active] == [0x8210, 0x8611]
 
 
 def test_feed_gives_frames_that_the_cycle_drained(cell: Cell) -> None:

@@ -85,14 +85,14 @@ def test_what_is_no_scene_and_what_is_no_object():
 def test_nobody_behind_it_reads_the_scene():
     """`Plan.scene` is there for who writes or sends it: sessions, results, bridges, studies, the command line."""
     wrong = []
-    for room in ("planning", "cell", "emulator", "robot", "touch"):
+    for room in ("planning", "cell", "tasks", "emulator", "robot", "touch"):
         for path in sorted((PACKAGE / room).rglob("*.py")):
             if path.relative_to(PACKAGE) == Path("planning/model.py"):
                 continue
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
                 if isinstance(node, ast.ImportFrom) and node.module in (
                     "canprobe.scene.model",
-                    "canprobe.scene_loader",
+                    "canprobe.scene.load",
                 ):
                     wrong.append(f"{path}:{node.lineno} imports {node.module}")
                 if isinstance(node, ast.Attribute) and node.attr == "scene":

@@ -8,6 +8,7 @@ import bridges_bench as bridges
 import matplotlib.image
 import numpy as np
 import pytest
+from canprobe.studies.region import draw_region
 from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -26,7 +27,6 @@ from canprobe.studies.faults import draw_ends, draw_faults
 from canprobe.studies.pipeline import draw_pipeline
 from canprobe.studies.realtime import draw_realtime
 from canprobe.studies.realtime_cases import CycleTimes, Measured
-from canprobe.studies.region import draw_region
 from canprobe.studies.soak import Sample, draw_soak
 from canprobe.studies.workprec import draw_workprec
 from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
