@@ -116,7 +116,7 @@ def test_links_pictures_and_names_of_commands(page):
 
 
 def test_the_table_of_conditions_is_the_one_that_supervises():
-    assert markdown_table() in TEXTS["docs/supervision.md"], "print it: canprobe.cell.conditions"
+    assert markdown_table() in TEXTS["docs/supervision.md"], "type: python docs/generate.py"
 
 
 def test_the_readme_stays_short():

@@ -2,7 +2,7 @@
 
 Field names are the TOML keys and carry their unit. A section that is None is absent and left out of the plan. A field
 says everything about its key: type and checks, default, and below it the meaning. `canprobe.scene.load` needs no
-more than that, and `docs/scene_keys.py` makes the reference of all keys from it.
+more than that, and `docs/generate.py` makes the reference of all keys from it.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The page of all scene keys, from the dataclasses of a scene: `python docs/scene_keys.py > docs/scene-keys.md`."""
+"""What the pages take from the code: all keys of a scene, and the table of conditions. `python docs/generate.py`."""
 
 from __future__ import annotations
 
@@ -6,15 +6,19 @@ import ast
 import dataclasses
 import inspect
 import itertools
+import re
 import typing
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
-from canprobe.scene import Scene
+from canprobe.cell.conditions import markdown_table
 from canprobe.scene.checks import Only, conditions_of, expected
 from canprobe.scene.load import toml_value
+from canprobe.scene.model import Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK
 
+DOCS = Path(__file__).parent
 UNITS = {  # the longest suffix that fits
     "bitrate": "bit/s",
     "n_m3": "N/m³",
@@ -43,7 +47,7 @@ misspelt, the name that was probably meant.
 A key that a scene leaves out has its default. The suffix of a key is its unit. Numbers may be written with or without
 a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.
 
-This page is generated from the definition of a scene: `python docs/scene_keys.py > docs/scene-keys.md`.
+This page is generated from the definition of a scene: `python docs/generate.py`.
 
 ## Sections and tasks
 
@@ -54,8 +58,8 @@ section is an error.
 """
 
 
-def page() -> str:
-    """The whole page."""
+def scene_keys() -> str:
+    """The page of all scene keys."""
     sections = [(name, _class_of(hint)) for name, hint in typing.get_type_hints(Scene).items()]
     return "\n".join([INTRODUCTION, *_needs(), "", *(line for name, cls in sections for line in _section(name, cls))])
 
@@ -88,7 +92,7 @@ def _needs() -> Iterator[str]:
 def _section(name: str, cls: type[Any]) -> Iterator[str]:
     head, _, rest = (inspect.getdoc(cls) or "").partition("\n\n")
     about = head.partition(": ")[2].replace("\n", " ")
-    yield f"## `[{name}]` {{#{name}}}\n"
+    yield f"## `[{name}]`\n"
     yield about[0].upper() + about[1:]
     if rest:
         yield f"\n{rest}"
@@ -123,5 +127,12 @@ def _condition(only: Only) -> str:
     return f"*{'Required' if only.required else 'Only'} with `{only.key}` = {values}.*"
 
 
+def with_conditions(page: str) -> str:
+    """The page of the supervision with the table as it is now in the place of the one that it has."""
+    return re.sub(r"(?m)^\| what \|(?:.*\n)(?:\|.*\n)+", lambda _: markdown_table(), page)
+
+
 if __name__ == "__main__":
-    print(page(), end="")
+    (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
+    supervision = DOCS / "supervision.md"
+    supervision.write_text(with_conditions(supervision.read_text(encoding="utf-8")), encoding="utf-8")
