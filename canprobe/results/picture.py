@@ -62,7 +62,7 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
     with rc_context(dict(_STYLE)):
         figure = Figure(figsize=(WIDTH_IN, height_in), dpi=DPI, layout="constrained")
         lines = [part for line in title.splitlines() for part in textwrap.wrap(line, 118)]
-        figure.suptitle("\n".join(lines), x=0.01, ha="left")
+        figure.suptitle("\n".join(lines), x=0.01, ha="left", parse_math=False)
         yield figure
         with whole_file(path) as part:
             figure.savefig(part, format=path.suffix[1:] or "png")
@@ -102,7 +102,8 @@ class _LogTicks(LogLocator):
     def tick_values(self, vmin: float, vmax: float) -> Sequence[float]:
         axis: Any = self.axis
         room = axis.get_tick_space() / math.log10(vmax / vmin)
-        self.set_params(subs=(1.0, 2.0, 3.0, 5.0, 7.0) if room > 6 else (1.0, 2.0, 5.0) if room > 4 else (1.0,))
+        few = (1.0, 2.0, 5.0) if room > 4 or vmax < 10 * vmin else (1.0,)  # else there could be none
+        self.set_params(subs=(1.0, 2.0, 3.0, 5.0, 7.0) if room > 6 else few)
         return super().tick_values(vmin, vmax)
 
 

@@ -182,7 +182,9 @@ def bridge_bars(path):
 
 FOUND = {"tool_centre_mm": [0.394, None, 80.478], "sigma_mm": [0.05, None, 0.08], "believed_mm": [0.0, 0.0, 80.0],
          "true_mm": [0.4, -0.3, 80.5], "touches": 13}  # fmt: skip
-REASON = "node 3 lost: no heartbeat for 250 ms; " + "quick stop of every drive, the probe was lifted off; " * 3
+REASON = (
+    "node 3 lost: $no frame^^$, no heartbeat for 250 ms; " + "quick stop of every drive, the probe was lifted off; " * 3
+)
 PICTURES = {
     "plane, stopped": draw_scene("plane", 1.5, completed=False, stop_reason=REASON),
     "axial, surface": draw_scene("axial", 1.5, draw=draw_surface),
