@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 from canprobe.bus.disk import whole_file
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
-from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import BusError, CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
@@ -27,8 +27,9 @@ from canprobe.session.links import check_links, need_controllers
 from canprobe.session.session import LOCKSTEP, Say, Session, hush_canopen, open_ports, quiet, resolve_scene
 from canprobe.session.up import check_joints, news_teller, telling_notes
 from canprobe.tasks.from_plan import make_task
-from canprobe.tasks.shape import ShapeRecord, on_run_clock
-from canprobe.tasks.untouched import _Hold
+from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
+from canprobe.tasks.task import record_of
+from canprobe.tasks.untouched import HoldTask
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
@@ -125,7 +126,7 @@ def _requested(
 ) -> Controller:
     """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
     if not bridges.requests:
-        return task if task is not None else _Hold()
+        return task if task is not None else HoldTask()
     from canprobe.tasks.from_plan import RequestedTask
 
     return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
@@ -165,9 +166,8 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
     return lambda measurement: progress(min(measurement.t_ns * 1e-9, total_s), total_s)
 
 
-def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]:
+def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
     """What the estimator in the loop said, and the others on the same contacts."""
-    tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
         return {}
     from canprobe.tasks.from_plan import estimates_of
@@ -176,10 +176,9 @@ def _estimates(scene: Scene, controller: object) -> dict[str, list[ShapeRecord]]
 
 
 def _mapped(
-    scene: Scene, controller: object, start_s: float
+    scene: Scene, tracker: ShapeTracker | None, start_s: float
 ) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
     """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
-    tracker = getattr(controller, "shape", None)
     if tracker is None or scene.shape is None:
         return None, None, None
     from canprobe.results.scores import map_of_scan, summarise_map
@@ -240,7 +239,7 @@ class OpenCell(Session):
         self._bridges = Bridges(plan, out, virtual=plan.scene.bus.interface == LOCKSTEP, say=say)
         self._watchers = tuple(observers)
         self._task = task
-        self._last: object = task
+        self._last: Controller | None = task
         self._result = RunResult.__new__(RunResult)
 
     def __enter__(self) -> Self:
@@ -278,9 +277,10 @@ class OpenCell(Session):
         Returns:
             The result of the whole block, the same from every call; it is complete when the block is left.
         """
+        runs = as_controller(controller)
         if self._task is None:
-            self._last = controller
-        super().run(controller, progress)
+            self._last = runs
+        super().run(runs, progress)
         return self._result
 
     def open_to_requests(self, task: Controller) -> Controller:
@@ -296,12 +296,12 @@ class OpenCell(Session):
             self._bridges.end(None)
 
     def _conclude(self, failure: BaseException | None) -> None:
-        controller, start_s = self._last, self.cell.start_ns * 1e-9
-        estimates = _estimates(self.scene, controller)
-        surface_map, consistency, map_summary = _mapped(self.scene, controller, start_s)
+        record, start_s = record_of(self._last), self.cell.start_ns * 1e-9
+        estimates = _estimates(self.scene, record.shape)
+        surface_map, consistency, map_summary = _mapped(self.scene, record.shape, start_s)
         summary = summarise(
             self,
-            controller,
+            record,
             estimates,
             None if failure is None else _reason(failure),
             map_summary=map_summary,
@@ -315,7 +315,7 @@ class OpenCell(Session):
             log_columns(self.cell),
             self.truth,
             {name: on_run_clock(records, start_s) for name, records in estimates.items()},
-            getattr(controller, "taxels", None),
+            record.taxels,
             surface_map,
             consistency,
             self.out,

@@ -12,7 +12,7 @@ from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters, TimedFrame
 from canprobe.bus.scheduling import Interrupts
 from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
-from canprobe.cell.controller import Command, Controller, Measurement, TactileSample
+from canprobe.cell.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.cycle import Cycle, CycleSettings, Observers
 from canprobe.cell.drives import DriveGroup, TactileReceiver, Vector
 from canprobe.cell.log import Notes, RunLog
@@ -109,7 +109,7 @@ class Cell:
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
-        self._tracker: object = None
+        self._controller = Controller()
         for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
             for base in (HEARTBEAT_BASE, EMCY_BASE):
                 self._network.subscribe(base + node_id, self._watched)
@@ -195,12 +195,7 @@ class Cell:
         """Enable the drives, then run ``controller`` until it says done.
 
         Args:
-            controller: has ``step(measurement) → command``, or is such a function. Where it has ``retreat(reason)`` the
-                cell asks it to let go before it stops for a reason that leaves time for that, and leaves the guard of
-                the contact to it; without, the cell takes the probe off the object itself. Where it has ``inspect(q)``
-                it sees the joint angles (6,), rad, before the drives are enabled, and may say why they must not be.
-                Where it has ``update()`` that is called when the commands of a step are out: for work that the next
-                step needs and these commands need not wait for.
+            controller: a `Controller`, or a function of the measurement that returns a command.
             progress: called after each cycle.
 
         Raises:
@@ -210,35 +205,28 @@ class Cell:
             NodeError: a node was lost or failed.
             InterfaceError: the bus was lost.
         """
-        step = controller.step if hasattr(controller, "step") else controller
-        if not callable(step):
-            raise UsageError(f"controller: expected a function or something with step(measurement), got {controller!r}")
+        runs = as_controller(controller)
         if self._running:
             raise UsageError("the cell runs a controller already, which must not run another one in its step")
         self._running = True
         try:
-            self._run(step, controller, progress)
+            self._run(runs, progress)
         finally:
             self._running = False
 
-    def _run(
-        self, step: Callable[[Measurement], Command], controller: object, progress: Callable[[Measurement], None]
-    ) -> None:
-        retreat: Callable[[str], None] | None = getattr(controller, "retreat", None)
-        update: Callable[[], None] | None = getattr(controller, "update", None)
-        self._tracker = getattr(controller, "shape", None)
+    def _run(self, controller: Controller, progress: Callable[[Measurement], None]) -> None:
+        self._controller = controller
         self._retreats_for = None
-        self._enable(getattr(controller, "inspect", None))
+        self._enable(controller.inspect)
         assert self.cycle is not None
         with Interrupts(self._stuck) as interrupts:
             while True:
                 measurement = self.cycle.begin()
-                held = self._supervise(measurement, retreat)
-                command = self._or_lift_off(self._ask, _hold if held else step, measurement, interrupts)
-                command = self._guarded(measurement, command, retreat)
+                held = self._supervise(measurement)
+                command = self._or_lift_off(self._ask, _hold if held else controller.step, measurement, interrupts)
+                command = self._guarded(measurement, command)
                 self.cycle.end(command)
-                if update is not None:
-                    self._or_lift_off(update)
+                self._or_lift_off(controller.update)
                 self.cycle.count_work()
                 self._record(measurement, command)
                 progress(measurement)
@@ -281,14 +269,14 @@ class Cell:
 
     # enabling and supervision
 
-    def _enable(self, inspect: Callable[[Vector], str | None] | None) -> None:
+    def _enable(self, inspect: Callable[[Vector], str | None]) -> None:
         if self.drives is None:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         self._cycle_until((), WARM_UP_S)
         self._await_rest()
-        if inspect is not None and (reason := inspect(self.drives.joints())) is not None:
+        if (reason := inspect(self.drives.joints())) is not None:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
@@ -336,7 +324,7 @@ class Cell:
     def _look(self, measurement: Measurement) -> None:
         assert self.cycle is not None
         self._note_alarms()
-        self.supervisor.seen.restarts = getattr(self._tracker, "restarts", 0)
+        self.supervisor.seen.restarts = self._controller.restarts
         self.supervisor.step(
             measurement,
             sync_ns=self.cycle.sync_ns,
@@ -351,33 +339,33 @@ class Cell:
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
             raise finding.error
 
-    def _supervise(self, measurement: Measurement, retreat: Callable[[str], None] | None) -> bool:
+    def _supervise(self, measurement: Measurement) -> bool:
         """Check the table's conditions; True: hold in this cycle."""
         self._look(measurement)
         finding = self.supervisor.finding()
-        if finding is None and retreat is None:
+        if finding is None and not self._controller.lets_go:
             finding = self.supervisor.guard_contact(measurement)
         if finding is None or finding.condition.reaction is not Reaction.HOLD:
             self._holding = False
             if finding is not None:
-                self._react(finding, retreat)
+                self._react(finding)
         elif not self._holding:
             self._holding = True
             self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
         return self._holding
 
-    def _guarded(self, measurement: Measurement, command: Command, retreat: Callable[[str], None] | None) -> Command:
+    def _guarded(self, measurement: Measurement, command: Command) -> Command:
         """The command that may be sent."""
         command, finding = self.supervisor.guard_target(command)
         if finding is not None:
-            self._react(finding, retreat)
+            self._react(finding)
         return command
 
-    def _react(self, finding: Finding, retreat: Callable[[str], None] | None) -> None:
+    def _react(self, finding: Finding) -> None:
         reaction = finding.condition.reaction
-        if reaction is Reaction.RETREAT and retreat is not None:
+        if reaction is Reaction.RETREAT and self._controller.lets_go:
             self._retreats_for = self._retreats_for or finding.error
-            retreat(str(finding.error))
+            self._controller.retreat(str(finding.error))
             return
         if reaction in (Reaction.RETREAT, Reaction.LIFT):
             self._lift_off(finding.error)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.errors import UsageError
 from canprobe.protocol.tactile import TactileFrame
 
 if TYPE_CHECKING:
@@ -80,8 +82,58 @@ class Command:
     estimate: SurfaceEstimate | None = None
 
 
-class Controller(Protocol):
-    """Anything with ``step(measurement) → command``; a plain function is wrapped."""
+class Controller:
+    """Base of everything that a cell can run: `step` decides a cycle, the rest does nothing unless it is overridden.
+
+    Attributes:
+        lets_go: it guards its contact itself, and takes the probe off the object when `retreat` asks for that. Without,
+            the cell does both.
+    """
+
+    lets_go: bool = False
 
     def step(self, measurement: Measurement) -> Command:
         """Decide one cycle."""
+        raise NotImplementedError(f"{type(self).__name__} has no step(measurement)")
+
+    def inspect(self, q: Vector) -> str | None:
+        """Why the drives must not be enabled where the joints are, q (n,) rad; None: they may."""
+        return None
+
+    def update(self) -> None:
+        """Work that the next step needs and this cycle's commands need not wait for; called when they are out."""
+
+    def retreat(self, reason: str) -> None:
+        """Let go, and end with this reason; asked of controllers with `lets_go` where there is time for it."""
+
+    @property
+    def restarts(self) -> int:
+        """How often its estimator diverged and started afresh."""
+        return 0
+
+
+class _Function(Controller):
+    """A plain function as a controller."""
+
+    def __init__(self, step: Callable[[Measurement], Command]) -> None:
+        self._step = step
+
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        return self._step(measurement)
+
+
+def as_controller(controller: object) -> Controller:
+    """A controller as it is, or of a function.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    if isinstance(controller, Controller):
+        return controller
+    if callable(controller) and not isinstance(controller, type):
+        return _Function(controller)
+    raise UsageError(
+        f"controller: expected a function of the measurement or a canprobe.Controller, got {controller!r}; derive its"
+        " class: class Mine(canprobe.Controller)"
+    )

@@ -268,7 +268,7 @@ def replay(
     try:
         cycles = LogCycles(plan, recording, as_taken=as_taken, drifts=folder is None)
         task = replay_task(plan, cycles)
-        tracker, unplaced = task.task.shape, task.task.unplaced
+        tracker, unplaced = task.task.shape, task.task.record().unplaced
         if not task.drove or tracker is None:
             cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=False)
             tracker, unplaced = replay_contacts(plan, cycles)

@@ -28,6 +28,7 @@ from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import LOCKSTEP, Session
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
+from canprobe.tasks.task import TaskRecord
 from canprobe.tasks.touch import losses_text, summarise_losses
 from canprobe.touch.consistency import Consistency
 from canprobe.touch.surface_map import SurfaceMap
@@ -182,7 +183,7 @@ class RunResult:
 
 def summarise(
     session: Session,
-    controller: object,
+    record: TaskRecord,
     estimates: dict[str, list[ShapeRecord]],
     stop_reason: str | None,
     *,
@@ -205,18 +206,18 @@ def summarise(
         "sim_time_s": sim_time,
         "wall_time_s": wall,
         "realtime_factor": sim_time / wall if wall > 0 else None,
-        "contact": _contact(session, controller, log),
+        "contact": _contact(session, record, log),
         "shape": summarise_shape(
             scene,
-            getattr(controller, "shape", None),
+            record.shape,
             estimates,
             _truth(session),
             log.get("t_s", np.empty(0)),
             map_summary=map_summary,
         ),
-        "calibration": summarise_calibration(scene, getattr(controller, "estimate", None)),
+        "calibration": summarise_calibration(scene, record.tool),
         "choices": [f"{choice.key} = {choice.value}: {choice.why}" for choice in session.plan.choices],
-        "cycle": _cycle(cell, controller) | {"observe_us": _observed(session)},
+        "cycle": _cycle(cell, record) | {"observe_us": _observed(session)},
         "bus_load": {
             bus.channel: {"planned_worst": bus.traffic.load, "measured": session.bus_load(bus.channel)}
             for bus in session.plan.buses
@@ -279,18 +280,13 @@ def _truth(session: Session) -> dict[str, Array]:
     return session.truth if "force" in session.truth else {}
 
 
-def _scan(controller: object) -> tuple[int, int] | None:
-    cycles = getattr(controller, "scan_cycles", None)
-    return cycles if cycles is not None and cycles[1] > cycles[0] else None
-
-
-def _contact(session: Session, controller: object, log: dict[str, Array]) -> dict[str, Any]:
-    task, scan = session.scene.task, _scan(controller) if session.keeps_all else None
+def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dict[str, Any]:
+    task, scan = session.scene.task, record.scan_cycles if session.keeps_all else None
     names = ("force_rms_error_n", "force_max_n", "contact_fraction", "speed_mean_m_s")
     target = task.force_n if task.kind in ("scan", "press") else None
     figures: dict[str, float | None] = dict.fromkeys(names)
     measured: float | None = None
-    if scan is not None:
+    if scan is not None and scan[1] > scan[0]:
         measured = _rms_error(log["force_n"][scan[0] : scan[1]], task.force_n)
         if truth := _truth(session):
             figures = score_contact(truth, *scan, task.force_n)
@@ -299,7 +295,7 @@ def _contact(session: Session, controller: object, log: dict[str, Array]) -> dic
         else:
             figures |= {"force_rms_error_n": measured, "force_max_n": float(np.nanmax(log["force_n"], initial=0.0))}
     return {"force_target_n": target, **figures, "force_measured_rms_error_n": measured} | {
-        "losses": summarise_losses(getattr(controller, "losses", ()))
+        "losses": summarise_losses(record.losses)
     }
 
 
@@ -401,7 +397,7 @@ def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
     return [float(v) if np.isfinite(v) else None for v in values]
 
 
-def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
+def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
     cycle, drives, tactile = cell.cycle, cell.drives, cell.tactile
     statistics = cycle.statistics if cycle is not None else None
     assembler = tactile.assembler if tactile is not None else None
@@ -413,8 +409,8 @@ def _cycle(cell: Cell, controller: object) -> dict[str, Any]:
         "late_pdos": drives.late if drives is not None else 0,
         "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans if assembler is not None else 0,
         "stale_frames": tactile.stale if tactile is not None else 0,
-        "unplaced_contacts": getattr(controller, "unplaced", 0),
-        "slowed_cycles": getattr(controller, "slowed", 0),
+        "unplaced_contacts": record.unplaced,
+        "slowed_cycles": record.slowed,
         "dropped_frames": cell.counters.overruns,
         "period_error_us": _percentiles(statistics.period_error_ns if statistics is not None else []),
         "response_us": _percentiles(statistics.response_ns if statistics is not None else []),

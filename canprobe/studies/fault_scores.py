@@ -39,6 +39,7 @@ from canprobe.bus.disk import read_candump
 from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
+from canprobe.cell.controller import Controller
 from canprobe.cell.supervision import Limits
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
@@ -51,6 +52,7 @@ from canprobe.scene.geometry import T_flange_probe
 from canprobe.scene.model import ServoSettings
 from canprobe.session.session import Session
 from canprobe.tasks.probing import Phase
+from canprobe.tasks.task import record_of
 from canprobe.touch.contact import indentation_from_force
 
 # What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
@@ -175,12 +177,12 @@ def score_rest(moved_rad: float, nodes: Sequence[SlaveNode]) -> list[str]:
     return failures
 
 
-def score_summary(session: Session, task: object, reason: str) -> list[str]:
+def score_summary(session: Session, task: Controller, reason: str) -> list[str]:
     """What came of the run can be summed up and written down, whatever happened in it."""
     if not session.started:
         return []
     try:
-        json.dumps(summarise(session, task, {}, reason or None), allow_nan=False)
+        json.dumps(summarise(session, record_of(task), {}, reason or None), allow_nan=False)
     except Exception as error:  # whatever it is, a user would have lost the run's summary by it
         return [f"summary: {type(error).__name__}: {error}"]
     return []

@@ -240,7 +240,7 @@ def _unheard(_: str) -> None:
     """What is not permitted was said by the first case."""
 
 
-class Hold:
+class Hold(Controller):
     """Keep the joints where they were found, for some cycles."""
 
     def __init__(self, cycles: int) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from canprobe.api import ROWS_OF_UP
 from canprobe.bus.socketcan import check_interface
-from canprobe.cell.controller import Command, Measurement
+from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
 from canprobe.session.children import EmulatorChild
@@ -69,7 +69,7 @@ class Sample:
     frames_on_bus: int
 
 
-class Soaker:
+class Soaker(Controller):
     """The controller: holds the joints, and looks at everything now and then."""
 
     def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:

@@ -16,6 +16,7 @@ from canprobe.robot.tool_calibration import BallModel, BallTouch, ToolEstimate, 
 from canprobe.scene.setup import Calibrate
 from canprobe.tasks.probing import LineMotion, Phase, ProbeMotion, ProbingTask, smooth_step
 from canprobe.tasks.sensing import ContactSensing
+from canprobe.tasks.task import TaskRecord
 from canprobe.touch.contact import ContactSample, PushFit
 from canprobe.touch.servo import ProbePose
 
@@ -132,6 +133,10 @@ class CalibrateTask(ProbingTask):
         self._number = len(self._task.approaches)
         if self.phase not in (Phase.RETREAT, Phase.DONE) and self._motion is not None:
             self._let_go()
+
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        return replace(super().record(), tool=self.estimate)
 
     # sensing and supervision
 

@@ -181,7 +181,7 @@ SPEED_RATE = 0.1
 """m/s²."""
 
 
-class RequestedTask:
+class RequestedTask(Controller):
     """Steps a task, and lets requests change it.
 
     Args:
@@ -221,8 +221,23 @@ class RequestedTask:
 
     def update(self) -> None:
         """What the task does once its commands are out."""
-        if self._task is not None and (update := getattr(self._task, "update", None)) is not None:
-            update()
+        if self._task is not None:
+            self._task.update()
+
+    @property
+    def lets_go(self) -> bool:  # type: ignore[override]
+        """As the task does."""
+        return self._task is not None and self._task.lets_go
+
+    def retreat(self, reason: str) -> None:
+        """Ask the task to let go."""
+        if self._task is not None:
+            self._task.retreat(reason)
+
+    @property
+    def restarts(self) -> int:
+        """Of the task's estimator."""
+        return 0 if self._task is None else self._task.restarts
 
     def _take(self, kind: str, value: float | None) -> None:
         if kind == "stop":

@@ -20,6 +20,7 @@ from canprobe.cell.supervisor import HiddenForce, outside_workspace
 from canprobe.robot.inverse import damped_step
 from canprobe.robot.kinematics import PumaModel, forward_jacobian
 from canprobe.tasks.sensing import ContactSensing
+from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch.image import Patch
 from canprobe.touch.servo import ProbePose
@@ -200,7 +201,7 @@ class Phase(IntEnum):
     REGAIN = 6
 
 
-class ProbingTask:
+class ProbingTask(Task):
     """Base of the tasks that touch.
 
     Args:
@@ -214,6 +215,8 @@ class ProbingTask:
         reason: why it stopped; None while all is well.
         taxels: last image of the touch itself.
     """
+
+    lets_go = True
 
     def __init__(
         self,
@@ -238,15 +241,10 @@ class ProbingTask:
         self._hidden, self._off_pad = HiddenForce(), HiddenForce()
         self._columns: dict[str, float | Vector] = {}
 
-    @property
-    def unplaced(self) -> int:
-        """Contacts that were not used because the joints of their instant are unknown."""
-        return self.sensing.dropped
-
-    @property
-    def slowed(self) -> int:
-        """Cycles in which a joint could not keep up with the probe's path."""
-        return self._motion.slowed if self._motion is not None else 0
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        slowed = self._motion.slowed if self._motion is not None else 0
+        return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
 
     def retreat(self, reason: str) -> None:
         """Let go and end for a reason that the cell has."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +17,7 @@ from canprobe.scene.setup import Touch
 from canprobe.tasks.probing import LineMotion, Phase, ProbeMotion, ProbingTask, smooth_step
 from canprobe.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.tasks.shape import ShapeTracker
+from canprobe.tasks.task import Loss, TaskRecord
 from canprobe.touch.contact import AtRest, ContactSample, PushFit
 from canprobe.touch.servo import LocalSurface, PathFollower, ProbePose, TactileServo
 
@@ -33,21 +34,6 @@ BRAKE_S = 0.02
 """Time constant with which the motion along the path ends: 0.5 mm at 25 mm/s."""
 REST_S = 0.25
 """Time at rest on the surface that was found, until the wanted force is reached and the scan goes on."""
-
-
-@dataclass(slots=True)
-class Loss:
-    """One time that a scan lost its contact.
-
-    Attributes:
-        cycle: in which it was noticed.
-        searched: how far the probe went towards the object, m.
-        regained_s: time from there to the new touch; None while, or because, there is none.
-    """
-
-    cycle: int
-    searched: float = 0.0
-    regained_s: float | None = None
 
 
 class Search:
@@ -154,6 +140,15 @@ class TouchTask(ProbingTask):
         self._shape_columns: dict[str, float | Vector] = {}
         self._estimate: SurfaceEstimate | None = None
         self._updated = True
+
+    @property
+    def restarts(self) -> int:
+        """How often its estimator diverged and started afresh."""
+        return self.shape.restarts if self.shape is not None else 0
+
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        return replace(super().record(), shape=self.shape, losses=self.losses, scan_cycles=self.scan_cycles)
 
     @property
     def scan_cycles(self) -> tuple[int, int] | None:

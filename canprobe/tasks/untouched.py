@@ -12,11 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.cell.assembly import patch_of
-from canprobe.cell.controller import Command, Measurement
+from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.cell.supervision import Contact, Limits
 from canprobe.cell.supervisor import outside_workspace, touch_finding
 from canprobe.robot.kinematics import PumaModel, joints_to_counts
 from canprobe.tasks.probing import smooth_step
+from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.patch.image import PatchCalibration
 
 # The tasks without touch: swing the joints, or only listen to the sensor.
@@ -24,7 +25,7 @@ from canprobe.touch.patch.image import PatchCalibration
 Vector = NDArray[np.float64]
 
 
-class FreeTask:
+class FreeTask(Task):
     """Swing every joint sinusoidally about where it stood, with a soft start and end.
 
     Args:
@@ -55,7 +56,7 @@ class FreeTask:
         return Command(q_target=target, done=left <= 0)
 
 
-class ListenTask:
+class ListenTask(Task):
     """Read the sensor and do nothing.
 
     Args:
@@ -72,6 +73,10 @@ class ListenTask:
         self._limits = limits
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Vector] = {}
+
+    def record(self) -> TaskRecord:
+        """What it knows so far."""
+        return TaskRecord(taxels=self.taxels)
 
     def step(self, measurement: Measurement) -> Command:
         """One cycle."""
@@ -90,7 +95,7 @@ class ListenTask:
         return Command(done=self._left <= 0, stop_reason=silent, columns=self._columns)
 
 
-class _Hold:
+class HoldTask(Task):
     """Stay where the drives are."""
 
     def step(self, _: Measurement) -> Command:
@@ -187,7 +192,7 @@ SETTLE_S = 0.25
 _PEAK = 15 / 8  # of the quintic's speed over its mean
 
 
-class JointCheck:
+class JointCheck(Controller):
     """The controller that moves one joint after the other, forth and back.
 
     Args:

@@ -467,7 +467,7 @@ def test_drives_of_another_make_are_brought_up_and_moved(tmp_path):
     result = undrawn_run(scene, out=tmp_path / "out", duration_s=1.0)
     assert result.summary["completed"] and result.summary["faults"] == []
     assert np.ptp(result.truth["q"][:, 5]) > 0.01
-    assert undrawn_run(scene, out=tmp_path / "out", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
+    assert undrawn_run(scene, out=tmp_path / "again", duration_s=0.2).plan.nodes[0].identity.vendor_id == 0xAB
 
 
 @pytest.mark.parametrize("fixed", [True, False])

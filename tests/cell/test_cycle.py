@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from undrawn import undrawn_run
+from undrawn import undrawn, undrawn_run
 
 import canprobe
 from canprobe.bus.disk import read_candump
@@ -131,7 +131,7 @@ def free():
 
 def test_an_observer_sees_every_cycle_every_frame_and_every_command(free, tmp_path):
     watcher, cycles = Watcher(), []
-    with canprobe.open_cell(free, out=tmp_path, observers=(watcher, cycles.append)) as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path, observers=(watcher, cycles.append)) as cell:
 
         def step(measurement):
             return Command(columns={"mine_m": 0.5}, done=measurement.cycle > 60)

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from undrawn import undrawn_run
+from undrawn import undrawn, undrawn_run
 
 import canprobe
 from canprobe.api import results_folder
@@ -40,10 +39,6 @@ def test_a_folder_that_is_written_to_is_refused_and_keeps_its_log(free, tmp_path
 FILES = {"bus.log", "log.npz", "scene.toml", "summary.json", "truth.npz"}
 
 
-def without_figures(scene):
-    return replace(scene, scene=replace(scene.scene, figures=False))
-
-
 def nod(measurement):
     return Command(done=measurement.cycle > 100, columns={"own_m": 0.5})
 
@@ -66,7 +61,7 @@ def test_a_controller_of_ones_own_leaves_what_a_run_leaves(free, tmp_path):
 
 
 def test_several_controllers_in_one_block_are_one_run(free, tmp_path):
-    with canprobe.open_cell(without_figures(free), out=tmp_path) as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
         first = cell.run(lambda m: Command(done=m.cycle > 100))
         second = cell.run(lambda m: Command(done=m.cycle > 300, columns={"second": 1.0}))
     assert first is second and second.summary["cycle"]["cycles"] > 300
@@ -86,7 +81,7 @@ def test_a_block_that_is_left_by_an_error_leaves_its_files_too(free, tmp_path, e
 
     with (
         pytest.raises((ValueError, SafetyStop)) as raised,
-        canprobe.open_cell(without_figures(free), out=tmp_path) as cell,
+        canprobe.open_cell(undrawn(free), out=tmp_path) as cell,
     ):
         cell.run(fail)
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -103,7 +98,7 @@ def test_a_cell_that_is_not_opened_says_how(free):
 
 
 def test_results_replace_others_only_where_that_is_wanted(free, tmp_path, capsys):
-    scene, run = without_figures(free), ["run", "free", "--duration", "0.1", "--out", str(tmp_path)]
+    scene, run = undrawn(free), ["run", "free", "--duration", "0.1", "--out", str(tmp_path)]
     undrawn_run(free, out=tmp_path, duration_s=0.1)
     (tmp_path / "surface.npz").write_text("of an earlier run")
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
@@ -131,7 +126,7 @@ def test_a_run_that_does_not_begin_replaces_nothing(free, tmp_path):
 
 
 def test_a_cell_that_is_left_open_keeps_its_last_cycles(free, tmp_path):
-    with canprobe.open_cell(without_figures(free), out=tmp_path, rows_kept=20) as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path, rows_kept=20) as cell:
         result = cell.run(nod)
     assert len(result.log["t_s"]) == 20 and result.truth == {} and not (tmp_path / "truth.npz").exists()
     assert result.summary["cycle"]["cycles"] > 100
@@ -162,7 +157,7 @@ def test_done_is_true_or_false(free, done):
 
 @pytest.mark.parametrize("ended", [True, False])
 def test_a_session_is_opened_once(free, tmp_path, ended):
-    with canprobe.open_cell(free, out=tmp_path) as cell:
+    with canprobe.open_cell(undrawn(free), out=tmp_path) as cell:
         if not ended:
             with pytest.raises(UsageError, match="a session is opened once"):
                 cell.__enter__()
@@ -173,7 +168,7 @@ def test_a_session_is_opened_once(free, tmp_path, ended):
 
 
 def test_the_scene_is_there_as_soon_as_the_log(free, tmp_path):
-    with canprobe.open_cell(free, out=tmp_path):
+    with canprobe.open_cell(undrawn(free), out=tmp_path):
         assert canprobe.load_scene(tmp_path / "scene.toml").name == "free"
 
 

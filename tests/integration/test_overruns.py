@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from wrapped import Wrapped
 
 import canprobe
 from canprobe.cell.controller import Command, Measurement
@@ -17,11 +18,12 @@ STALL_NS = 8_000_000
 EVERY = 40
 
 
-class Stalls:
+class Stalls(Wrapped):
     """A controller that now and then takes longer than three cycles, in virtual time."""
 
     def __init__(self, session: Session, every: int) -> None:
-        self.task, self._session, self._every = make_task(session.plan), session, every
+        super().__init__(make_task(session.plan))
+        self._session, self._every = session, every
 
     def step(self, measurement: Measurement) -> Command:
         command = self.task.step(measurement)
@@ -44,7 +46,7 @@ def stalled() -> tuple[Session, Stalls]:
 
 def test_overruns_are_counted_and_the_rate_is_the_true_one(stalled: tuple[Session, Stalls]) -> None:
     session, controller = stalled
-    cycle = summarise(session, controller.task, {}, None)["cycle"]
+    cycle = summarise(session, controller.record(), {}, None)["cycle"]
     assert cycle["overruns"] == pytest.approx(cycle["cycles"] / EVERY, rel=0.15)  # none while bringing up and stopping
     lost = 2 * cycle["overruns"]  # the stall swallows the rest of its own period and two more
     assert cycle["rate_hz"] == pytest.approx(400.0 * cycle["cycles"] / (cycle["cycles"] + lost), rel=0.01)
@@ -54,7 +56,7 @@ def test_overruns_are_counted_and_the_rate_is_the_true_one(stalled: tuple[Sessio
 def test_the_nodes_say_that_sync_was_late_and_it_is_told_in_one_line(stalled: tuple[Session, Stalls]) -> None:
     """1.5 periods (1006h) after a SYNC its absence is an EMCY 8100h; the next SYNC ends that error (1001h)."""
     session, controller = stalled
-    overruns = summarise(session, controller.task, {}, None)["cycle"]["overruns"]
+    overruns = summarise(session, controller.record(), {}, None)["cycle"]["overruns"]
     (told,) = session.cell.faults
     times = re.fullmatch(
         r"nodes 1-6, 16: EMCY 8100h, communication, (\d+) times, first at [\d.]+ s, last at [\d.]+ s", told
@@ -68,7 +70,7 @@ def test_the_contact_keeps_its_speed_and_the_surface(stalled: tuple[Session, Sta
     session, controller = stalled
     assert controller.task.scan_cycles is not None
     first, last = controller.task.scan_cycles
-    contact = summarise(session, controller.task, {}, None)["contact"]
+    contact = summarise(session, controller.record(), {}, None)["contact"]
     assert contact["contact_fraction"] == 1.0
     assert contact["force_max_n"] < 3.0
     t, points = session.truth["t_s"], session.truth["contact_point"]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from wrapped import Wrapped
 
 import canprobe
 from canprobe.scene.model import PlantSettings
@@ -17,7 +18,7 @@ AT_CYCLE = 900
 NOMINAL = 1.27e8
 
 
-class Disturbed:
+class Disturbed(Wrapped):
     """A scan over the cylinder; in one cycle the object is put somewhere else, or taken away."""
 
     def __init__(self, move_mm, *, share=1.0, duration_s=3.0, **task):
@@ -31,7 +32,7 @@ class Disturbed:
                 shape=replace(scene.shape, also=()),
             )
         )
-        self.task = make_task(self.session.plan)
+        super().__init__(make_task(self.session.plan))
         self.move_mm = move_mm
         self.witness = None
         self.positions = []
@@ -59,9 +60,6 @@ class Disturbed:
         command = self.task.step(measurement)
         self.positions.append((int(self.task.phase), *self.task._motion.pose.centre))
         return command
-
-    def retreat(self, reason):
-        self.task.retreat(reason)
 
     def run(self):
         with self.session:

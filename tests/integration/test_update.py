@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from injected import HOLD_CYCLE, Injected
+from wrapped import Wrapped
 
 import canprobe
-from canprobe.cell.controller import Command
+from canprobe.cell.controller import Command, Controller
 from canprobe.session.session import Session, resolve_scene
 from canprobe.tasks.from_plan import make_task
 
 
-class Working:
+class Working(Controller):
     """Holds the joints; notes when it is called, and how many frames had been sent by then."""
 
     def __init__(self, session):
@@ -47,15 +48,16 @@ def test_what_it_raises_ends_the_run_off_the_object():
         def _run(self):
             task, failing = self.task, self
 
-            class Controller:
-                shape, retreat, step = None, task.retreat, lambda _, m: failing.step(m)
+            class Late(Wrapped):
+                def step(self, measurement):
+                    return failing.step(measurement)
 
                 def update(self):
                     if failing.session.cell.cycle.number == failing.at + 1:
                         raise ZeroDivisionError("in update")
 
             with self.session, pytest.raises(ZeroDivisionError, match="in update"):
-                self.session.run(Controller(), progress=self._progress)
+                self.session.run(Late(task), progress=self._progress)
 
     run = Failing("press", HOLD_CYCLE, lambda _: None)
     run.assert_drives_off()

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from undrawn import undrawn_run
+from undrawn import undrawn, undrawn_run
+from wrapped import Wrapped
 
 import canprobe
 from canprobe.bus.disk import CandumpWriter, RecordingPort
@@ -77,11 +78,12 @@ class DelayedPort:
             self._under_way.append((can_id, data, self._last))
 
 
-class Stalling:
+class Stalling(Wrapped):
     """The scene's task, which now and then takes most of a period, or more than two."""
 
     def __init__(self, plan, clock):
-        self.task, self._clock = make_task(plan), clock
+        super().__init__(make_task(plan))
+        self._clock = clock
 
     def step(self, measurement):
         command = self.task.step(measurement)
@@ -131,7 +133,7 @@ def other_run(tmp_path_factory):
     other = canprobe.plan(short_scan(force_n=1.5, speed_mm_s=20.0, heading_deg=100.0, wavelength_mm=8.0, search_mm=7.0))
     task = make_task(other)
     with contextlib.ExitStack() as stack:
-        session = stack.enter_context(canprobe.open_cell(short_scan(), out=out))
+        session = stack.enter_context(canprobe.open_cell(undrawn(short_scan()), out=out))
         session.run(task)
     return out
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+from wrapped import Wrapped
+
 import canprobe
 from canprobe.bus.port import ControllerState
 from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.controller import Command
+from canprobe.cell.controller import Command, Controller
 from canprobe.emulator.faults import Fault, FaultyNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
@@ -75,19 +77,18 @@ class Injected:
         return command
 
     def _run(self):
-        def step(measurement):
-            return self.step(measurement)
-
-        if not self.own and hasattr(self.task, "retreat"):
-            step.retreat = self.task.retreat
-            step.shape = self.task.shape
         with self.session:
             try:
-                self.session.run(step, progress=self._progress)
+                self.session.run(self._controller(), progress=self._progress)
             except (CanprobeError, KeyboardInterrupt, ZeroDivisionError) as error:
                 self.error = error
                 if self.answered_ns is None:
                     self.answered_ns = self.now()
+
+    def _controller(self):
+        controller = Wrapped(Controller() if self.own else self.task)
+        controller.step = self.step
+        return controller
 
     def _progress(self, measurement):
         supervisor = self.session.cell.supervisor

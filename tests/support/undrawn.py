@@ -10,6 +10,11 @@ from canprobe.results.summary import RunResult
 from canprobe.scene.model import Scene
 
 
+def undrawn(scene: Scene) -> Scene:
+    """The scene, whose runs leave all their files but the figures."""
+    return replace(scene, scene=replace(scene.scene, figures=False))
+
+
 def undrawn_run(scene: Scene, **options: Any) -> RunResult:
-    """`canprobe.run` that leaves all its files but the figures."""
-    return canprobe.run(replace(scene, scene=replace(scene.scene, figures=False)), **options)
+    """`canprobe.run` of such a scene."""
+    return canprobe.run(undrawn(scene), **options)

@@ -1,16 +1,16 @@
 """How a summary tells of contact that a scan lost."""
 
 from collections import deque
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.controller import Command, Measurement
+from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.session.session import Session, resolve_scene
 from canprobe.tasks.from_plan import FORCE_RATE, RequestedTask, make_task
-from canprobe.tasks.touch import Loss, losses_text, summarise_losses
+from canprobe.tasks.task import Loss
+from canprobe.tasks.touch import losses_text, summarise_losses
 
 FOUND = {"searched_mm": 0.93, "regained_after_ms": 465.0}
 GONE = {"searched_mm": 2.0, "regained_after_ms": None}
@@ -80,7 +80,7 @@ def test_up_holds_until_a_start_and_holds_again_after_a_stop():
     """Two starts, two tasks; the first is stopped, nothing moves without one."""
     made, queue = [], deque()
 
-    class Task:
+    class Task(Controller):
         def __init__(self):
             made.append(self)
 
@@ -113,8 +113,21 @@ def q0():
 
 def test_what_a_task_does_once_its_commands_are_out_is_passed_on():
     worked = []
-    task = SimpleNamespace(step=lambda _: Command(), update=lambda: worked.append(True))
-    RequestedTask(task, None, (), 2.5e-3).update()
-    assert worked == [True]
-    for without in (None, SimpleNamespace(step=lambda _: Command())):
-        RequestedTask(without, None, (), 2.5e-3).update()
+
+    class Working(Controller):
+        lets_go = True
+
+        def update(self):
+            worked.append("update")
+
+        def retreat(self, reason):
+            worked.append(reason)
+
+    requested = RequestedTask(Working(), None, (), 2.5e-3)
+    requested.update()
+    assert requested.lets_go
+    requested.retreat("enough")
+    assert worked == ["update", "enough"]
+    idle = RequestedTask(None, None, (), 2.5e-3)
+    idle.update()
+    assert not idle.lets_go
