@@ -245,7 +245,7 @@ def test_own_controller_in_ten_lines():
 
 def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
     session = session_of("free")
-    with pytest.raises(UsageError, match="a function of the measurement or a canprobe.Controller, got 3"), session:
+    with pytest.raises(UsageError, match=r"measurement or a canprobe\.Controller, got 3"), session:
         session.run(3)
     assert len(session.cell.log) == 0
     assert_safe(session)
