@@ -1,5 +1,17 @@
 """Where canprobe touches the world: clocks, CAN ports, canopen's network over them, and files.
 
-`port` is what the cycle knows of it. Behind it stand `lockstep` and `timed`, buses in virtual time; `socketcan` with
-`mmsg`; and `interfaces` for whatever python-can drives.
+Everything above knows two small interfaces, both in `port`: a `Clock` (now, sleep until) and a `Port` (`send_batch`,
+`drain`, counters, the controller's state). Behind them:
+
+    lockstep, timed, controllers   virtual time, one thread: frames take no time, or their bits at the bit rate, with
+                                   arbitration, error frames and error states; the same seed gives the same log
+    socketcan, mmsg, link          a raw socket with bursts a system call; how the interface is set, and the line that sets it
+    interfaces                     any interface of python-can
+
+`network` and `sdo_client` give canopen a bus without threads: whoever waits pumps the port, in the port's own time.
+`scheduling` asks the machine for real time and keeps interrupts between two cycles. `disk` writes files whole or not
+at all, and reads and writes logs.
+
+`time`, `socket`, `threading` and python-can are imported in this room, in `vcan/` and in `session/` only. Times are
+integer nanoseconds. A port never raises for what a bus does; it counts, and reports its state.
 """

@@ -1,5 +1,17 @@
-"""Scene → plan: which nodes and PDOs a scene needs, whether they fit, what is left out and why.
+"""Setup → plan: which nodes and PDOs are needed, whether they fit the bus, what is left out and why.
 
-`make.make_plan` asks the others: `devices` what the EDS files allow, `traffic` what fits the bus, `motion` what the arm
-can do, `choices` what the scene has left open. The answer is a `model.Plan`; `report` writes it for people and tools.
+What comes in is a `Setup`; what goes out is a frozen `Plan`, or a `PlanError` with every reason at once and the
+changes that would fit. Nothing is opened or sent here.
+
+1. `devices` reads each device's EDS file: which objects, PDOs, mappings and bit rates it really has. What it lacks
+   and what cannot be done without is a reason; what can be done without is listed as not available.
+2. `choices` lists what the setup leaves open ("auto"), the cheapest first. For each candidate `make` plans SYNC, PDOs
+   and identifiers, and `traffic` checks load, the peak behind one SYNC and the worst-case response time of every
+   message.
+3. `motion` follows the task's path with the arm: reach, stops, speeds, the shape under the probe.
+4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what
+   is left out, warnings. Bring-up, cycle, emulator and command line work from it alone.
+
+`report` writes a plan for people and as JSON, `measured` sets a recorded bus beside it, `bridges` is the table of the
+tools that can be fed. Start reading at `model`, then `make`.
 """

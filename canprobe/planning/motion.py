@@ -1,4 +1,4 @@
-"""Can the arm do it: reach, joint stops and joint speeds along the whole path, and which way the path is turned."""
+"""Can the arm do it: reach, joint stops and joint speeds along the whole path."""
 
 from __future__ import annotations
 

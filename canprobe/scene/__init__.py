@@ -1,5 +1,20 @@
-"""A scene: the words of a file, checked.
+"""A scene: the words of a file, checked, and the setup that they mean.
 
-`model` says what there is, one field a line with its check; `load` reads and writes it, `rules` says what goes
-together, `geometry` turns it into SI.
+What comes in is TOML text; what goes out is a `Scene` (the user's words and units) and from that a `Setup` (SI units,
+whole for its task).
+
+    TOML ── load ──► Scene ── resolve ──► Setup
+
+- `model` is the scene as frozen dataclasses: one field a key, its type and checks in the annotation, its meaning
+  below. `checks` has the checks, `rules` what goes together across keys, and which sections a task needs.
+- `load` reads a file and reports every mistake at once; `dump_scene` writes a scene back. Scenes cross processes as
+  text.
+- `resolve` is the only place where millimetres, degrees and kilopascals become SI and defaults become values. `setup`
+  is its result: planning, cell, tasks and emulator read a `Setup` and never a `Scene`.
+- `geometry` turns the object, the probe and the path of a scene into frames and surfaces; it is used by `resolve` and
+  by those who show a scene.
+
+Invariant: behind `resolve` there is no optional part that "must be there"; a task's setup holds exactly what that
+task needs. To add a key: a field in `model`, a line in `resolve`, and its user. Start reading at `model`, then
+`resolve`.
 """

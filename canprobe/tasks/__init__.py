@@ -1,1 +1,16 @@
-"""Controllers: what a cell does in each cycle, from a measurement to a command."""
+"""Controllers: what a cell does in each cycle, from a measurement to a command.
+
+`from_plan.make_task` gives the controller of a plan's task; nothing is imported that the task does not need.
+
+- `touch` approaches, settles, scans or holds, searches for a lost contact, and retreats; `calibrate` touches a ball
+  from several sides. Both stand on `probing`: phases, the probe's motion within the joints' limits, what is said in
+  each cycle.
+- `sensing` makes a contact of a measurement: joints at the instant of the image, the patch, the squeezed layer.
+- `shape` is the estimator in the loop: contacts go in when they are felt, answers are computed in `update` when the
+  commands are out, and are used from the next cycle on.
+- `untouched` has the tasks without touch: hold, swing, listen, and the check of each joint's first motion.
+- `task` is what a task leaves for the summary.
+
+A task guards its own contact (`lets_go`): it decides by the same table of conditions as the cell when to let go. A
+task reads its setup (`canprobe.scene.setup`) and nothing of a scene.
+"""

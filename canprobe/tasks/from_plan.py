@@ -1,4 +1,4 @@
-"""Plan → controller of its task: the scene's millimetres and degrees become SI here, once; and tasks on request."""
+"""Plan → the controller of its task, its estimators, and a task that others start, stop and set while it runs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,15 @@
 """A CiA 301 node without I/O: object dictionary, SDO, PDO, SYNC, EMCY, error control, LSS and storage.
 
-`slave_node` puts the services together; each has its state in `core` and takes bytes and a time.
+`slave_node.SlaveNode` has one method for what comes in (`receive(can_id, data, t)`) and one for time (`advance(t)`);
+both return frames to send, and the node says when it wants to be called next. It puts the services together; each has
+its state in `core`, which they share: identity, NMT state, time, timers, dictionary, application.
+
+- `dictionary` keeps values and makes every check that an access over the bus must pass, with the abort codes of CiA
+  301.
+- `sdo_server` does expedited, segmented and block transfers by one table of states, for several clients.
+- `pdo_engine` and `rpdo_tpdo` route PDOs, hold parameters and mapping rules, events, inhibit times and SYNC.
+- `error_control` is heartbeat, guarding and emergencies; `lss_slave` node ids and stored parameters.
+
+An application (`canprobe.emulator.drive`, `canprobe.emulator.array`) hooks onto entries of the dictionary and is told
+of SYNC.
 """

@@ -1,1 +1,14 @@
-"""The emulated cell behind the nodes: arm, contact, tactile array. Pure: time goes in as a number."""
+"""The emulated cell behind the nodes: arm, contact, tactile array. Pure: time goes in as a number.
+
+`plant.Plant` is asked for motor positions, torques and images at an instant, and moves itself there.
+
+- `ideal_arm`: each drive is a second-order system, solved exactly. `dynamic_arm`: rigid links, friction, drive
+  cascade and the object's push, by `equations` and a choice of integrators; `held_step` is the default step on
+  dynamics held over a cycle, `pushing` the contact forces near one posture.
+- `probe` is the elastic layer on an object (Winkler, Hunt–Crossley damping, regularised friction).
+- `taxels` makes counts of pressure: blur, gains, saturation, hysteresis, creep, crosstalk, noise, quantisation.
+- `config` says what a plant is made of.
+
+The image model shares no formula with the estimators. Energy is not created in a closed contact cycle without
+friction.
+"""

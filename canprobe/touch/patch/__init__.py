@@ -1,1 +1,16 @@
-"""The contact patch in a tactile image: force, centroid, moments, and curvature from them."""
+"""The contact patch in a tactile image: force, centroid, moments, and curvature from them.
+
+An image comes in as counts of a whole array or of the window round the contact; out come, for the servo and the
+estimators, a `Patch` (force in N, centroid in m on the pad, what makes it doubtful) and second moments.
+
+- `image` sums and centres the pressure, carries a patch on that the window or a dead taxel cuts, and undoes the
+  array's hysteresis lag as far as it is calibrated.
+- `moments` is the forward model of second moments: how curvature, force and the array's blur make them.
+- `curvature` inverts it over several images into a likelihood of K, and fuses that with what the motion has shown: a
+  straight path leaves the curvature across it open, and one touch with its image closes it.
+- `array_model` has the calibrated numbers of the emulated array's make, found by
+  `canprobe.studies.array_calibration`.
+
+The emulated array (`canprobe.emulator.plant.taxels`) shares no formula with this room: the model that makes the data
+is finer than the one that reads them.
+"""
