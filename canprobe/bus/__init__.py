@@ -5,7 +5,7 @@ Everything above knows two small interfaces, both in `port`: a `Clock` (now, sle
 
     lockstep, timed, controllers   virtual time, one thread: frames take no time, or their bits at the bit rate, with
                                    arbitration, error frames and error states; the same seed gives the same log
-    socketcan, mmsg, link          a raw socket with bursts a system call; how the interface is set, and the line that sets it
+    socketcan, mmsg, link          a raw socket, a burst of frames a system call; how the link is set
     interfaces                     any interface of python-can
 
 `network` and `sdo_client` give canopen a bus without threads: whoever waits pumps the port, in the port's own time.
