@@ -9,7 +9,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from canprobe.bus.disk import whole_file
 from canprobe.cli.output import print_json, say
 from canprobe.cli.parser import Commands, Parser, add_json, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
@@ -66,6 +65,8 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def _draw(plan: Plan, path: Path) -> Path:
+    from canprobe.bus.disk import whole_file
+
     try:
         from canprobe.results.figures import draw_plan
     except ImportError as error:
