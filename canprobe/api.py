@@ -11,7 +11,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from canprobe.bus.disk import whole_file
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Observation, Observer, Observers
@@ -204,10 +203,8 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
         from canprobe.results.figures import draw_run
         from canprobe.results.surface_figure import draw_surface
 
-        with whole_file(out / "report.png") as part:
-            draw_run(result, part)
-        with whole_file(out / "surface.png") as part:
-            draw_surface(result, part)
+        draw_run(result, out / "report.png")
+        draw_surface(result, out / "surface.png")
 
 
 class OpenCell(Session):

@@ -65,8 +65,6 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 
 def _draw(plan: Plan, path: Path) -> Path:
-    from canprobe.bus.disk import whole_file
-
     try:
         from canprobe.results.figures import draw_plan
     except ImportError as error:
@@ -74,8 +72,7 @@ def _draw(plan: Plan, path: Path) -> Path:
     if not path.suffix:
         path = path.with_suffix(".png")  # as matplotlib would do by itself, and tell nobody
     try:
-        with whole_file(path) as part:
-            draw_plan(plan, part)
+        draw_plan(plan, path)
     except ValueError as error:  # matplotlib knows no such form
         raise UsageError(f"--figure {path}: {error}") from error
     return path

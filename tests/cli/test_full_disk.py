@@ -32,10 +32,6 @@ def scan(tmp_path_factory):
 @pytest.mark.parametrize(
     ("words", "name"),
     [
-        (["log", "SCAN", "--to", "bus.asc"], "bus.asc"),
-        (["log", "SCAN", "--to", "bus.blf"], "bus.blf"),
-        (["log", "SCAN", "--to", "bus.trc"], "bus.trc"),
-        (["log", "SCAN", "--to", "copy.log"], "copy.log"),
         (["plan", "cylinder", "--export", "dcf", "--out", "."], "node001.dcf"),
         (["plan", "cylinder", "--export", "dbc", "--out", "."], "cylinder.dbc"),
         (["plan", "cylinder", "--export", "kcd", "--out", "."], "cylinder.kcd"),
