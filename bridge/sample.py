@@ -308,7 +308,7 @@ class Context:
         plan: of the run.
         settings: section `[bridge]`.
         out: folder of the run; None where no files are written.
-        send: hands a request (see `canprobe.cell.requests`) back to the cell.
+        send: hands a request (see `canprobe.tasks.from_plan.RequestedTask`) back to the cell.
     """
 
     plan: Plan

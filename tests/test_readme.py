@@ -20,7 +20,7 @@ from canprobe.planning.bridges import BRIDGES
 from canprobe.scene.checks import convert
 from canprobe.scene.load import load_scene, scenes_folder
 from canprobe.scene.model import Scene
-from canprobe.studies.harness import STUDIES
+from canprobe.studies.sweep import STUDIES
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

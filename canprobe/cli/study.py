@@ -47,8 +47,7 @@ def add_parser(commands: Commands[Parser]) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run a study, print its table, write its files."""
-    from canprobe.studies.harness import STUDIES
-    from canprobe.studies.sweep import run_study
+    from canprobe.studies.sweep import STUDIES, run_study
 
     if args.list:
         if args.json:

@@ -19,7 +19,6 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
@@ -32,20 +31,6 @@ from canprobe.errors import ResultsError, StudyError
 
 Say = Callable[[str], None]
 Row = Mapping[str, Any]
-
-STUDIES: Mapping[str, str] = MappingProxyType(
-    {
-        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
-        "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
-        "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
-        "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
-        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
-        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
-        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
-        "faults": "what the cell does about thousands of random faults of its nodes and their links",
-    }
-)
-"""Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -295,8 +280,7 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     write_text(paths[2], document + "\n")
     if importlib.util.find_spec("matplotlib") is not None:
         paths.append(out / f"{result.name}.png")
-        with whole_file(paths[-1]) as part:
-            result.draw(part)
+        result.draw(paths[-1])
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
 
 

@@ -44,11 +44,12 @@ from functools import partial
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from time import perf_counter
+from types import MappingProxyType
 from typing import Any
 
 from canprobe.errors import StudyError, UsageError
 from canprobe.session.children import end_with_parent
-from canprobe.studies.harness import STUDIES, CellStore, Say, StudyResult, as_json, cell_key, model_digest
+from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_key, model_digest
 
 # Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.
 
@@ -303,6 +304,21 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
 
 def _no_progress(_done: float, _total: float) -> None:
     """Nobody watches."""
+
+
+STUDIES: Mapping[str, str] = MappingProxyType(
+    {
+        "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
+        "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
+        "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
+        "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
+        "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
+        "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
+        "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
+        "faults": "what the cell does about thousands of random faults of its nodes and their links",
+    }
+)
+"""Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
 def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:

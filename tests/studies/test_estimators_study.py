@@ -19,7 +19,8 @@ from canprobe.studies.estimators import (
     on_the_move,
     settings,
 )
-from canprobe.studies.harness import STUDIES, Column, StudyResult, as_document, table_lines, write_study
+from canprobe.studies.harness import Column, StudyResult, as_document, table_lines, write_study
+from canprobe.studies.sweep import STUDIES
 from canprobe.touch.estimate.fit import METHODS
 
 FEW = [Setting("chen1996", 160, 10), Setting("ml", 160), Setting("recursive", 160)]

@@ -8,7 +8,6 @@ import bridges_bench as bridges
 import matplotlib.image
 import numpy as np
 import pytest
-from canprobe.studies.region import draw_region
 from matplotlib.collections import PathCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
@@ -21,7 +20,7 @@ from canprobe.results.figures import draw_plan, draw_run
 from canprobe.results.surface_figure import draw_surface
 from canprobe.studies import estimators, stability, workprec
 from canprobe.studies import stability as stability_figure
-from canprobe.studies.bound import AT, NOISES, REGION, SIZES_M, SURFACES, draw_bound
+from canprobe.studies.bound import NOISES, SIZES_M, SURFACES, draw_bound
 from canprobe.studies.estimators import draw_estimators
 from canprobe.studies.faults import draw_ends, draw_faults
 from canprobe.studies.pipeline import draw_pipeline
@@ -64,17 +63,6 @@ def bound(path):
             "coverage": min(1.0, rng.normal(0.96, 0.02)) - 0.3 * far,
         })  # fmt: skip
     draw_bound(rows, path)
-
-
-def region(path):
-    rng = np.random.default_rng(0)
-    rows = [
-        {"method": method, "ratio": rng.normal(1.0, 0.2) + (i % 9 == 0), "coverage": rng.uniform(0.7, 1.0)}
-        | {AT + name: limit * 10 ** rng.uniform(-3, 1) for name, limit in REGION.items()}
-        for i in range(60)
-        for method in ("ml", "recursive")
-    ]
-    draw_region(rows, path)
 
 
 def every_estimator(path):
@@ -194,7 +182,6 @@ PICTURES = {
     "calibrate": draw_scene("press", 0.5, calibration=FOUND),
     "plan": lambda path: draw_plan(canprobe.plan(canprobe.load_scene("cylinder")), path),
     "bound": bound,
-    "region": region,
     "estimators": every_estimator,
     "pipeline": pipeline,
     "workprec": plant,

@@ -15,7 +15,6 @@ from waiting import wait_until
 
 from canprobe.cli import main
 from canprobe.errors import StudyError, UsageError
-from canprobe.studies import harness as study
 from canprobe.studies import harness as sweep_store
 from canprobe.studies import sweep
 from canprobe.studies.harness import CellStore, as_json, cell_key, model_digest
@@ -61,9 +60,9 @@ def run(*, quick, sweep):
 if __name__ == "__main__":
     from types import MappingProxyType
     from canprobe.cli import main
-    from canprobe.studies import study
+    from canprobe.studies import sweep
     sys.modules["canprobe.studies.demo"] = __import__("demo")
-    study.STUDIES = MappingProxyType({"demo": "a demonstration"})
+    sweep.STUDIES = MappingProxyType({"demo": "a demonstration"})
     sys.exit(main(["study", "demo", "--out", str(HERE / "out"), "--workers", "1", "--json", *sys.argv[1:]]))
 '''
 
@@ -269,7 +268,7 @@ def test_a_dask_cluster_computes_the_same(demo, tmp_path, monkeypatch):
     import distributed
 
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]))
-    monkeypatch.setattr(study, "STUDIES", {"demo": "a demonstration"})
+    monkeypatch.setattr(sweep, "STUDIES", {"demo": "a demonstration"})
     monkeypatch.setitem(sys.modules, "canprobe.studies.demo", demo)
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=None, protocol="tcp://"
