@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import numpy as np
 import pytest
 
 import canprobe
@@ -14,7 +15,8 @@ from canprobe.errors import PlanError, SceneError
 from canprobe.planning.choices import patch_radius_m, taxels_needed, window_choices
 from canprobe.planning.devices import tactile_objects
 from canprobe.scene.load import dump_scene, parse_scene
-from canprobe.scene.model import ProbeSettings
+from canprobe.scene.resolve import resolve
+from canprobe.scene.setup import Probe
 
 PDOS = {4: 3, 6: 6, 8: 9, 10: 14, 12: 19}
 
@@ -62,7 +64,7 @@ def test_a_soft_contact_is_felt_by_every_window_that_is_planned_for_it():
 
 @pytest.mark.parametrize("force, stiffness, radius_mm", [(2.0, 1.27e8, 40.0), (2.0, 2.3e7, 40.0), (0.5, 1e9, 20.0)])
 def test_the_planned_patch_is_the_plants_on_a_plane(force, stiffness, radius_mm):
-    probe = ProbeSettings(radius_mm=radius_mm, stiffness_n_m3=stiffness)
+    probe = Probe(np.eye(4), radius_mm * 1e-3, stiffness, 0.3)
     radius = patch_radius_m(force, probe)
     contact = elastic_contact(radius**2 / (2e-3 * radius_mm), (0.0, 0.0), radius_mm * 1e-3, stiffness)
     assert contact.force == pytest.approx(force, rel=1e-12)
@@ -77,9 +79,9 @@ def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_
         0.2: [6, 4, 8, 10, 12],  # 10^(1/4) less
     }
     for force, sides in orders.items():
-        assert [side for side, _ in window_choices(change(press, task={"force_n": force}))] == sides
-    assert "10.6 mm across and asks for 8.2 taxels" in window_choices(press)[0][1]
-    assert [side for side, _ in window_choices(canprobe.load_scene("listen"))] == [12, 10, 8, 6, 4]
+        assert [side for side, _ in window_choices(resolve(change(press, task={"force_n": force})))] == sides
+    assert "10.6 mm across and asks for 8.2 taxels" in window_choices(resolve(press))[0][1]
+    assert [side for side, _ in window_choices(resolve(canprobe.load_scene("listen")))] == [12, 10, 8, 6, 4]
 
 
 def test_auto_takes_what_fits_and_says_why():

@@ -8,6 +8,7 @@ import pytest
 
 import canprobe
 from canprobe.scene.load import load_scene
+from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session, rehearse, shortened
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
@@ -54,6 +55,6 @@ def test_real_nodes_are_emulated_in_it():
     plan = canprobe.plan(
         replace(scene, arm=replace(scene.arm, emulated=False), bus=replace(scene.bus, interface="socketcan"))
     )
-    with Session(replace(plan, scene=shortened(plan.scene))) as session:
+    with Session(replace(plan, setup=resolve(shortened(plan.scene)))) as session:
         session.run(make_task(session.plan))
     assert session.opened and not session.cell.faults

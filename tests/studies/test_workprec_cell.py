@@ -63,7 +63,7 @@ def test_a_scan_that_is_stopped_is_a_row_with_its_reason(monkeypatch):
     def stopped(*_, **__):
         raise workprec_cell.SafetyStop("measured force 9 N above the limit of 5 N")
 
-    monkeypatch.setattr(workprec_cell, "run", stopped)
+    monkeypatch.setattr(workprec_cell, "run_scene", stopped)
     answer = measure(Case(Setting(100.0, "features", "classical"), "chord", "ideal", 1.0, 1))
     assert answer == {"ended": "stopped", "reason": "measured force 9 N above the limit of 5 N"}
 
@@ -82,7 +82,7 @@ def test_the_cost_is_that_of_the_scan_alone(monkeypatch):
         return SimpleNamespace(log=log, summary=summary)
 
     clock = iter(range(100))
-    monkeypatch.setattr(workprec_cell, "run", run)
+    monkeypatch.setattr(workprec_cell, "run_scene", run)
     monkeypatch.setattr(workprec_cell, "process_time", lambda: float(next(clock)))
     answer = measure(Case(Setting(100.0, "features", "classical"), "recursive", "ideal", 1.0, 1))
     assert answer["cost_ms_per_s"] == pytest.approx(1e3 * 5.0 / 0.05)

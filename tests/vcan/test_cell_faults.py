@@ -28,7 +28,7 @@ def test_the_interface_goes_down_in_mid_run(bench: Any) -> None:
         lines = command.end(3)
     finally:
         link("up")
-    assert any("vcan0" in line and ("down" in line or "lost" in line) for line in lines)
+    assert any("vcan0" in line and ("down" in line or "lost" in line) for line in lines), lines
     results = bench.results("results")
     assert results.summary["completed"] is False
     assert any("while stopping" in fault for fault in results.summary["faults"])
