@@ -108,7 +108,7 @@ def test_samples_that_say_they_are_old_do_not_move_the_surface():
 
     with session:
         session.run(step)
-    assert controller.unplaced > 20
+    assert controller.record().unplaced > 20
     assert session.truth["force"].max() < 3.0
 
 
