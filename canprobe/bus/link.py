@@ -128,6 +128,22 @@ def emptying_line(name: str) -> str:
     return ip_line(f"{name} down", f"{name} up")
 
 
+def drop_queued(name: str) -> bool:
+    """Drop the frames that wait in an interface's transmit queue; False where the right to do so, or `tc`, is missing.
+
+    A queue that another one replaces lets go of its frames; then the default one comes back. The link stays up, and the
+    frame that the controller itself holds stays in it.
+    """
+    queue = ["dev", name, "root"]
+    steps = (["replace", *queue, "handle", "1:", "pfifo"], ["del", *queue])
+    try:
+        return not any(
+            subprocess.run(["tc", "qdisc", *step], capture_output=True, check=False).returncode for step in steps
+        )
+    except OSError:
+        return False
+
+
 def ip_line(*settings: str) -> str:
     """The line to type that sets links one way after the other, with `sudo` for who needs it."""
     return " && ".join(f"{sudo()}ip link set {setting}" for setting in settings)

@@ -21,7 +21,7 @@ import struct
 import time
 from collections.abc import Collection, Sequence
 
-from canprobe.bus.link import TX_QUEUE, emptying_line, ip_line, setting_line, sudo
+from canprobe.bus.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import (
     ERR_FLAG,
@@ -215,11 +215,21 @@ class SocketCanPort:
             raise self._failed(error) from error
 
     def close(self) -> None:
-        """Close the socket once its frames have left, or none leaves any more: then the user hears what to do."""
+        """Close the socket once its frames have left; where none leaves any more, they are dropped.
+
+        Sent minutes later they would be old news to nodes that come back. Without the right to drop them, the user
+        hears what to type.
+        """
         if self._socket.fileno() < 0:
             return
         try:
-            if not self._await_empty():
+            if self._await_empty():
+                return
+            if drop_queued(self.channel):
+                self._reports.say(
+                    f"{self.channel}: frames that nobody acknowledged were dropped from its transmit queue"
+                )
+            else:
                 self._reports.say(
                     f"{self.channel}: frames wait in its transmit queue that nobody acknowledges, and are sent when"
                     f" somebody does; to drop them type: {emptying_line(self.channel)}"

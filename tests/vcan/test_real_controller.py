@@ -64,10 +64,12 @@ def test_its_setting_and_its_state_are_read(make_adapter: MakeAdapter) -> None:
 
 
 @pytest.mark.parametrize(
-    ("queue", "what"),
-    [(10, "the transmit queue stays full"), (1000, "the socket's send buffer stays full")],
+    ("queue", "what", "permitted"),
+    [(10, "the transmit queue stays full", False), (1000, "the socket's send buffer stays full", True)],
 )
-def test_what_is_full_while_nobody_acknowledges(make_adapter: MakeAdapter, queue: int, what: str) -> None:
+def test_what_is_full_while_nobody_acknowledges(
+    make_adapter: MakeAdapter, monkeypatch: pytest.MonkeyPatch, queue: int, what: str, permitted: bool
+) -> None:
     adapter = make_adapter(queue=queue)
     told: list[str] = []
     port = SocketCanPort(adapter.name, MonotonicClock(), reports=Reports(say=told.append))
@@ -75,10 +77,21 @@ def test_what_is_full_while_nobody_acknowledges(make_adapter: MakeAdapter, queue
     with pytest.raises(InterfaceError, match=f"^{adapter.name}: {what}") as caught:
         port.send_batch(FRAMES)
     assert ("type: ip link set" in str(caught.value)) is (queue == 10)
+    if not permitted:
+        monkeypatch.setattr("canprobe.bus.socketcan.drop_queued", lambda _: False)
     port.close()
     (line,) = told
-    assert line.startswith(f"{adapter.name}: frames wait in its transmit queue that nobody acknowledges")
-    assert line.endswith(f"type: ip link set {adapter.name} down && ip link set {adapter.name} up")
+    if not permitted:
+        assert line.startswith(f"{adapter.name}: frames wait in its transmit queue that nobody acknowledges")
+        assert line.endswith(f"type: ip link set {adapter.name} down && ip link set {adapter.name} up")
+        return
+    assert line == f"{adapter.name}: frames that nobody acknowledged were dropped from its transmit queue"
+    adapter.acknowledge(True)
+    later = SocketCanPort(adapter.name, MonotonicClock())
+    later.send_batch([(0x7FF, b"")])
+    wait_until(lambda: 0x7FF in adapter.frames, lambda: True, str)
+    assert len(adapter.frames) <= 3, "what the controller held, and no more"
+    later.close()
 
 
 @pytest.mark.parametrize("queue", [10, 1000])
@@ -115,7 +128,7 @@ def test_emulated_nodes_wait_for_their_bus_until_ctrl_c(
     monkeypatch.setattr("canprobe.cli.emulate.say", say)
     nodes = [word for n in range(1, 7) for word in ("--eds", "puma260_joint", "--node-id", str(n))]
     assert main(["emulate", *nodes, "--channel", adapter.name]) == 0
-    assert told[-1].startswith(f"{adapter.name}: frames wait in its transmit queue that nobody acknowledges")
+    assert told[-1] == f"{adapter.name}: frames that nobody acknowledged were dropped from its transmit queue"
 
 
 def test_a_scan_that_nobody_acknowledges_says_so(make_adapter: MakeAdapter, capsys: pytest.CaptureFixture[str]) -> None:
