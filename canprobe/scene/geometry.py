@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from canprobe.errors import SceneError
 from canprobe.robot.kinematics import tool_z_offset
-from canprobe.robot.tool_calibration import BallApproach, ToolEstimate, ball_approaches
+from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.checks import MismatchError, convert
 from canprobe.scene.load import toml_value
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings
@@ -100,20 +100,10 @@ def scan_axes(task: TaskSettings) -> Array:
     return np.array((along, np.cross(normal, along), normal))
 
 
-# The touches that a `calibrate` scene makes: of the ball that it expects, in SI units and the base frame.
-
-
 def expected_ball(task: TaskSettings) -> tuple[Array, float]:
     """Centre (3,), m, base frame, and radius, m, of the ball: its top is at `start_mm`."""
     radius = task.ball_radius_mm * 1e-3
     return np.array(task.start_mm) * 1e-3 - radius * approach_normal(task), radius
-
-
-def planned_approaches(task: TaskSettings) -> list[BallApproach]:
-    """The touches in their order."""
-    return ball_approaches(
-        task.touches, math.radians(task.tilt_deg), math.radians(task.beside_deg), approach_normal(task)
-    )
 
 
 # What a calibration found: for the summary, for people, and as a file that other scenes take.

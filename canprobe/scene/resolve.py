@@ -9,7 +9,7 @@ import numpy as np
 from canprobe.errors import PlanError
 from canprobe.robot.kinematics import MODELS
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.geometry import T_base_object, T_flange_probe, scan_axes, true_object
+from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (
     ArmSettings,
     LimitSettings,
@@ -142,7 +142,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     )
     servo = scene.servo or ServoSettings()
     if settings.kind == "calibrate":
-        radius = settings.ball_radius_mm * MM
+        centre, radius = expected_ball(settings)
         tilt, beside = math.radians(settings.tilt_deg), math.radians(settings.beside_deg)
         return Calibrate(
             arm=arm,
@@ -152,7 +152,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
             force=settings.force_n,
             duration_s=settings.duration_s,
             lag_s=servo.drive_lag_ms * 1e-3,
-            ball_centre=approach.start - radius * approach.normal,  # its top is expected at the start
+            ball_centre=centre,
             ball_radius=radius,
             ball_sigma=settings.ball_sigma_mm * MM,
             approaches=ball_approaches(settings.touches, tilt, beside, approach.normal),
@@ -195,7 +195,6 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
     model = MODELS[plant.arm_model] if plant.arm_model is not None else arm.model if arm is not None else None
     return Truth(
         object=shape,
-        T_base_object=T_base_object(scene.object) if scene.object is not None else None,
         model=model if arm is not None else None,
         T_flange_probe=_displaced(probe.T_flange_probe, np.array(plant.tool_error_mm) * MM),
         stiffness=plant.stiffness_n_m3 or probe.stiffness,

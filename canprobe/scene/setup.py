@@ -320,7 +320,6 @@ class Truth:
 
     Attributes:
         object: None where nothing can be touched.
-        T_base_object: (4, 4) of the object's frame; None without an object.
         model: the arm; None without one.
         T_flange_probe: (4, 4) of the probe's centre.
         stiffness: K/h of its layer, N/m³.
@@ -333,7 +332,6 @@ class Truth:
     """
 
     object: PlacedShape | None
-    T_base_object: Floats | None
     model: PumaModel | None
     T_flange_probe: Floats
     stiffness: float
