@@ -7,34 +7,37 @@ more than that, and `docs/generate.py` makes the reference of all keys from it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from canprobe.protocol.tactile import WINDOWS
 from canprobe.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, Only, Pattern, Range, ScenePath
+from canprobe.scene.hardware import (
+    ArmSettings,
+    Auto,
+    CellInfo,
+    Channel,
+    EmulateSettings,
+    JointSettings,
+    NodeId,
+    SerialNumber,
+    Vec3,
+)
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
-Auto = Literal["auto"]  # the plan chooses
 TactileModeName = Literal["window", "image", "features", "auto"]
 CobIds = Literal["default", "by_deadline", "auto"]
 ShapeMethod = Literal["recursive", "ml", "chord", "chen1996"]
 ObjectKind = Literal["plane", "sphere", "cylinder", "ellipsoid", "saddle", "bowl", "torus", "wave", "fillet", "quadric"]
-ArmModel = Literal["upenn", "unimate"]
 Fidelity = Literal["ideal", "dynamic"]
 Integrator = Literal["semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive"]
 TransmitQueue = Literal["priority", "fifo"]
 BridgeName = Literal["mcap", "foxglove", "ros2", "view"]
 
 Vec2 = tuple[float, float]
-Vec3 = tuple[float, float, float]
-Vec6 = tuple[float, float, float, float, float, float]
 Row4 = tuple[float, float, float, float]
-Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
-NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
-SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
-SerialNumbers = tuple[SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber, SerialNumber]
-NodeIds = tuple[NodeId, NodeId, NodeId, NodeId, NodeId, NodeId]
 
 TOUCH_KINDS: tuple[TaskKind, ...] = ("scan", "press", "calibrate")
 """Tasks that touch an object."""
@@ -98,6 +101,7 @@ class CycleSettings:
 
 
 @dataclass(frozen=True, slots=True)
+<<<<<<< HEAD
 class ArmSettings:
     """`[arm]`: six joint drives."""
 
@@ -121,6 +125,8 @@ class ArmSettings:
 
 
 @dataclass(frozen=True, slots=True)
+=======
+>>>>>>> 0579d19 (wip)
 class SensorSettings:
     """`[sensor]`: the 16×16 tactile array."""
 
@@ -209,8 +215,8 @@ class TaskSettings:
 
     `scan` approaches, touches and follows a path over the surface. `press` approaches and holds the force. `calibrate`
     touches a ball of known radius from several sides and finds the centre of the probe on the flange; it expects the
-    top of the ball at `start_mm`. `listen` only reads the array. `free` swings the joints about `arm.start_deg` and
-    needs no array.
+    top of the ball at `start_mm`. `listen` only reads the array. `free` swings the joints about their
+    start posture and needs no array.
     """
 
     kind: TaskKind
@@ -255,8 +261,6 @@ class TaskSettings:
     """Angle of the outer touches from the top of the ball."""
     beside_deg: Annotated[float, Range(0, 15), CALIBRATING] = 9.0
     """Angle of each touch from the pole of the probe."""
-    swing_deg: Annotated[Vec6, FREE] = (5.0, 5.0, 5.0, 10.0, 10.0, 10.0)
-    """Amplitude of the swing of each joint."""
     swing_period_s: Annotated[float, Range(0.1, 3600), FREE] = 4.0
     """Period of the swing."""
 
@@ -339,9 +343,9 @@ class PlantSettings:
 
     fidelity: Fidelity = "ideal"
     """Model of the arm."""
-    arm_model: ArmModel | None = None
-    """Geometry of the emulated arm where it differs from `arm.model`. Its base is placed so that the start point
-    stays where it is."""
+    true_cell: Annotated[str | None, ScenePath()] = None
+    """Cell whose chain the emulated arm has where it differs from the one that the controller uses. Its base is placed
+    so that the start point stays where it is."""
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
     """Integrator of the equations of motion."""
     step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0
@@ -414,7 +418,9 @@ class Scene:
     cycle: CycleSettings = CycleSettings()
     limits: LimitSettings = LimitSettings()
     bring_up: BringUpSettings = BringUpSettings()
+    cell: CellInfo = CellInfo()
     arm: ArmSettings | None = None
+    joints: Mapping[str, JointSettings] = field(default_factory=dict)
     sensor: SensorSettings | None = None
     probe: ProbeSettings | None = None
     object: ObjectSettings | None = None
@@ -422,6 +428,7 @@ class Scene:
     servo: ServoSettings | None = None
     plant: PlantSettings | None = None
     bridge: BridgeSettings | None = None
+    emulate: EmulateSettings | None = None
 
     @property
     def name(self) -> str:
