@@ -11,7 +11,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -106,6 +106,9 @@ def _converted(value: object, annotation: Any) -> Any:
         kinds = [parts[0]] * len(items) if parts[-1] is Ellipsis else list(parts)
         matches = isinstance(value, list | tuple) and len(items) == len(kinds)
         converted = tuple(_converted(item, kind) for item, kind in zip(items, kinds, strict=False))
+    elif origin is Mapping:
+        matches = isinstance(value, dict)
+        converted = {key: _converted(item, parts[1]) for key, item in value.items()} if isinstance(value, dict) else {}
     else:
         number = annotation is float and type(value) is int
         converted = float(value) if number else value  # type: ignore[arg-type]  # an int here
@@ -134,6 +137,8 @@ def expected(annotation: Any) -> str:
     if origin is tuple:
         many = _NAMES[parts[0]][1] if parts[0] in _NAMES else f"items, each {expected(parts[0])}"
         return f"a list of {many}" if parts[-1] is Ellipsis else f"a list of {len(parts)} {many}"
+    if origin is Mapping:
+        return f"a table of {_NAMES[parts[1]][1]}"
     return _NAMES[annotation][0] if annotation in _NAMES else "true or false"
 
 

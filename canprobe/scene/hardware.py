@@ -21,6 +21,7 @@ Vec6 = tuple[float, float, float, float, float, float]
 Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
+MOST_JOINTS = 8
 HOMING_METHODS = (1, 2, 17, 18, 33, 34, 35, 37)
 
 TURNS = Only("kind", ("revolute",))

@@ -1,7 +1,7 @@
 """Read a scene: TOML text → checked `Scene`, all problems at once; and the way back.
 
 `Reader` knows no key by name. A file is a dataclass whose fields are sections: `Section`, `Section | None`, or
-`tuple[Section, ...]` for a list of tables (`[[section]]`). A section is a dataclass whose fields are keys, with type,
+`Mapping[str, Section]` for named tables (`[section.NAME]`). A section is a dataclass whose fields are keys, with type,
 checks and default (`canprobe.scene.model`). What goes together across keys stands in `canprobe.scene.rules`.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import re
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
@@ -19,9 +20,11 @@ from typing import Any
 
 from canprobe.errors import SceneError
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
-from canprobe.scene.model import Scene
+from canprobe.scene.model import Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
+DEFAULT_CELL = "puma260"
+"""Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
@@ -34,9 +37,10 @@ def dump_scene(scene: Scene) -> str:
     """
     tables = []
     for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
-        many = isinstance(part, tuple)
-        title = f"[[{name}]]" if many else f"[{name}]"
-        tables += [f"{title}\n{_keys(section)}" for section in (part if many else (part,)) if section is not None]
+        if isinstance(part, Mapping):
+            tables += [f"[{name}.{toml_key(key)}]\n{_keys(section)}" for key, section in part.items()]
+        elif part is not None:
+            tables.append(f"[{name}]\n{_keys(part)}")
     return "\n".join(tables)
 
 
@@ -50,6 +54,11 @@ def _keys(section: Any) -> str:
     return lines
 
 
+def toml_key(key: str) -> str:
+    """One key as TOML writes it."""
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else toml_value(key)
+
+
 def toml_value(value: object) -> str:
     """One value as TOML writes it."""
     if isinstance(value, bool):
@@ -59,7 +68,7 @@ def toml_value(value: object) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(toml_value, value))}]"
     if isinstance(value, dict):
-        return f"{{{', '.join(f'{key} = {toml_value(item)}' for key, item in value.items())}}}"
+        return f"{{{', '.join(f'{toml_key(key)} = {toml_value(item)}' for key, item in value.items())}}}"
     return repr(value) if isinstance(value, int | float) else str(value)
 
 
@@ -69,23 +78,57 @@ def _escaped(character: str) -> str:
     return f"\\u{ord(character):04X}" if ord(character) < 0x20 or ord(character) == 0x7F else character
 
 
-def load_scene(name_or_path: str | Path) -> Scene:
+def load_scene(name_or_path: str | Path, cell: str | Path | None = None) -> Scene:
     """Read a scene.
 
     Args:
         name_or_path: a packaged scene's name, such as `cylinder`, or the path of a TOML file.
+        cell: name or path of the cell, in the place of the scene's own.
 
     Raises:
         SceneError: with every problem found, each with file, key path, what was expected and what was got.
     """
     name = str(name_or_path)
-    packaged = _packaged_files()
+    packaged = packaged_files("scenes")
+    path = find_file(name, packaged, "scene")
+    file = path.name if name in packaged else name
+    return _scene(read_toml(path, file), file, path.parent, cell)
+
+
+def load_cell(name_or_path: str | Path) -> dict[str, Any]:
+    """Read a cell file.
+
+    Args:
+        name_or_path: a packaged cell's name, such as `puma260`, or the path of a TOML file.
+
+    Returns:
+        Its document, checked section by section, with absolute paths of the files beside it.
+
+    Raises:
+        SceneError: with every problem found.
+    """
+    name = str(name_or_path)
+    packaged = packaged_files("cells")
+    path = find_file(name, packaged, "cell")
+    file = path.name if name in packaged else name
+    document = read_toml(path, file)
+    reader = Reader(path.parent)
+    reader.read(Cell, document)
+    reader.refuse(file)
+    return reader.with_paths(document)
+
+
+def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
+    """The packaged file of a name, or the path that the name is.
+
+    Raises:
+        SceneError: there is no such file; with the nearest packaged name.
+    """
     path = packaged.get(name, Path(name))
     if not isfile(path) and not name.endswith(".toml") and "/" not in name:
         hint = _did_you_mean(name, packaged)
-        raise SceneError([f"{name}: no such scene or file{hint}; packaged scenes: {', '.join(packaged)}"])
-    file = path.name if name in packaged else name
-    return _scene(read_toml(path, file), file, path.parent)
+        raise SceneError([f"{name}: no such {what} or file{hint}; packaged {what}s: {', '.join(packaged)}"])
+    return path
 
 
 def scenes_folder() -> Path:
@@ -95,11 +138,17 @@ def scenes_folder() -> Path:
 
 def packaged_scenes() -> list[tuple[str, str]]:
     """Name and title of every packaged scene, by name."""
-    return [(name, load_scene(name).title) for name in _packaged_files()]
+    return [(name, load_scene(name).title) for name in packaged_files("scenes")]
 
 
-def _packaged_files() -> dict[str, Path]:
-    return {path.stem: path for path in sorted(scenes_folder().glob("*.toml"))}
+def packaged_cells() -> list[tuple[str, str]]:
+    """Name and title of every packaged cell, by name."""
+    return [(name, load_cell(name)["cell"]["title"]) for name in packaged_files("cells")]
+
+
+def packaged_files(folder: str) -> dict[str, Path]:
+    """Paths of the packaged `scenes` or `cells`, by name."""
+    return {path.stem: path for path in sorted((scenes_folder().parent / folder).glob("*.toml"))}
 
 
 def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -> Scene:
@@ -113,7 +162,7 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     Raises:
         SceneError: with every problem found.
     """
-    return _scene(parse_toml(text, file), file, folder)
+    return _scene(parse_toml(text, file), file, folder, None)
 
 
 def read_toml(path: Path, file: str) -> dict[str, Any]:
@@ -138,12 +187,17 @@ def parse_toml(text: str, file: str) -> dict[str, Any]:
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
 
 
-def _scene(document: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
-    """The scene in a document, with the sections that its task has by default, and everything checked together."""
-    task = document.get("task")
+def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | Path | None) -> Scene:
+    """The scene in a document, with what its cell says and the sections that its task has by default.
+
+    Everything is checked together.
+    """
+    task = own.get("task")
     kind = task.get("kind") if isinstance(task, dict) else None
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
     defaults = [section for section, (need, _) in needs.items() if need == "default"]
+    unused = [section for section, (need, _) in needs.items() if need in ("never", "may")]
+    document = _with_cell(own, file, folder, cell, unused)
     reader = Reader(folder)
     values = reader.read(Scene, document, (*_ALWAYS, *defaults))
     for section, (need, why) in needs.items():
@@ -161,9 +215,34 @@ def _scene(document: Mapping[str, Any], file: str, folder: Path | None) -> Scene
 
     for where, complaint in broken_rules(lookup):
         reader.complain(where, complaint)
-    if reader.problems:
-        raise SceneError([f"{file}: {problem}" for problem in reader.problems])
+    reader.refuse(file)
     return Scene(**values)
+
+
+def _with_cell(
+    own: Mapping[str, Any], file: str, folder: Path | None, cell: str | Path | None, unused: Iterable[str]
+) -> dict[str, Any]:
+    """A scene's document over that of its cell, key by key; without the cell's sections that its task does not use."""
+    named = own.get("cell", DEFAULT_CELL)
+    if isinstance(named, dict):
+        if cell is not None:
+            raise SceneError([f"{file}: cell: the scene describes its cell itself, got {cell} in its place"])
+        return dict(own)
+    if not isinstance(named, str):
+        raise SceneError([f"{file}: cell: expected the name or the path of a cell, got {toml_value(named)}"])
+    if cell is None:
+        cell = folder / named if folder is not None and isfile(folder / named) else named
+    hardware = {name: table for name, table in load_cell(cell).items() if name not in unused}
+    return _merged(hardware, {name: table for name, table in own.items() if name != "cell"})
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    both = {key: _merged(below[key], above[key]) for key in below if _are_tables(below[key], above.get(key))}
+    return {**below, **above, **both}
+
+
+def _are_tables(*values: object) -> bool:
+    return all(isinstance(value, dict) for value in values)
 
 
 class Reader:
@@ -172,17 +251,28 @@ class Reader:
     Attributes:
         problems: each with its key path.
         bad: the key paths that have one.
+        paths: files that were found beside the file, by key path.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
         self.problems: list[str] = []
         self.bad: set[str] = set()
+        self.paths: dict[str, str] = {}
         self._folder = folder
 
     def complain(self, path: str, message: str) -> None:
         """Note a problem."""
         self.bad.add(path)
         self.problems.append(f"{path}: {message}")
+
+    def refuse(self, file: str) -> None:
+        """Raise the problems, if there are any, as those of a file.
+
+        Raises:
+            SceneError: with all of them.
+        """
+        if self.problems:
+            raise SceneError([f"{file}: {problem}" for problem in self.problems])
 
     def read(self, file: type[Any], document: Mapping[str, Any], needed: Iterable[str] = ()) -> dict[str, Any]:
         """The sections of a file, by name.
@@ -197,19 +287,28 @@ class Reader:
             if name not in sections:
                 self.complain(name, f"unknown section{_did_you_mean(name, sections)}")
         return {
-            name: self._list(hint, document.get(name, []), name)
-            if typing.get_origin(hint) is tuple
+            name: self._named(hint, document.get(name, {}), name)
+            if typing.get_origin(hint) is Mapping
             else self.section(next(iter(typing.get_args(hint)), hint), document.get(name, {}), name)
             for name, hint in sections.items()
             if name in document or name in needed
         }
 
-    def _list(self, hint: Any, tables: Any, name: str) -> tuple[Any, ...]:
-        if not isinstance(tables, list):
-            self.complain(name, f"expected a list of sections [[{name}]], got {toml_value(tables)}")
-            return ()
-        cls = typing.get_args(hint)[0]
-        return tuple(self.section(cls, table, f"{name}[{at}]") for at, table in enumerate(tables, start=1))
+    def with_paths(self, table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+        """A table that was read, with the paths that were found in the place of names."""
+        return {
+            key: self.with_paths(value, f"{prefix}{toml_key(key)}.")
+            if isinstance(value, dict)
+            else self.paths.get(prefix + key, value)
+            for key, value in table.items()
+        }
+
+    def _named(self, hint: Any, tables: Any, name: str) -> dict[str, Any]:
+        if not isinstance(tables, dict):
+            self.complain(name, f"expected sections [{name}.NAME], got {toml_value(tables)}")
+            return {}
+        cls = typing.get_args(hint)[1]
+        return {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
 
     def section(self, cls: type[Any], table: Any, name: str) -> Any:
         """One section; a key that has a problem or is missing is None in it."""
@@ -242,7 +341,7 @@ class Reader:
             hint = _did_you_mean(raw, choices_of(annotation)) if isinstance(raw, str) else ""
             return self.complain(path, f"expected {mismatch}, got {toml_value(raw)}{hint}")
         if conditions_of(annotation, ScenePath) and self._folder and isfile(self._folder / value):
-            return str((self._folder / value).resolve())
+            value = self.paths[path] = str((self._folder / value).resolve())
         return value
 
     def _check_condition(self, path: str, given: bool, only: Only, actual: Any) -> None:

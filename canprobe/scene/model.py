@@ -101,32 +101,6 @@ class CycleSettings:
 
 
 @dataclass(frozen=True, slots=True)
-<<<<<<< HEAD
-class ArmSettings:
-    """`[arm]`: six joint drives."""
-
-    model: ArmModel = "upenn"
-    """Published geometry of the PUMA 260 that the controller uses."""
-    node_ids: Annotated[NodeIds, DISTINCT] = (1, 2, 3, 4, 5, 6)
-    """Node ids of the drives, from the base to the wrist."""
-    eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
-    """EDS of the drives: a packaged name, or a path relative to the scene."""
-    emulated: bool = True
-    """canprobe serves the drives. false: the drives are real."""
-    start_deg: Vec6 = (90.0, 65.0, 15.0, 0.0, 100.0, 0.0)
-    """Joint angles that select the branch of the inverse kinematics. An emulated arm starts here in `free`, and
-    above the start point in other tasks."""
-    missed_syncs: Annotated[int, Range(1, 250)] = 5
-    """SYNC periods of silence after which master and drives treat each other as lost."""
-    grouped_rpdo: bool | Auto = False
-    """Put two targets into one RPDO by dummy mapping."""
-    serial_numbers: Annotated[SerialNumbers | None, DISTINCT] = None
-    """Serial number (1018h:04) that each drive must have. Left out: any."""
-
-
-@dataclass(frozen=True, slots=True)
-=======
->>>>>>> 0579d19 (wip)
 class SensorSettings:
     """`[sensor]`: the 16×16 tactile array."""
 
@@ -409,6 +383,24 @@ class BridgeSettings:
 
 
 @dataclass(frozen=True, slots=True)
+class Cell:
+    """What a cell file may hold: the sections of a scene that describe hardware. Those that are None are absent."""
+
+    cell: CellInfo
+    bus: BusSettings | None = None
+    cycle: CycleSettings | None = None
+    limits: LimitSettings | None = None
+    bring_up: BringUpSettings | None = None
+    arm: ArmSettings | None = None
+    joints: Mapping[str, JointSettings] = field(default_factory=dict)
+    sensor: SensorSettings | None = None
+    probe: ProbeSettings | None = None
+    servo: ServoSettings | None = None
+    plant: PlantSettings | None = None
+    emulate: EmulateSettings | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class Scene:
     """One experiment. Sections that are None are absent."""
 
@@ -448,6 +440,17 @@ class Scene:
     @property
     def emulated_node_ids(self) -> tuple[int, ...]:
         """The nodes that the scene wants emulated, ascending."""
-        arm = self.arm.node_ids if self.arm is not None and self.arm.emulated else ()
+        drives = [node_id for node_id, emulated in self.drives.items() if emulated]
         sensor = (self.sensor.node_id,) if self.sensor is not None and self.sensor.emulated else ()
-        return tuple(sorted((*arm, *sensor)))
+        return tuple(sorted((*drives, *sensor)))
+
+    @property
+    def drives(self) -> dict[int, bool]:
+        """Node ids of the drives in the order of the joints, and whether each is emulated; empty without an arm."""
+        if self.arm is None:
+            return {}
+        joints = enumerate(self.joints.values(), start=1)
+        return {
+            joint.node_id or number: self.arm.emulated if joint.emulated is None else joint.emulated
+            for number, joint in joints
+        }

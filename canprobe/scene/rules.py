@@ -13,6 +13,7 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.scene.checks import MismatchError, convert
+from canprobe.scene.hardware import MOST_JOINTS, JointSettings
 from canprobe.scene.model import TOUCH_KINDS, Scene
 
 _MAY, _DEFAULT = ("may", ""), ("default", "")
@@ -21,48 +22,58 @@ SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
     # section: (need, why). need: "must" be given, "default" when left out, "may" be given, "never"
     "scan": {
         "arm": ("must", "a scan moves the probe"),
+        "joints": ("must", "a scan moves the probe"),
         "sensor": ("must", "a scan follows what it feels"),
         "probe": _DEFAULT,
         "object": _MAY,
         "shape": _DEFAULT,
         "servo": _DEFAULT,
         "plant": _DEFAULT,
+        "emulate": _DEFAULT,
     },
     "press": {
         "arm": ("must", "a press moves the probe"),
+        "joints": ("must", "a press moves the probe"),
         "sensor": ("must", "a press holds the force it feels"),
         "probe": _DEFAULT,
         "object": _MAY,
         "shape": ("never", "one touch without motion shows no shape"),
         "servo": _DEFAULT,
         "plant": _DEFAULT,
+        "emulate": _DEFAULT,
     },
     "calibrate": {
         "arm": ("must", "a calibration moves the probe"),
+        "joints": ("must", "a calibration moves the probe"),
         "sensor": ("must", "a calibration feels the ball"),
         "probe": _DEFAULT,
         "object": _MAY,
         "shape": ("never", "the ball's shape is known"),
         "servo": ("never", "no surface is followed"),
         "plant": _DEFAULT,
+        "emulate": _DEFAULT,
     },
     "listen": {
         "arm": ("never", "listening moves nothing"),
+        "joints": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
         "probe": _DEFAULT,
         "object": _MAY,
         "shape": ("never", "without motion there is no shape to estimate"),
         "servo": ("never", "listening moves nothing"),
         "plant": _DEFAULT,
+        "emulate": _DEFAULT,
     },
     "free": {
         "arm": ("must", "free motion moves the arm"),
+        "joints": ("must", "free motion moves the arm"),
         "sensor": ("never", "free motion feels nothing"),
         "probe": _MAY,
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
         "plant": _DEFAULT,
+        "emulate": _DEFAULT,
     },
 }
 
@@ -83,10 +94,38 @@ def _across(*keys: str) -> Callable[[Callable[..., _Complaint]], Callable[..., _
     return take
 
 
-@_across("arm.node_ids", "sensor.node_id")
-def _duplicate_node(arm_ids: tuple[int, ...], sensor_id: int) -> _Complaint:
-    if sensor_id in arm_ids:
-        yield "sensor.node_id", f"expected a node id of its own, got {sensor_id}, which arm.node_ids has too"
+@_across("arm", "joints")
+def _joints_missing(arm: object, joints: Mapping[str, JointSettings]) -> _Complaint:
+    if not 1 <= len(joints) <= MOST_JOINTS:
+        yield "joints", f"expected 1 to {MOST_JOINTS} sections [joints.NAME], got {len(joints)}"
+
+
+@_across("joints", "arm.urdf?")
+def _joint_incomplete(joints: Mapping[str, JointSettings], urdf: str | None) -> _Complaint:
+    for name, joint in joints.items():
+        turns = joint.kind == "revolute"
+        needed = ["counts_per_turn"] if turns else ["counts_per_m"]
+        if urdf is None:
+            needed += ["min_deg", "max_deg", "speed_deg_s"] if turns else ["min_mm", "max_mm", "speed_mm_s"]
+        for key in needed:
+            if getattr(joint, key) is None:
+                yield f"joints.{name}.{key}", f"missing: a {joint.kind} joint needs it"
+        for other in joint.coupling or ():
+            if other not in joints or other == name:
+                names = ", ".join(key for key in joints if key != name)
+                yield f"joints.{name}.coupling", f"expected names of other joints ({names}), got {other}"
+
+
+@_across("joints", "sensor.node_id?")
+def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None) -> _Complaint:
+    owners = {sensor: "sensor"} if sensor is not None else {}
+    for number, (name, joint) in enumerate(joints.items(), start=1):
+        node_id = joint.node_id or number
+        other = owners.setdefault(node_id, name)
+        if other == "sensor":
+            yield "sensor.node_id", f"expected a node id of its own, got {node_id}, which joints.{name} has too"
+        elif other != name:
+            yield f"joints.{name}.node_id", f"expected node ids all different, got {node_id}, as joints.{other} has"
 
 
 @_across("task.kind", "sensor.emulated", "object?")
