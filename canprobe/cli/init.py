@@ -1,0 +1,273 @@
+"""Write a cell file for your own arm and a first scene that runs on the emulator at once.
+
+The chain comes from a URDF; without one the file begins with the rows of a PUMA 560, to be replaced. EDS files are
+copied beside the cell file: one for all drives, or one for each joint from the base. What neither file says (counts a
+turn, gears) has a placeholder with a comment.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from canprobe.cli.parser import Commands, Parser, folder_path
+from canprobe.errors import CanprobeError, PlanError, UsageError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from canprobe.robot.model import ArmModel, Joint
+    from canprobe.robot.urdf import UrdfArm
+    from canprobe.scene.model import Scene
+
+_EXAMPLE = """\
+examples:
+  canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
+  canprobe run my-cell/first.toml
+"""
+_RATES_HZ = (400.0, 1000 / 3, 250.0, 200.0, 125.0, 100.0, 50.0)
+_TRIES = 400
+_GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
+
+
+def add_parser(commands: Commands[Parser]) -> None:
+    """Add the command."""
+    parser = commands.add_parser(
+        "init", help="write a cell file and a first scene for your own arm", description=__doc__, epilog=_EXAMPLE
+    )
+    parser.add_argument("folder", metavar="DIR", type=folder_path, help="folder to write into; made if it is missing")
+    parser.add_argument("--urdf", metavar="FILE", type=Path, help="URDF of the arm [rows of a PUMA 560]")
+    parser.add_argument("--base", metavar="LINK", help="link of the URDF that is the base [its root]")
+    parser.add_argument("--tip", metavar="LINK", help="link of the URDF that is the flange [its only end]")
+    parser.add_argument(
+        "--eds", metavar="FILE", type=Path, action="append", default=[], help="EDS of the drives; once, or once a joint"
+    )
+    parser.set_defaults(run=run)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Write cell.toml and first.toml, with the files that they name."""
+    folder: Path = args.folder
+    for name in ("cell.toml", "first.toml"):
+        if (folder / name).exists():
+            raise UsageError(f"{folder / name} exists already: choose another folder, or remove it")
+    for path in (*args.eds, *([args.urdf] if args.urdf else [])):
+        if not path.is_file():
+            raise UsageError(f"{path}: no such file")
+    if args.urdf is None and (args.base or args.tip):
+        raise UsageError("--base and --tip are links of a URDF: give it with --urdf FILE")
+    cell = _urdf_cell(args) if args.urdf else _dh_cell(args)
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in {*args.eds, *([args.urdf] if args.urdf else [])}:
+        if path.resolve() != (folder / path.name).resolve():
+            shutil.copy(path, folder / path.name)
+    (folder / "cell.toml").write_text(cell, encoding="utf-8")
+    first = _first_scene(folder, args.folder.resolve().name)
+    (folder / "first.toml").write_text(first, encoding="utf-8")
+    print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
+    print(f"next: canprobe plan {folder / 'first.toml'}")
+    print(f"      canprobe run {folder / 'first.toml'}")
+    return 0
+
+
+# The cell file.
+
+_HEAD = """\
+# A cell: the hardware that scenes run on. All keys: docs/scene-keys.md.
+# What is marked "check" is a placeholder that neither the URDF nor the EDS says.
+
+[cell]
+name = "{name}"
+title = "{name}"
+
+[bus]
+bitrate = 1000000
+
+[cycle]
+rate_hz = 400 # of SYNC and servo; `canprobe plan` says what the drives and the bus can do
+
+"""
+_TAIL = """
+[sensor] # the tactile array; see the keys
+node_id = 16
+
+[probe] # the sphere that carries the array, behind the flange
+radius_mm = 40
+centre_offset_mm = 80
+
+[limits]
+force_max_n = 5
+joint_speed_share = 0.5 # of the joints' speeds; raise it once the cell runs
+
+[bring_up]
+boot_up_s = 2.0 # raise these where drives are slow
+sdo_s = 0.5
+"""
+
+
+def _urdf_cell(args: argparse.Namespace) -> str:
+    from canprobe.robot.urdf import from_urdf
+
+    found = from_urdf(args.urdf, args.base, args.tip)
+    text = _HEAD.format(name=_cell_name(args.folder))
+    text += "[arm]\n" + f'urdf = "{args.urdf.name}"\n'
+    text += "".join(f'{key} = "{link}"\n' for key, link in (("base", args.base), ("tip", args.tip)) if link)
+    text += "mount_mm = [0, 0, 0] # where the arm's base stands; the scene's coordinates count from there\n"
+    text += _common_eds(args.eds, len(found.joints)) + _TAIL
+    postures = _rounded(found)
+    for number, (joint, start) in enumerate(zip(found.joints, postures, strict=True), start=1):
+        text += "\n" + _joint_section(number, joint, start, args.eds)
+    return text
+
+
+def _common_eds(eds: Sequence[Path], joints: int) -> str:
+    if len(eds) not in (0, 1, joints):
+        raise UsageError(f"--eds: expected one file, or one for each of the {joints} joints, got {len(eds)}")
+    if len(eds) == joints and joints > 1:
+        return "emulated = true # false: the drives are real\n"
+    name = eds[0].name if eds else "puma260_joint.eds"
+    return f'eds = "{name}"\nemulated = true # false: the drives are real\n'
+
+
+def _joint_section(number: int, joint: Joint, start: float, eds: Sequence[Path]) -> str:
+    """One joint; its range and speed stand in the URDF."""
+    from canprobe.scene.load import toml_key
+
+    lines = [f"[joints.{toml_key(joint.name)}]"]
+    if joint.prismatic:
+        lines += ['kind = "prismatic"', f"start_mm = {start:g}"]
+    else:
+        lines += [f"start_deg = {start:g}"]
+    if not joint.qd_max > 0.0:
+        lines += ["speed_mm_s = 100 # check" if joint.prismatic else "speed_deg_s = 30 # check"]
+    lines += [f"node_id = {number} # check"]
+    if len(eds) > 1:
+        lines += [f'eds = "{eds[number - 1].name}"']
+    if joint.prismatic:
+        lines += [f"counts_per_m = {_COUNTS_PER_M} # check"]
+    else:
+        lines += [f"counts_per_turn = {_COUNTS_PER_TURN} # check: position units of the drive per motor turn"]
+        lines += [f"gear = {_GEAR} # check: motor turns per turn of the joint"]
+    lines += ["sign = 1 # check: -1 where the drive counts the other way", "zero_counts = 0 # check"]
+    return "\n".join(lines) + "\n"
+
+
+def _dh_cell(args: argparse.Namespace) -> str:
+    """The packaged PUMA 560 as a template."""
+    from canprobe.scene.load import packaged_files
+
+    text = packaged_files("cells")["puma560"].read_text(encoding="utf-8")
+    name = _cell_name(args.folder)
+    text = text.replace('name = "puma560"', f'name = "{name}"').replace(
+        'title = "PUMA 560 with the array and the probe of the PUMA 260"', f'title = "{name}: rows of a PUMA 560"'
+    )
+    if args.eds:
+        eds = _common_eds(args.eds, 6)
+        text = text.replace('eds = "puma260_joint.eds"\n', eds)
+        if len(args.eds) == 6:
+            for number, path in enumerate(args.eds, start=1):
+                text = text.replace(f"node_id = {number}\n", f'node_id = {number}\neds = "{path.name}"\n')
+    return "# Replace the rows, ranges, gears and masses by those of your arm.\n#\n" + text
+
+
+def _cell_name(folder: Path) -> str:
+    name = "".join(c if c.isalnum() and c.isascii() or c in "_.-" else "-" for c in folder.resolve().name)
+    return name if name and name[0].isalnum() else f"cell{name}"
+
+
+# The first scene: a straight scan over a plane under the probe, where the arm moves well.
+
+
+def _rounded(found: UrdfArm) -> list[float]:
+    """A posture from which the probe points down as far as the arm can, in deg and mm."""
+    import numpy as np
+
+    from canprobe.robot.chain import forward_jacobian, tool_z_offset
+
+    tool, rng = tool_z_offset(80.0), np.random.default_rng(0)
+    low = np.array([joint.q_min for joint in found.joints])
+    high = np.array([joint.q_max for joint in found.joints])
+    turning = np.array([not joint.prismatic for joint in found.joints])
+    low, high = np.where(turning, np.maximum(low, -math.pi), low), np.where(turning, np.minimum(high, math.pi), high)
+    best, most = (low + high) / 2, -math.inf
+    for _ in range(_TRIES):
+        q = low + (high - low) * rng.uniform(0.15, 0.85, len(low))
+        T, J = forward_jacobian(found.chain, q, tool)
+        singular = np.linalg.svd(J * np.array((5.0, 5.0, 5.0, 1.0, 1.0, 1.0))[:, None], compute_uv=False)
+        score = 3.0 * -float(T[2, 2]) + float(singular[min(len(low), 6) - 1]) + 2.0 * min(0.0, float(T[2, 3]))
+        if score > most:
+            best, most = q, score
+    shown = [joint.shown(float(value)) for joint, value in zip(found.joints, best, strict=True)]
+    return [round(value) for value in shown]
+
+
+def _first_scene(folder: Path, name: str) -> str:
+    """The first of some scenes, from demanding to plain, that the cell can do as it stands."""
+    from canprobe.api import plan
+    from canprobe.scene.load import parse_scene
+
+    problems: list[str] = []
+    for text in _candidates(folder):
+        try:
+            plan(parse_scene(text, file="first.toml", folder=folder))
+        except PlanError as error:
+            problems = problems or list(error.problems)
+        else:
+            return text
+    raise PlanError([*problems, f"{folder / 'cell.toml'} was written: correct it, then write a scene for it"])
+
+
+def _candidates(folder: Path) -> Iterator[str]:
+    from canprobe.scene.load import parse_scene
+    from canprobe.scene.resolve import resolve
+
+    for rate in _RATES_HZ:
+        head = f'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
+        cycle = "" if rate == _RATES_HZ[0] else f"\n[cycle]\nrate_hz = {rate!r}\n"
+        cycle += f"\n[sensor]\nrate_hz = {min(200.0, rate)!r}\n" if rate < 200.0 else ""
+        free = head + cycle + '\n[task]\nkind = "free"\nduration_s = 5\n'
+        setup = resolve(parse_scene(free, folder=folder))
+        assert setup.arm is not None
+        for speed, length in ((10, 20), (5, 10)):
+            yield head + cycle + _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
+        yield free
+
+
+def _touch(model: ArmModel, q: NDArray, T_flange_probe: NDArray, speed: float, length: float) -> str:
+    """A straight scan over a plane that faces the pole of the probe in the start posture."""
+    import numpy as np
+
+    from canprobe.robot.chain import forward
+
+    T = forward(model.chain, q) @ T_flange_probe
+    pole, place = T[:3, 2], 1e3 * T[:3, 3]
+    normal = -pole if model.n > 4 or abs(pole[2]) < 0.99 else np.array((0.0, 0.0, -math.copysign(1.0, pole[2])))
+    start = place - 45.0 * normal
+    rows = ", ".join(f"{value:.1f}" for value in start)
+    roll, pitch = math.degrees(math.asin(-float(normal[1]))), math.degrees(math.atan2(normal[0], normal[2]))
+    if abs(normal[2]) < 0.9:  # the plane is steep: a heading in the xy-plane, across the normal
+        heading = math.degrees(math.atan2(normal[0], -normal[1]))
+    else:
+        heading = 0.0
+    rolling = "rolling_share = 1 # the arm holds its orientation\n" if model.n <= 4 else ""
+    return f"""
+[object] # the truth of the emulated contact; delete the section for a real object
+kind = "plane"
+position_mm = [{rows}]
+rotation_deg = [{roll:.3f}, {pitch:.3f}, 0]
+
+[task]
+kind = "scan"
+strategy = "straight"
+force_n = 2
+start_mm = [{rows}]
+approach_normal = [{normal[0]:.6f}, {normal[1]:.6f}, {normal[2]:.6f}]
+heading_deg = {heading:.1f}
+length_mm = {length}
+speed_mm_s = {speed}
+duration_s = 10
+{rolling}"""

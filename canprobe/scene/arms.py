@@ -1,0 +1,154 @@
+"""From the sections `[arm]` and `[joints.*]` to the arm: chain, joints, drive units, bodies, drives.
+
+The chain is read from a URDF or from Denavit-Hartenberg rows. What a joint's section gives replaces what the URDF says.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from canprobe.errors import PlanError
+from canprobe.robot.chain import Chain, from_dh
+from canprobe.robot.model import ArmModel, Body, Joint
+from canprobe.robot.urdf import UrdfArm, from_urdf
+from canprobe.scene.geometry import transform
+from canprobe.scene.hardware import ArmSettings, JointSettings
+
+Array = NDArray[np.float64]
+Bodies = tuple[Body | None, ...]
+
+_MM = 1e-3
+_OF_REVOLUTE = {
+    "q_min": ("min_deg", math.radians(1)),
+    "q_max": ("max_deg", math.radians(1)),
+    "qd_max": ("speed_deg_s", math.radians(1)),
+    "rated_torque": ("rated_torque_nm", 1.0),
+    "rotor_inertia": ("rotor_inertia_kg_m2", 1.0),
+    "coulomb": ("coulomb_nm", 1.0),
+    "viscous": ("viscous_nm_s", 1.0),
+}
+_OF_PRISMATIC = {
+    "q_min": ("min_mm", _MM),
+    "q_max": ("max_mm", _MM),
+    "qd_max": ("speed_mm_s", _MM),
+    "rated_torque": ("rated_force_n", 1.0),
+    "rotor_inertia": ("rotor_mass_kg", 1.0),
+    "coulomb": ("coulomb_n", 1.0),
+    "viscous": ("viscous_n_s_m", 1.0),
+}
+"""Field of a `Joint` → key of a section, and what its unit is in SI."""
+_PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 20.0, "viscous": 20.0}
+
+
+def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]) -> tuple[ArmModel, Bodies]:
+    """The arm of a cell, and the bodies of its links, None for one of unknown mass.
+
+    Args:
+        name: of the cell.
+        arm: its section.
+        sections: those of its joints, from the base.
+
+    Raises:
+        PlanError: the URDF cannot be used, or joints and sections contradict each other.
+    """
+    mount, flange = transform(arm.mount_mm, arm.mount_deg), transform(arm.flange_mm, arm.flange_deg)
+    if arm.urdf is not None:
+        found = from_urdf_file(arm, name)
+        _refuse_other_names(found, sections, arm)
+        chain = _moved(found.chain, mount, flange)
+        joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
+        bodies = found.bodies
+    else:
+        rows = [(s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg)) for s in sections.values()]
+        slides = [section.kind == "prismatic" for section in sections.values()]
+        chain = from_dh(
+            rows,
+            arm.convention,
+            name=name,
+            joints=list(sections),
+            prismatic=slides,
+            T_base_mount=mount,
+            T_last_flange=flange,
+        )
+        joints = [_joint(section, _bare(joint, section)) for joint, section in sections.items()]
+        bodies = tuple(_body(section, place, arm) for section, place in zip(sections.values(), rows, strict=True))
+    model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
+    return model, bodies
+
+
+def from_urdf_file(arm: ArmSettings, name: str) -> UrdfArm:
+    """The arm in the URDF of a section."""
+    assert arm.urdf is not None
+    return from_urdf(arm.urdf, arm.base, arm.tip, name=name)
+
+
+def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:
+    names = found.chain.joints
+    if tuple(sections) != names:
+        listed = ", ".join(sections) or "none"
+        raise PlanError([f"joints: expected the joints of {arm.urdf} in their order ({', '.join(names)}), got {listed}"])
+    for joint, section in zip(found.joints, sections.values(), strict=True):
+        kind = "prismatic" if joint.prismatic else "revolute"
+        if section.kind != kind:
+            raise PlanError([f'joints.{joint.name}.kind: expected "{kind}" as in {arm.urdf}, got "{section.kind}"'])
+
+
+def _moved(chain: Chain, mount: Array, flange: Array) -> Chain:
+    fixed = chain.fixed.copy()
+    fixed[0] = mount @ fixed[0]
+    return replace(chain, fixed=fixed, T_last_flange=chain.T_last_flange @ flange)
+
+
+def _bare(name: str, section: JointSettings) -> Joint:
+    prismatic = section.kind == "prismatic"
+    return Joint(name, prismatic, 0.0, 0.0, 0.0, **(_PRISMATIC_DEFAULTS if prismatic else {}))
+
+
+def _joint(section: JointSettings, joint: Joint) -> Joint:
+    keys = _OF_PRISMATIC if joint.prismatic else _OF_REVOLUTE
+    given = {field: (getattr(section, key), unit) for field, (key, unit) in keys.items()}
+    return replace(joint, **{field: value * unit for field, (value, unit) in given.items() if value is not None})
+
+
+def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
+    """(n, n) drive units per rad or m of each joint."""
+    names = list(sections)
+    turns = np.diag([section.gear for section in sections.values()])
+    for i, section in enumerate(sections.values()):
+        for other, share in (section.coupling or {}).items():
+            turns[i, names.index(other)] = share
+    units = [s.sign * (s.counts_per_turn or s.counts_per_m or 0.0) for s in sections.values()]
+    radians = [1.0 if section.kind == "prismatic" else 2 * math.pi for section in sections.values()]
+    scaled: Array = np.diag(units) @ turns / np.array(radians)
+    return scaled
+
+
+def _body(section: JointSettings, row: tuple[float, ...], arm: ArmSettings) -> Body | None:
+    """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
+    if section.mass_kg is None:
+        return None
+    T = np.eye(4) if arm.convention == "modified" else behind_joint(row, section.kind == "prismatic")
+    xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
+    tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+    R = T[:3, :3]
+    return Body(section.mass_kg, R @ (np.array(section.com_mm) * _MM) + T[:3, 3], R @ tensor @ R.T)
+
+
+def behind_joint(row: tuple[float, ...], prismatic: bool) -> Array:
+    """(4, 4) of what a standard row holds besides the motion of its joint."""
+    raise NotImplementedError
+
+
+def start_posture(sections: Mapping[str, JointSettings]) -> Array:
+    """(n,) start of each joint, rad or m."""
+    return np.array([s.start_mm * _MM if s.kind == "prismatic" else math.radians(s.start_deg) for s in sections.values()])
+
+
+def swing(sections: Mapping[str, JointSettings]) -> Array:
+    """(n,) amplitude of each joint in free motion, rad or m."""
+    return np.array([s.swing_mm * _MM if s.kind == "prismatic" else math.radians(s.swing_deg) for s in sections.values()])
