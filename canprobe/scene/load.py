@@ -308,7 +308,10 @@ class Reader:
             self.complain(name, f"expected sections [{name}.NAME], got {toml_value(tables)}")
             return {}
         cls = typing.get_args(hint)[1]
-        return {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
+        read = {key: self.section(cls, table, f"{name}.{toml_key(key)}") for key, table in tables.items()}
+        if None in read.values():
+            self.bad.add(name)
+        return read
 
     def section(self, cls: type[Any], table: Any, name: str) -> Any:
         """One section; a key that has a problem or is missing is None in it."""
