@@ -12,6 +12,7 @@ import numpy as np
 from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
+from canprobe.bus.lockstep import Participant
 from canprobe.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.eds.reading import is_drive
 from canprobe.emulator.array import make_tactile_node
@@ -44,7 +45,7 @@ class TruePlant(Protocol):
         """True values of a state: numbers and arrays, always under the same names."""
 
 
-class TruthRecorder:
+class TruthRecorder(Participant):
     """A silent participant of the bus that writes down the plant's state at every SYNC.
 
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
@@ -57,26 +58,13 @@ class TruthRecorder:
     """
 
     name = "truth recorder"
-    witness = True
+    hears_every_sync = True
     listens = frozenset((SYNC_ID,))
 
     def __init__(self, plant: TruePlant) -> None:
         self._plant = plant
         self.origin_ns = 0
         self._rows: list[tuple[int, int, Any]] = []
-
-    @property
-    def next_deadline_ns(self) -> None:
-        """Only a SYNC wakes it."""
-        return None
-
-    def start(self, t_ns: int) -> list[Frame]:
-        """Nothing to say."""
-        return []
-
-    def advance(self, t_ns: int) -> list[Frame]:
-        """Nothing is ever due."""
-        return []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """On a SYNC, take the state."""

@@ -15,6 +15,7 @@ from collections.abc import Callable, Container
 
 from canopen.objectdictionary import ObjectDictionary
 
+from canprobe.bus.lockstep import Participant
 from canprobe.emulator.node.core import NMT_TRANSITIONS, Application, NodeCore, Route, Service
 from canprobe.emulator.node.dictionary import Dictionary
 from canprobe.emulator.node.error_control import Emergency, HeartbeatConsumer, HeartbeatProducer, NodeGuarding
@@ -29,7 +30,7 @@ _ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 
 _COMMANDS = frozenset(NmtCommand)
 
 
-class SlaveNode:
+class SlaveNode(Participant):
     """One node, made from an EDS and an application.
 
     Attributes:
@@ -38,8 +39,9 @@ class SlaveNode:
         application: the device.
         next_deadline_ns: when `advance` has something to do, or None.
         lss: the LSS service; None where the node's id cannot be changed over the bus.
-        rerouted: called when `listens` has changed; a bus puts its own function there.
     """
+
+    next_deadline_ns: int | None = None
 
     def __init__(
         self,
@@ -60,12 +62,11 @@ class SlaveNode:
         """
         self.application = application if application is not None else Application()
         self.core = core = NodeCore(node_id, Dictionary(od))
-        self.next_deadline_ns: int | None = None
         core.timers.holder = self
         self._boot_ns = boot_ns
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
-        self.rerouted: Callable[[], None] = _nothing
+        self._rerouted: Callable[[], None] = _nothing
         self.emcy = Emergency(core)
         self.pdos = PdoEngine(core, self.emcy, self.application)
         self.store = Store(core, self.application)
@@ -107,6 +108,15 @@ class SlaveNode:
     def dictionary(self) -> Dictionary:
         """The node's object dictionary with its present values."""
         return self.core.dictionary
+
+    @property
+    def kind(self) -> type:
+        """That of the device."""
+        return type(self.application)
+
+    def connect(self, rerouted: Callable[[], None]) -> None:
+        """Call `rerouted` from now on."""
+        self._rerouted = rerouted
 
     def start(self, t_ns: int) -> list[Frame]:
         """Power on."""
@@ -227,7 +237,7 @@ class SlaveNode:
             routes[NMT_ID] = self._nmt
         elif self.lss is not None and self.lss.unconfigured:
             routes.update(self.lss.routes())
-        self.rerouted()
+        self._rerouted()
 
 
 def _nothing() -> None:
