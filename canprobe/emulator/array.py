@@ -18,9 +18,8 @@ from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
 from canprobe.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
-from canprobe.emulator.node.core import Application
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
-from canprobe.emulator.node.slave_node import OdOf, SlaveNode
+from canprobe.emulator.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
 from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_whole

@@ -16,9 +16,8 @@ from canprobe.emulator.drive.mode import DriveFaults, DriveFeedback, DriveLoop, 
 from canprobe.emulator.drive.modes import CyclicPosition, CyclicTorque, CyclicVelocity, Homing, ProfilePosition
 from canprobe.emulator.drive.parameters import FACTORS, STAYS_STOPPED, DriveParameters
 from canprobe.emulator.drive.reference import STEP_NS, AxisPlant, Motion
-from canprobe.emulator.node.core import Application
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
-from canprobe.emulator.node.slave_node import OdOf, SlaveNode
+from canprobe.emulator.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.protocol import cia402
 from canprobe.protocol.cia402 import (
     AUTOMATIC_TRANSITIONS,

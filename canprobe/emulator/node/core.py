@@ -1,19 +1,13 @@
-"""What the services of one node share: identity, NMT state, time, dictionary, timers, application and the frames to
-send.
-"""
+"""What the services of one node share: identity, NMT state, time, dictionary, timers and the frames to send."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from heapq import heapify, heappop, heappush, heapreplace
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-from canprobe.emulator.node.dictionary import Dictionary
-from canprobe.protocol.frames import Frame, NmtCommand, NmtState
-
-if TYPE_CHECKING:
-    from canprobe.emulator.node.slave_node import SlaveNode
-
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, nothing
+from canprobe.protocol.frames import Frame, NmtCommand, NmtState, is_restricted
 
 # Deadlines of one node: a heap that forgives re-arming, because a cyclic node re-arms on every SYNC.
 
@@ -28,11 +22,11 @@ class Timer:
         queued_ns: where its entry on the heap is, at `due_ns` or before (for `Timers`).
     """
 
-    __slots__ = ("_callback", "_owner", "due_ns", "queued_ns")
+    __slots__ = ("_owner", "callback", "due_ns", "queued_ns")
 
     def __init__(self, owner: Timers, callback: Callable[[int], None]) -> None:
         self._owner = owner
-        self._callback = callback
+        self.callback = callback
         self.queued_ns: int | None = None
         self.due_ns: int | None = None
 
@@ -65,11 +59,6 @@ class Timer:
             self.queued_ns = None
         return self.due_ns is not None
 
-    def fire(self, due_ns: int) -> None:
-        """Disarm and call back with the time that was ordered; the entry is off the heap."""
-        self.due_ns = self.queued_ns = None
-        self._callback(due_ns)
-
 
 class Holder(Protocol):
     """Somebody who shows the next deadline."""
@@ -77,28 +66,24 @@ class Holder(Protocol):
     next_deadline_ns: int | None
 
 
-class _Nobody:
-    next_deadline_ns: int | None = None
-
-
 class Timers:
     """All deadlines of a node.
+
+    Args:
+        holder: whose `next_deadline_ns` follows `next_ns`: buses ask for it far more often than it changes.
 
     Attributes:
         now_ns: the time up to which `run` was last called.
         next_ns: the earliest deadline, or None.
-        holder: whose `next_deadline_ns` is the same: buses ask for it far more often than it changes.
     """
 
-    __slots__ = ("_count", "_heap", "_most", "holder", "next_ns", "now_ns")
-
-    def __init__(self) -> None:
+    def __init__(self, holder: Holder) -> None:
         self._heap: list[tuple[int, int, Timer]] = []
         self._count = 0
         self._most = _ROOM
+        self._holder = holder
         self.now_ns = 0
         self.next_ns: int | None = None
-        self.holder: Holder = _Nobody()
 
     def new(self, callback: Callable[[int], None]) -> Timer:
         """A timer that calls `callback(due_ns)`; not armed."""
@@ -109,7 +94,7 @@ class Timers:
         self._count += 1
         heappush(self._heap, (due_ns, self._count, timer))
         if self.next_ns is None or due_ns < self.next_ns:
-            self.next_ns = self.holder.next_deadline_ns = due_ns
+            self.next_ns = self._holder.next_deadline_ns = due_ns
         if len(self._heap) > self._most:
             self._compact()
 
@@ -120,7 +105,7 @@ class Timers:
             queued, _, timer = heap[0]
             due = timer.due_ns
             if due == queued:
-                self.next_ns = self.holder.next_deadline_ns = due
+                self.next_ns = self._holder.next_deadline_ns = due
                 return
             if timer.holds(queued) and due is not None:
                 timer.queued_ns = due
@@ -128,7 +113,7 @@ class Timers:
                 heapreplace(heap, (due, self._count, timer))
             else:
                 heappop(heap)
-        self.next_ns = self.holder.next_deadline_ns = None
+        self.next_ns = self._holder.next_deadline_ns = None
 
     def _compact(self) -> None:
         """Drop the entries of deadlines that were moved or cancelled, which else stay until their time."""
@@ -138,12 +123,13 @@ class Timers:
         self._most = 2 * len(heap) + _ROOM
 
     def run(self, t_ns: int) -> None:
-        """Fire everything due up to and at `t_ns`, in order of time, then of arming."""
+        """Fire everything due up to and at `t_ns`, in order of time, then of arming, each with the time ordered."""
         self.now_ns = t_ns
         heap = self._heap
         while heap and heap[0][0] <= t_ns:
             due, _, timer = heappop(heap)
-            timer.fire(due)
+            timer.due_ns = timer.queued_ns = None
+            timer.callback(due)
             self.tidy()
 
 
@@ -156,31 +142,34 @@ NO_ROUTES: Mapping[int, Route] = {}
 class NodeCore:
     """Shared by the services of one node; the node itself drives it.
 
+    Args:
+        node_id: 1–127, or 255 for none.
+        dictionary: the node's.
+        holder: shows the next deadline of the timers.
+
     Attributes:
-        node_id: 1–127.
         state: NMT state.
         now_ns: time of the event being served.
         out: frames to send, in order.
+        reroute: to be called when the routes of a service have changed.
     """
 
-    __slots__ = ("dictionary", "node_id", "now_ns", "out", "reroute", "state", "timers")
-
-    def __init__(self, node_id: int, dictionary: Dictionary) -> None:
+    def __init__(self, node_id: int, dictionary: Dictionary, holder: Holder) -> None:
         self.node_id = node_id
         self.dictionary = dictionary
-        self.timers = Timers()
+        self.timers = Timers(holder)
         self.state = NmtState.INITIALISING
         self.now_ns = 0
         self.out: list[Frame] = []
-        self.reroute: Callable[[], None] = _nothing
+        self.reroute: Callable[[], None] = nothing
 
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame behind those the node already sends."""
         self.out.append((can_id, data))
 
 
-class Service(Protocol):
-    """One CiA 301 service of a node."""
+class Service:
+    """One CiA 301 service of a node. The base class keeps nothing and hears nothing."""
 
     def reset(self, t_ns: int) -> None:
         """Forget everything and read the parameters again (the dictionary holds its defaults)."""
@@ -190,60 +179,35 @@ class Service(Protocol):
 
     def routes(self) -> Mapping[int, Route]:
         """What to call for which CAN-ID, in the present NMT state."""
+        return NO_ROUTES
 
 
-def _nothing() -> None:
-    return None
+INVALID = 1 << 31
+"""Of a COB-ID: the object does not exist."""
+
+
+def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:
+    """Raises SdoAbort for a COB-ID with reserved or 29-bit bits, of a restricted identifier, or of another while valid.
+
+    Source: CiA 301, objects 1014h, 1200h, 1400h, 1800h, "Restricted CAN-IDs".
+    """
+    word = int(new)
+    changed_while_valid = not (word | old) & INVALID and (word ^ old) & 0x7FF
+    if word & reserved or changed_while_valid or (not word & INVALID and is_restricted(word & 0x7FF)):
+        raise SdoAbort(Abort.VALUE)
 
 
 # The NMT state machine of a slave as a table.
 #
 #     power on / reset → INITIALISING → (boot-up) PRE_OPERATIONAL ⇄ OPERATIONAL ⇄ STOPPED ⇄ PRE_OPERATIONAL
 #
+# Every command works in every state but INITIALISING, where none does.
 # Source: CiA 301, "NMT state machine" and "NMT node control".
 
-_ALIVE = (NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED)
-_GOALS = {
+NMT_GOALS = {
     NmtCommand.START: NmtState.OPERATIONAL,
     NmtCommand.STOP: NmtState.STOPPED,
     NmtCommand.PRE_OPERATIONAL: NmtState.PRE_OPERATIONAL,
     NmtCommand.RESET_NODE: NmtState.INITIALISING,
     NmtCommand.RESET_COMMUNICATION: NmtState.INITIALISING,
 }
-
-NMT_TRANSITIONS: dict[tuple[NmtState, NmtCommand], NmtState] = {
-    (state, command): goal for state in _ALIVE for command, goal in _GOALS.items()
-}
-"""Every command works in every state but INITIALISING, where none does."""
-
-
-# What a device does with its CANopen node: the base class of drive and sensor, which does nothing.
-
-
-class Application:
-    """A device without a function; subclasses override what they need."""
-
-    def attach(self, node: SlaveNode) -> None:
-        """Once, at construction of the node: hang checks, hooks and samplers on its dictionary and PDOs."""
-
-    def keep(self) -> bytes:
-        """What "save" (1010h) stores of the device beside its dictionary."""
-        return b""
-
-    def recall(self, kept: bytes) -> None:
-        """Before `reset`: what was stored; empty when nothing was, or after "load" (1011h)."""
-
-    def reset(self, t_ns: int) -> None:
-        """The node boots; the dictionary holds its defaults or what was stored."""
-
-    def entered(self, t_ns: int) -> None:
-        """The NMT state has just changed."""
-
-    def sync(self, t_ns: int, counter: int) -> None:
-        """A SYNC in operational: synchronous RPDOs have been applied, TPDOs are packed next."""
-
-    def advance(self, t_ns: int) -> None:
-        """Time has come to `t_ns`; called before anything that the node does then."""
-
-    def connection_lost(self, t_ns: int) -> None:
-        """The network is gone: heartbeat consumer, life guarding, NMT stop."""

@@ -9,10 +9,9 @@ Source: CiA 305, "LSS slave", "LSS services".
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from enum import Enum
 
-from canprobe.emulator.node.core import NO_ROUTES, Application, NodeCore, Route
-from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value
+from canprobe.emulator.node.core import NodeCore, Route, Service
+from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, nothing
 from canprobe.protocol.frames import (
     BIT_RATES,
     LSS_ANSWER_ID,
@@ -35,14 +34,6 @@ from canprobe.protocol.frames import (
 SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
 IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
 _MASK = 0xFFFFFFFF
-
-
-class Match(Enum):
-    """What a question of fastscan means to this slave."""
-
-    NO = 0
-    YES = 1
-    FOUND = 2  # the whole address: it is selected
 
 
 class LssSearch:
@@ -73,19 +64,19 @@ class LssSearch:
             and serial_low <= mine.serial_number <= serial_high
         )
 
-    def fastscan(self, data: bytes, mine: LssAddress) -> Match:
-        """The bits of one number from the asked one upwards."""
+    def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
+        """The bits of one number from the asked one upwards: whether they are mine, and with them the whole address."""
         bit, position, following = data[5:]
         if not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
-            return Match.NO
+            return False, False
         if bit == NOTHING_ASKED:
             self._position = 0
-            return Match.YES
+            return True, False
         asked = _MASK << bit & _MASK
         if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
-            return Match.NO
+            return False, False
         self._position = following
-        return Match.FOUND if bit == 0 and following < position else Match.YES
+        return True, bit == 0 and following < position
 
     def _complete(self, data: bytes, sequence: range) -> list[int]:
         """Take one number of a sequence; all of them where it is the last one and none was left out, else nothing."""
@@ -118,7 +109,7 @@ _VERIFY = 0x1020
 _NEVER = frozenset({0x1003, 0x1010, 0x1011})
 
 
-class Store:
+class Store(Service):
     """Parameters of one node, kept by "save" and forgotten by "load" (from the next reset on).
 
     Attributes:
@@ -129,28 +120,19 @@ class Store:
         changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
     """
 
-    def __init__(self, core: NodeCore, application: Application) -> None:
-        self._core, self._application = core, application
+    def __init__(self, core: NodeCore, keep: Callable[[], bytes]) -> None:
+        """`keep()` returns what "save" stores of the application beside the dictionary."""
+        self._core, self._keep = core, keep
         self.saved: dict[int, Value] = {}
         self.kept = b""
         self.node_id: int | None = None
-        self.changed: Callable[[], None] = _nothing
+        self.changed: Callable[[], None] = nothing
         self.volatile: set[int] = set()
         core.dictionary.configured = self._unverify
         core.dictionary.on_check(0x1010, self._save)
         core.dictionary.on_check(0x1011, self._load)
         core.dictionary.on_write(0x1010, self._show)
         core.dictionary.on_write(0x1011, self._show)
-
-    def reset(self, t_ns: int) -> None:
-        """Nothing: the node calls `recall`."""
-
-    def entered(self, t_ns: int) -> None:
-        """Nothing."""
-
-    def routes(self) -> Mapping[int, Route]:
-        """Listens to nothing."""
-        return NO_ROUTES
 
     def recall(self, communication_only: bool) -> None:
         """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
@@ -163,12 +145,7 @@ class Store:
 
     def keep_node_id(self, node_id: int) -> None:
         """Store a node id (LSS store configuration). Raises SdoAbort when it could not be written."""
-        before, self.node_id = self.node_id, node_id
-        try:
-            self.changed()
-        except SdoAbort:
-            self.node_id = before
-            raise
+        self._replace(self.saved, self.kept, node_id)
 
     def _save(self, subindex: int, value: Value) -> None:
         if value != SAVE or subindex not in _GROUPS:
@@ -178,21 +155,21 @@ class Store:
         for key, entry in dictionary.entries.items():
             if entry.writable and entry.readable and key >> 8 in _GROUPS[subindex] and key >> 8 not in skip:
                 saved[key] = dictionary.values[key]
-        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._application.keep())
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._keep(), self.node_id)
 
     def _load(self, subindex: int, value: Value) -> None:
         if value != LOAD or subindex not in _GROUPS:
             raise SdoAbort(Abort.CANNOT_STORE)
         saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
-        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"")
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"", self.node_id)
 
-    def _replace(self, saved: dict[int, Value], kept: bytes) -> None:
-        before = self.saved, self.kept
-        self.saved, self.kept = saved, kept
+    def _replace(self, saved: dict[int, Value], kept: bytes, node_id: int | None) -> None:
+        before = self.saved, self.kept, self.node_id
+        self.saved, self.kept, self.node_id = saved, kept, node_id
         try:
             self.changed()
         except SdoAbort:
-            self.saved, self.kept = before
+            self.saved, self.kept, self.node_id = before
             raise
 
     def _unverify(self, index: int) -> None:
@@ -208,17 +185,13 @@ class Store:
                 self._core.dictionary.put(index, sub, 1)
 
 
-def _nothing() -> None:
-    return None
-
-
 # LSS slave: the node gets its id over the bus. Without one it stays in initialisation and hears LSS alone.
 
 Answer = bytes | None
 _INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
-class LssSlave:
+class LssSlave(Service):
     """The LSS service of one node.
 
     Args:
@@ -273,9 +246,6 @@ class LssSlave:
         """Back to waiting, nothing heard."""
         self._enter(LssState.WAITING)
 
-    def entered(self, t_ns: int) -> None:
-        """LSS works in every NMT state."""
-
     def routes(self) -> Mapping[int, Route]:
         """The LSS master's messages."""
         return {LSS_REQUEST_ID: self._receive}
@@ -324,18 +294,20 @@ class LssSlave:
         return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._is_blank else None
 
     def _fastscan(self, data: bytes) -> Answer:
-        match = self._search.fastscan(data, self.address) if self._is_blank else Match.NO
-        if match is Match.FOUND:
+        if not self._is_blank:
+            return None
+        matches, found = self._search.fastscan(data, self.address)
+        if found:
             self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.IDENTIFIED) if match is not Match.NO else None
+        return pack_lss(LssCommand.IDENTIFIED) if matches else None
 
     # ------------------------------------------------------------------ being configured
 
     def _configure_node_id(self, data: bytes) -> Answer:
-        fits = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
-        if fits:
-            self.pending = data[1]
-        return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE if fits else LssError.REFUSED)
+        if not (1 <= data[1] <= 127 or data[1] == UNCONFIGURED):
+            return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.REFUSED)
+        self.pending = data[1]
+        return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE)
 
     def _configure_bit_timing(self, data: bytes) -> Answer:
         same = data[1] == 0 and BIT_RATES.get(data[2]) == self.bitrate

@@ -16,8 +16,8 @@ from collections.abc import Callable, Container
 from canopen.objectdictionary import ObjectDictionary
 
 from canprobe.bus.lockstep import Participant
-from canprobe.emulator.node.core import NMT_TRANSITIONS, Application, NodeCore, Route, Service
-from canprobe.emulator.node.dictionary import Dictionary
+from canprobe.emulator.node.core import NMT_GOALS, NodeCore, Route, Service
+from canprobe.emulator.node.dictionary import Dictionary, nothing
 from canprobe.emulator.node.error_control import Emergency, HeartbeatConsumer, HeartbeatProducer, NodeGuarding
 from canprobe.emulator.node.lss_slave import LssSlave, Store
 from canprobe.emulator.node.pdo_engine import PdoEngine, SyncConsumer
@@ -27,7 +27,35 @@ from canprobe.protocol.frames import NMT_ID, UNCONFIGURED, Frame, NmtCommand, Nm
 OdOf = Callable[[int], ObjectDictionary]
 """Parses a node's EDS for a node id."""
 _ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
-_COMMANDS = frozenset(NmtCommand)
+
+
+class Application:
+    """What a device does with its CANopen node. The base class does nothing; subclasses override what they need."""
+
+    def attach(self, node: SlaveNode) -> None:
+        """Once, at construction of the node: hang checks, hooks and samplers on its dictionary and PDOs."""
+
+    def keep(self) -> bytes:
+        """What "save" (1010h) stores of the device beside its dictionary."""
+        return b""
+
+    def recall(self, kept: bytes) -> None:
+        """Before `reset`: what was stored; empty when nothing was, or after "load" (1011h)."""
+
+    def reset(self, t_ns: int) -> None:
+        """The node boots; the dictionary holds its defaults or what was stored."""
+
+    def entered(self, t_ns: int) -> None:
+        """The NMT state has just changed."""
+
+    def sync(self, t_ns: int, counter: int) -> None:
+        """A SYNC in operational: synchronous RPDOs have been applied, TPDOs are packed next."""
+
+    def advance(self, t_ns: int) -> None:
+        """Time has come to `t_ns`; called before anything that the node does then."""
+
+    def connection_lost(self, t_ns: int) -> None:
+        """The network is gone: heartbeat consumer, life guarding, NMT stop."""
 
 
 class SlaveNode(Participant):
@@ -61,18 +89,16 @@ class SlaveNode(Participant):
             od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
         """
         self.application = application if application is not None else Application()
-        self.core = core = NodeCore(node_id, Dictionary(od))
-        core.timers.holder = self
+        self.core = core = NodeCore(node_id, Dictionary(od), self)
         self._boot_ns = boot_ns
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
-        self._rerouted: Callable[[], None] = _nothing
+        self._rerouted: Callable[[], None] = nothing
         self.emcy = Emergency(core)
-        self.pdos = PdoEngine(core, self.emcy, self.application)
-        self.store = Store(core, self.application)
+        self.pdos = PdoEngine(core, self.emcy, self.application.sync)
+        self.store = Store(core, self.application.keep)
         self._heartbeat = HeartbeatProducer(core)
-        servers = [SdoServer(core, index) for index in _sdo_servers(core)]
-        sync = SyncConsumer(core, self.emcy, self.pdos.sync)
+        channels = [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
         self._od_of = od_of
         self.lss = LssSlave(core, self.store, self._renamed) if od_of is not None else None
         self._services: tuple[Service, ...] = (
@@ -80,10 +106,10 @@ class SlaveNode(Participant):
             self.emcy,
             self.pdos,
             self.store,
-            sync,
+            SyncConsumer(core, self.emcy, self.pdos.sync),
             HeartbeatConsumer(core, self.emcy, self._communication_error),
             NodeGuarding(core, self.emcy, self._communication_error),
-            *servers,
+            *(SdoServer(core, index) for index in channels),
             self._heartbeat,
         )
         core.reroute = self._reroute
@@ -156,13 +182,12 @@ class SlaveNode(Participant):
         return out
 
     def _nmt(self, data: bytes, t_ns: int) -> None:
-        if len(data) != 2 or data[1] not in (0, self.core.node_id) or data[0] not in _COMMANDS:
+        if len(data) != 2 or data[1] not in (0, self.core.node_id) or data[0] not in NMT_GOALS:
             return
-        command = NmtCommand(data[0])
-        goal = NMT_TRANSITIONS.get((self.core.state, command))
+        goal = NMT_GOALS[NmtCommand(data[0])]
         if goal is NmtState.INITIALISING:
-            self._initialise(t_ns, command is NmtCommand.RESET_COMMUNICATION)
-        elif goal is not None:
+            self._initialise(t_ns, data[0] == NmtCommand.RESET_COMMUNICATION)
+        else:
             self._enter(goal, t_ns)
 
     def _renamed(self, t_ns: int) -> None:
@@ -207,7 +232,7 @@ class SlaveNode(Participant):
         if state is self.core.state:
             return
         self.core.state = state
-        for service in reversed(self._services):  # the heartbeat tells first
+        for service in reversed(self._services):  # the heartbeat first
             service.entered(t_ns)
         self.application.entered(t_ns)
         self._reroute()
@@ -238,11 +263,3 @@ class SlaveNode(Participant):
         elif self.lss is not None and self.lss.unconfigured:
             routes.update(self.lss.routes())
         self._rerouted()
-
-
-def _nothing() -> None:
-    return None
-
-
-def _sdo_servers(core: NodeCore) -> list[int]:
-    return [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
