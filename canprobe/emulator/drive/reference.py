@@ -32,6 +32,14 @@ class Piece(NamedTuple):
         )
 
 
+class Rates(NamedTuple):
+    """Limits of a move: counts/s and counts/s², all positive."""
+
+    speed: float
+    acceleration: float
+    deceleration: float
+
+
 class Profile:
     """Pieces one after the other, at rest at `end` after them.
 
@@ -40,7 +48,7 @@ class Profile:
         end: position at rest, counts.
     """
 
-    def __init__(self, pieces: tuple[Piece, ...], end: float) -> None:
+    def __init__(self, pieces: tuple[Piece | Decay, ...], end: float) -> None:
         self._pieces = pieces
         self.end = end
         self.duration_s = sum(piece.duration_s for piece in pieces)
@@ -96,9 +104,14 @@ def trapezoid(
     return Profile(tuple(pieces), target)
 
 
-# Endless references: constant velocity, and what a constant torque does to the motor; both end at a fence.
+def uniform(position: float, velocity: float) -> Profile:
+    """Constant velocity without an end."""
+    return Profile((Piece(inf, position, velocity, 0.0),), position)
+
+
+# What a constant torque does to the motor, and the fence at which a motion without an end is cut off.
 #
-# Source: CiA 402-2, cyclic synchronous velocity and torque modes; software position limits 607Dh.
+# Source: CiA 402-2, cyclic synchronous torque mode; software position limits 607Dh.
 
 
 class Trajectory(Protocol):
@@ -110,90 +123,56 @@ class Trajectory(Protocol):
         """Position (counts) and velocity (counts/s)."""
 
 
-class ConstantVelocity:
-    """A straight line without an end."""
+class Decay(NamedTuple):
+    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
 
-    duration_s = inf
-
-    def __init__(self, position: float, velocity: float) -> None:
-        self._position, self._velocity = position, velocity
+    duration_s: float
+    position: float
+    velocity: float
+    final: float
+    damping: float
 
     def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        return self._position + self._velocity * t_s, self._velocity
+        """As of `Piece`."""
+        decay = exp(-self.damping * t_s)
+        excess = self.velocity - self.final
+        return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
 
 
-class TorqueRun:
-    """Motion under a constant torque, solved exactly; velocity stays within a limit.
+def torque_run(
+    position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
+) -> Profile:
+    """Motion without an end under a constant torque, solved exactly; velocity stays within a limit.
 
     Friction first brings a motor to rest that moves against the torque, then keeps it there unless the torque is
     above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
+
+    Args:
+        position: at the start, counts.
+        velocity: at the start, counts/s; cut to the limit.
+        permille: torque, 1/1000 of the rated torque.
+        dynamics: of the motor.
+        speed_limit: counts/s, may be infinite.
     """
-
-    duration_s = inf
-
-    def __init__(
-        self, position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
-    ) -> None:
-        """Start.
-
-        Args:
-            position: counts.
-            velocity: counts/s; cut to the limit.
-            permille: torque, 1/1000 of the rated torque.
-            dynamics: of the motor.
-            speed_limit: counts/s, may be infinite.
-        """
-        self._torque, self._dynamics, self._limit = permille, dynamics, speed_limit
-        velocity = min(max(velocity, -speed_limit), speed_limit)
-        self._first = self._phase(position, velocity, copysign(1.0, velocity)) if velocity else None
-        rest_s, position = self._first.rest(position) if self._first else (0.0, position)
-        self._turn_s = rest_s
-        self._rest = position
-        moves = abs(permille) > dynamics.coulomb
-        self._second = self._phase(position, 0.0, copysign(1.0, permille)) if moves and rest_s < inf else None
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        if self._first is not None and t_s < self._turn_s:
-            return self._first.at(t_s)
-        if self._second is None:
-            return self._rest, 0.0
-        return self._second.at(t_s - self._turn_s)
-
-    def _phase(self, position: float, velocity: float, sign: float) -> _Phase:
-        gain, coulomb, damping = self._dynamics
-        final = gain * (self._torque - sign * coulomb) / damping
-        return _Phase(position, velocity, final, damping, self._limit)
-
-
-class _Phase:
-    """Velocity from `velocity` towards `final`, exponentially, without a change of sign; cut at the limit."""
-
-    def __init__(self, position: float, velocity: float, final: float, damping: float, limit: float) -> None:
-        self._position, self._velocity, self._final, self._damping = position, velocity, final, damping
-        self._cut_s, self._cut_velocity = inf, 0.0
-        if abs(final) > limit and final * velocity >= 0.0:
-            self._cut_velocity = copysign(limit, final)
-            self._cut_s = log((velocity - final) / (self._cut_velocity - final)) / damping
-
-    def rest(self, position: float) -> tuple[float, float]:
-        """When and where the motor is at rest; (inf, position) if never."""
-        if self._final * self._velocity >= 0.0:
-            return inf, position
-        t_s = log(1.0 - self._velocity / self._final) / self._damping
-        return t_s, self.at(t_s)[0]
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        free = min(t_s, self._cut_s)
-        decay = exp(-self._damping * free)
-        excess = self._velocity - self._final
-        velocity = self._final + excess * decay
-        position = self._position + self._final * free + excess * (1.0 - decay) / self._damping
-        if t_s > self._cut_s:
-            return position + self._cut_velocity * (t_s - self._cut_s), self._cut_velocity
-        return position, velocity
+    gain, coulomb, damping = dynamics
+    velocity = min(max(velocity, -speed_limit), speed_limit)
+    pieces: list[Piece | Decay] = []
+    if velocity:
+        final = gain * (permille - copysign(coulomb, velocity)) / damping
+        if final * velocity < 0.0:
+            pieces.append(Decay(log(1.0 - velocity / final) / damping, position, velocity, final, damping))
+            (position, _), velocity = pieces[0].at(pieces[0].duration_s), 0.0
+    if not velocity:
+        if abs(permille) <= coulomb:
+            return Profile((*pieces, Piece(inf, position, 0.0, 0.0)), position)
+        final = gain * (permille - copysign(coulomb, permille)) / damping
+    driven = Decay(inf, position, velocity, final, damping)
+    if abs(final) > speed_limit:
+        limit = copysign(speed_limit, final)
+        driven = driven._replace(duration_s=log((velocity - final) / (limit - final)) / damping)
+        pieces.append(driven)
+        return Profile((*pieces, Piece(inf, driven.at(driven.duration_s)[0], limit, 0.0)), position)
+    return Profile((*pieces, driven), position)
 
 
 class Fenced:
@@ -220,7 +199,10 @@ STANDSTILL_COUNTS = 0.1
 """Motion in one step below which the motor is at rest."""
 PATIENCE_STEPS = 400
 NOTHING_S = 1e-9
-"""Rest of a trajectory that is none."""
+"""Rest of a trajectory below which it has ended."""
+
+Done = Callable[[int], None] | None
+"""Called with the time, ns, when a motion is over."""
 
 
 class AxisPlant(Protocol):
@@ -267,7 +249,7 @@ class Motion:
         self._begin_ns = 0
         self._patience = 0
         self._was = 0.0
-        self._done: Callable[[int], None] | None = None
+        self._done: Done = None
 
     @property
     def busy(self) -> bool:
@@ -304,7 +286,11 @@ class Motion:
         moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
         return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
 
-    def follow(self, trajectory: Trajectory, t_ns: int, done: Callable[[int], None] | None = None) -> None:
+    def move(self, target: float, t_ns: int, rates: Rates, done: Done = None) -> None:
+        """Move to `target`, counts, from the present position and speed; as `follow`."""
+        self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, **rates._asdict()), t_ns, done)
+
+    def follow(self, trajectory: Trajectory, t_ns: int, done: Done = None) -> None:
         """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
         self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
         self._patience, self._was = PATIENCE_STEPS, inf
@@ -313,7 +299,7 @@ class Motion:
             self._ramp(here, here, t_ns, t_ns + STEP_NS)
         self._step(t_ns)
 
-    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None] | None = None) -> None:
+    def decelerate(self, t_ns: int, rate: float, done: Done = None) -> None:
         """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
 
         Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
