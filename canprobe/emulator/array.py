@@ -46,10 +46,8 @@ def is_overloaded(raw: Raw) -> bool:
 
 def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
     """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
-    if tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8:
-        return _kept(threshold).take(raw.astype(np.intp))
-    counts = _scaled(raw, tare, gain_permille)
-    np.rint(counts, out=counts)
+    as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
+    counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
     return _kept(threshold).take(counts.astype(np.intp), mode="clip")
 
 
@@ -65,7 +63,9 @@ def correct_finely(
     raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
 ) -> NDArray[np.float64]:
     """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
-    return _limited(_scaled(raw, tare, gain_permille), threshold)
+    counts = np.minimum(_scaled(raw, tare, gain_permille), FULL_SCALE)
+    counts[counts < max(threshold, 0)] = 0.0
+    return counts
 
 
 def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
@@ -74,12 +74,6 @@ def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> N
         counts -= tare
     if gain_permille != GAIN_ONE:
         counts *= gain_permille / GAIN_ONE
-    return counts
-
-
-def _limited(counts: NDArray[np.float64], threshold: int) -> NDArray[np.float64]:
-    np.minimum(counts, FULL_SCALE, out=counts)
-    counts[counts < max(threshold, 0)] = 0.0
     return counts
 
 
@@ -297,19 +291,16 @@ def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
     return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
 
 
-def make_tactile_node(
-    od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1, od_of: OdOf | None = None
-) -> SlaveNode:
+def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, od_of: OdOf | None = None) -> SlaveNode:
     """A tactile node on the plant.
 
     Args:
         od: of `tactile_array.eds`, for this node id.
         node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
-        latency_frames: triggers between sampling an image and sending it.
         od_of: the EDS for another node id, where LSS may give the node one.
     """
-    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames), od_of=od_of)
+    return SlaveNode(od, node_id, TactileApplication(plant), od_of=od_of)
 
 
 def _check_tare(subindex: int, value: Value) -> None:

@@ -17,7 +17,7 @@ from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.errors import CanprobeError, UsageError
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 
-MAX_WAIT_NS = 100_000_000
+_MAX_WAIT_NS = 100_000_000
 
 
 class Exchange(LockstepBus):
@@ -123,14 +123,13 @@ class _Outside(Participant):
     listens = ()
 
 
-def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], max_wait_ns: int = MAX_WAIT_NS) -> None:
-    """Power on the nodes and serve them until `stop()`; it is asked after every wait.
+def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool]) -> None:
+    """Power on the nodes and serve them until `stop()`; it is called after every wait, of 100 ms at most.
 
     Args:
         nodes: participants, for example `SlaveNode`s.
         port: of the bus; its clock is the nodes' clock.
         stop: ends the loop when it returns True.
-        max_wait_ns: longest wait, so that `stop` is asked often enough.
     """
     exchange, clock = Exchange(nodes), port.clock
     with garbage_collection_paused():
@@ -144,7 +143,7 @@ def serve(nodes: Sequence[Participant], port: Port, stop: Callable[[], bool], ma
                 exchange.rerouted = False
                 if (patient := exchange.patient) != deferred:
                     port.defer(deferred := patient)
-            due_ns, until_ns = exchange.next_deadline_ns(), now_ns + max_wait_ns
+            due_ns, until_ns = exchange.next_deadline_ns(), now_ns + _MAX_WAIT_NS
             received = port.wait_and_drain(until_ns if due_ns is None else min(due_ns, until_ns))
             # The last arrival is the time to work at: one reading of the clock less before the answers leave.
             now_ns = max(now_ns, received[-1][2]) if received else clock.now_ns()

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from canopen.objectdictionary import ObjectDictionary
@@ -29,24 +29,9 @@ from canprobe.robot.inverse import start_posture
 from canprobe.robot.kinematics import Array, PumaModel, forward
 from canprobe.scene.setup import Arm, Setup
 
-# Records what is true in the plant at every SYNC, beside what the nodes measure.
-
-
-class TruePlant(Protocol):
-    """A plant that tells its present true values."""
-
-    def advance(self, t_ns: int) -> None:
-        """Bring the plant to `t_ns`; idempotent."""
-
-    def state(self) -> Any:
-        """The present state, all that the truth follows from."""
-
-    def truth(self, state: Any) -> Mapping[str, Any]:
-        """True values of a state: numbers and arrays, always under the same names."""
-
 
 class TruthRecorder(Participant):
-    """A silent participant of the bus that writes down the plant's state at every SYNC.
+    """A silent participant of the bus that notes the plant's state at every SYNC, beside what the nodes measure.
 
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
 
@@ -61,7 +46,7 @@ class TruthRecorder(Participant):
     hears_every_sync = True
     listens = frozenset((SYNC_ID,))
 
-    def __init__(self, plant: TruePlant) -> None:
+    def __init__(self, plant: Plant) -> None:
         self._plant = plant
         self.origin_ns = 0
         self._rows: list[tuple[int, int, Any]] = []
@@ -87,7 +72,7 @@ class TruthRecorder(Participant):
 
 
 def set_serial_number(node: SlaveNode, serial: int) -> None:
-    """Tell two devices of one EDS apart; a device without 1018h:04 has none."""
+    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
     if key_of(0x1018, 4) in node.dictionary:
         node.dictionary.set_default(0x1018, 4, serial)
 

@@ -109,7 +109,7 @@ _VERIFY = 0x1020
 _NEVER = frozenset({0x1003, 0x1010, 0x1011})
 
 
-class Store(Service):
+class Store:
     """Parameters of one node, kept by "save" and forgotten by "load" (from the next reset on).
 
     Attributes:
@@ -129,10 +129,9 @@ class Store(Service):
         self.changed: Callable[[], None] = nothing
         self.volatile: set[int] = set()
         core.dictionary.configured = self._unverify
-        core.dictionary.on_check(0x1010, self._save)
-        core.dictionary.on_check(0x1011, self._load)
-        core.dictionary.on_write(0x1010, self._show)
-        core.dictionary.on_write(0x1011, self._show)
+        for index, act in ((0x1010, self._save), (0x1011, self._load)):
+            core.dictionary.on_check(index, act)
+            core.dictionary.on_write(index, self._show)
 
     def recall(self, communication_only: bool) -> None:
         """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
@@ -187,7 +186,6 @@ class Store(Service):
 
 # LSS slave: the node gets its id over the bus. Without one it stays in initialisation and hears LSS alone.
 
-Answer = bytes | None
 _INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
@@ -211,21 +209,6 @@ class LssSlave(Service):
         self.pending = core.node_id
         self.state = LssState.WAITING
         self._search = LssSearch()
-        self._in_both_states: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.IDENTIFY_UNCONFIGURED: self._identify_unconfigured,
-            **dict.fromkeys(IDENTIFY, self._identify),
-        }
-        self._in_waiting: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.FASTSCAN: self._fastscan,
-            **dict.fromkeys(SELECT, self._select),
-        }
-        self._in_configuration: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.CONFIGURE_NODE_ID: self._configure_node_id,
-            LssCommand.CONFIGURE_BIT_TIMING: self._configure_bit_timing,
-            LssCommand.STORE: self._store_configuration,
-            LssCommand.INQUIRE_NODE_ID: self._inquire_node_id,
-            **dict.fromkeys(_INQUIRE, self._inquire),
-        }
 
     @property
     def address(self) -> LssAddress:
@@ -247,7 +230,7 @@ class LssSlave(Service):
         self._enter(LssState.WAITING)
 
     def routes(self) -> Mapping[int, Route]:
-        """The LSS master's messages."""
+        """The LSS master's messages, in every NMT state."""
         return {LSS_REQUEST_ID: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
@@ -256,9 +239,9 @@ class LssSlave(Service):
         if data[0] == LssCommand.SWITCH_GLOBAL:
             self._switch(data[1], t_ns)
             return
-        in_state = self._in_configuration if self.state is LssState.CONFIGURATION else self._in_waiting
-        act = self._in_both_states.get(data[0]) or in_state.get(data[0])
-        answer = act(data) if act is not None else None
+        answer = self._searched(data)
+        if answer is None and self.state is LssState.CONFIGURATION:
+            answer = self._configured(data)
         if answer is not None:
             self._core.send(LSS_ANSWER_ID, answer)
 
@@ -274,60 +257,44 @@ class LssSlave(Service):
         self.state = state
         self._search.forget()
 
-    # ------------------------------------------------------------------ being found
-
-    @property
-    def _is_blank(self) -> bool:
-        """It has no id and was not given one yet: the searches are for such nodes alone."""
-        return self.unconfigured and self.pending == UNCONFIGURED
-
-    def _select(self, data: bytes) -> Answer:
-        if not self._search.selects(data, self.address):
-            return None
-        self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.SELECTED)
-
-    def _identify(self, data: bytes) -> Answer:
-        return pack_lss(LssCommand.IDENTIFIED) if self._search.identifies(data, self.address) else None
-
-    def _identify_unconfigured(self, _: bytes) -> Answer:
-        return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._is_blank else None
-
-    def _fastscan(self, data: bytes) -> Answer:
-        if not self._is_blank:
-            return None
-        matches, found = self._search.fastscan(data, self.address)
-        if found:
+    def _searched(self, data: bytes) -> bytes | None:
+        """Answer the questions by which a master finds the slave; fastscan is for slaves without an id alone."""
+        command, waits = data[0], self.state is LssState.WAITING
+        blank = self.unconfigured and self.pending == UNCONFIGURED  # no id, and it was not given one yet
+        if command in IDENTIFY and self._search.identifies(data, self.address):
+            return pack_lss(LssCommand.IDENTIFIED)
+        if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
+            return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
+        if waits and command in SELECT and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.IDENTIFIED) if matches else None
+            return pack_lss(LssCommand.SELECTED)
+        if waits and command == LssCommand.FASTSCAN and blank:
+            matches, found = self._search.fastscan(data, self.address)
+            if found:
+                self._enter(LssState.CONFIGURATION)
+            return pack_lss(LssCommand.IDENTIFIED) if matches else None
+        return None
 
-    # ------------------------------------------------------------------ being configured
-
-    def _configure_node_id(self, data: bytes) -> Answer:
-        if not (1 <= data[1] <= 127 or data[1] == UNCONFIGURED):
-            return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.REFUSED)
-        self.pending = data[1]
-        return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE)
-
-    def _configure_bit_timing(self, data: bytes) -> Answer:
-        same = data[1] == 0 and BIT_RATES.get(data[2]) == self.bitrate
-        return _verdict(LssCommand.CONFIGURE_BIT_TIMING, LssError.NONE if same else LssError.REFUSED)
-
-    def _store_configuration(self, _: bytes) -> Answer:
-        try:
-            self._store.keep_node_id(self.pending)
-        except SdoAbort:
-            return _verdict(LssCommand.STORE, LssError.STORE_FAILED)
-        return _verdict(LssCommand.STORE, LssError.NONE)
-
-    def _inquire(self, data: bytes) -> Answer:
-        return pack_number(LssCommand(data[0]), self.address.numbers[data[0] - _INQUIRE[0]])
-
-    def _inquire_node_id(self, _: bytes) -> Answer:
-        """The active id; in initialisation the pending one, which is about to be."""
-        node_id = self.pending if self.unconfigured else self._core.node_id
-        return pack_lss(LssCommand.INQUIRE_NODE_ID, bytes((node_id,)))
-
-
-def _verdict(command: LssCommand, error: LssError) -> bytes:
-    return pack_lss(command, bytes((error,)))
+    def _configured(self, data: bytes) -> bytes | None:
+        """Answer what a master asks and orders in configuration state."""
+        command, error = data[0], LssError.NONE
+        if command in _INQUIRE:
+            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE[0]])
+        if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which is about to be active
+            return pack_lss(LssCommand(command), bytes((self.pending if self.unconfigured else self._core.node_id,)))
+        if command == LssCommand.CONFIGURE_NODE_ID:
+            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED:
+                self.pending = data[1]
+            else:
+                error = LssError.REFUSED
+        elif command == LssCommand.CONFIGURE_BIT_TIMING:
+            if data[1] != 0 or BIT_RATES.get(data[2]) != self.bitrate:
+                error = LssError.REFUSED
+        elif command == LssCommand.STORE:
+            try:
+                self._store.keep_node_id(self.pending)
+            except SdoAbort:
+                error = LssError.STORE_FAILED
+        else:
+            return None
+        return pack_lss(LssCommand(command), bytes((error,)))

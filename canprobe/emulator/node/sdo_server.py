@@ -80,13 +80,7 @@ SDO_TRANSITIONS: dict[tuple[SdoState, SdoRequest], tuple[SdoState, ...]] = {
 """State and request → the states that may follow when the request is right in itself; IDLE by an abort if not."""
 
 _ABORT_COMMAND = 0x80
-_BY_SPECIFIER = (
-    _R.DOWNLOAD_SEGMENT,
-    _R.INITIATE_DOWNLOAD,
-    _R.INITIATE_UPLOAD,
-    _R.UPLOAD_SEGMENT,
-    _R.UNKNOWN,  # but for 80h itself
-)
+_BY_SPECIFIER = (_R.DOWNLOAD_SEGMENT, _R.INITIATE_DOWNLOAD, _R.INITIATE_UPLOAD, _R.UPLOAD_SEGMENT)
 _BLOCK_UPLOAD = (_R.INITIATE_BLOCK_UPLOAD, _R.END_BLOCK_UPLOAD, _R.ACKNOWLEDGE_BLOCK, _R.START_BLOCK_UPLOAD)
 _BLOCK_DOWNLOAD = (_R.INITIATE_BLOCK_DOWNLOAD, _R.END_BLOCK_DOWNLOAD)
 
@@ -99,7 +93,7 @@ def _read(command: int) -> SdoRequest:
         return _BLOCK_UPLOAD[command & 3]
     if specifier == 6:
         return _BLOCK_DOWNLOAD[command & 1]
-    return _BY_SPECIFIER[specifier] if specifier < 5 else _R.UNKNOWN
+    return _BY_SPECIFIER[specifier] if specifier < 4 else _R.UNKNOWN
 
 
 _REQUESTS = tuple(_read(command) for command in range(256))

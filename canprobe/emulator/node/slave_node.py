@@ -105,7 +105,6 @@ class SlaveNode(Participant):
             *([self.lss] if self.lss is not None else []),
             self.emcy,
             self.pdos,
-            self.store,
             SyncConsumer(core, self.emcy, self.pdos.sync),
             HeartbeatConsumer(core, self.emcy, self._communication_error),
             NodeGuarding(core, self.emcy, self._communication_error),
