@@ -3,7 +3,7 @@
 Each participant and each port has one outgoing queue. At one instant the bus first lets everybody speak whose deadline
 has come, then carries the frames one by one: of the heads of all queues the one that wins the arbitration, so lowest
 identifier first, first in first out for each sender, ties by order of attachment. Nobody receives what it sent. Answers
-join at the same instant, until nobody has anything to say. A frame takes no time on the wire.
+join at the same instant, until nobody has anything to send. A frame takes no time on the wire.
 
 A deadline that a reception moves to the present is served when the frames already waiting have gone.
 """
@@ -29,7 +29,7 @@ EVERY_ID = range(1 << 32)
 
 
 class Participant:
-    """What lives on an emulated bus, as a function of frames and time. The base class hears all and says nothing.
+    """What lives on an emulated bus, as a function of frames and time. The base class hears all and sends nothing.
 
     The bus sends what `start`, `receive` and `advance` return, in that order.
 
@@ -113,7 +113,7 @@ class LockstepBus:
         self.clock = clock
         self.channel = channel
         self.recorder: Recorder | None = None
-        self.error_recorder: Recorder | None = None  # told each error frame, where bits can fail
+        self.error_recorder: Recorder | None = None  # called with each error frame, where bits can fail
         self._max_frames = max_frames
         self._count = 0
         self._nodes: list[BusNode] = []
@@ -122,7 +122,7 @@ class LockstepBus:
         clock.attach(self)
 
     def attach(self, participant: Participant) -> None:
-        """Put `participant` on the bus and start it; what it says is carried when time moves or a port is used."""
+        """Put `participant` on the bus and start it; what it sends is carried when time moves or a port is used."""
         node = self._add(participant)
         participant.connect(self._forget_listeners)
         self._queue(node, participant.start(self.clock.now_ns()))

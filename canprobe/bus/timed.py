@@ -376,7 +376,7 @@ class TimedBus(LockstepBus):
             heappush(self._ready, entry)
 
     def _silence(self, node: BusNode) -> None:
-        """A node that is bus off loses what it wanted to say."""
+        """A node that is bus off loses what it wanted to send."""
         node.outbox.clear()
         self._ready = [entry for entry in self._ready if entry[2] is not node]
         heapify(self._ready)

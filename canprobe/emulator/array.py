@@ -1,7 +1,7 @@
 """The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
 
 A trigger is a SYNC at which the header's TPDO is due. The array is sampled there; what goes out is the image of an
-earlier trigger, because a real sensor needs a frame to process it. The header's sample age says so.
+earlier trigger, because a real sensor needs a frame to process it. The header carries the sample's age.
 Source: objects 2000h–2130h of `tactile_array.eds`; wire form in `protocol.tactile`.
 """
 
@@ -190,7 +190,7 @@ class TactileApplication(Application):
         self._read_settings()
 
     def _read_settings(self) -> None:
-        """Take what the dictionary says now; an array without a window size has 8 taxels along the window."""
+        """Take the present values of the dictionary; an array without a window size has 8 taxels along the window."""
         number = self._node.dictionary.number
         self._mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
         self._gain, self._threshold = number(GAIN, 0, 1000), number(THRESHOLD)

@@ -172,7 +172,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
 def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe: Array) -> Array:
     """Where the real arm's base stands in the controller's base frame, (3,), m.
 
-    An experimenter moves the arm to the object and takes that place for what the encoders say: both arms hold the
+    An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
     """
     offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
@@ -180,7 +180,7 @@ def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe:
 
 
 def _first_posture(setup: Setup, arm: Arm) -> Array:
-    """Joint angles (n,), rad, at power on: above the start point of a touch, else as the scene says."""
+    """Joint angles (n,), rad, at power on: above the start point of a touch, else as in the scene."""
     touch = setup.touch
     if touch is None:
         return arm.q_start
@@ -201,7 +201,7 @@ def _first_posture(setup: Setup, arm: Arm) -> Array:
 def make_eds_node(
     od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
 ) -> SlaveNode:
-    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis of its own.
+    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
 
     Args:
         od: of any EDS, for this node id.

@@ -1,7 +1,7 @@
 """What every mode of operation shares: the parts of the drive, halt, and the bits of controlword and statusword.
 
 A mode lives between `start` and `leave`, in operation enabled only. One more mode is a class that derives from
-`DriveMode`, or from `CyclicMode` if it has a target for every SYNC; `modes.MODES` lists it.
+`CyclicMode` if it has a target for every SYNC, or from `ProfiledMode` if it makes its own way; `modes.MODES` lists it.
 Source: CiA 402-2, controlword bits 4–6, 8 and 9, statusword bits 10–13, halt option code 605Dh.
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Callable
 from functools import partial
 
 from canprobe.emulator.drive.parameters import PEAK_PERMILLE, DriveParameters, Units
-from canprobe.emulator.drive.reference import AxisPlant, Motion
+from canprobe.emulator.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.emulator.node.dictionary import Dictionary, Value
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.protocol import cia402
@@ -313,18 +313,34 @@ class DriveMode:
         limit = self._parameters.max_torque
         return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
 
-    def _look(self) -> tuple[int, float] | None:
-        """For a mode's timer: now, and where the motor is; None when the following error has become a fault."""
-        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
-        counts = self.parts.feedback.measure(t_ns)
-        return None if self._lags(t_ns, counts) else (t_ns, counts)
-
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""
         if not self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
             return False
         self.parts.fault(FOLLOWING_ERROR, t_ns)
         return True
+
+
+class ProfiledMode(DriveMode):
+    """A mode that makes its own profile; while its timer runs it looks at the motor every `STEP_NS`."""
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._timer = parts.node.core.timers.new(self._look)
+
+    def leave(self, t_ns: int) -> None:
+        """Look no more."""
+        self._timer.cancel()
+
+    def watch(self, t_ns: int, counts: float) -> None:
+        """The motor is at `counts`, and its following error is no fault."""
+
+    def _look(self, due_ns: int) -> None:
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        if not self._lags(t_ns, counts):
+            self._timer.arm_next(due_ns, STEP_NS)
+            self.watch(t_ns, counts)
 
 
 class CyclicMode(DriveMode):

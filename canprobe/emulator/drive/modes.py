@@ -9,11 +9,11 @@ Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 607
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum, auto
 from math import ceil, floor
+from typing import NamedTuple
 
-from canprobe.emulator.drive.mode import REACHED, CyclicMode, DriveMode, DriveParts
+from canprobe.emulator.drive.mode import REACHED, CyclicMode, DriveMode, DriveParts, ProfiledMode
 from canprobe.emulator.drive.reference import STEP_NS, Fenced, Rates, torque_run, uniform
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.protocol.cia402 import (
@@ -160,7 +160,7 @@ class CyclicTorque(CyclicMode):
 # Profile position: set-points by handshake, one under way and one waiting, each a trapezoidal move.
 #
 # A rising edge of controlword bit 4 offers a set-point (607Ah with 6081h, 6083h and 6084h of that moment); bit 5 puts
-# it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 says that
+# it in place of everything else at once, bit 6 makes it relative to the set-point before. Statusword bit 12 is set when
 # it was taken, and stays while bit 4 does or while no further one could be taken; one offered then is ignored.
 # The next set-point starts when the last is reached: the actual position has been within 6067h for 6068h (bit 10).
 # Not here: bit 9 (change on set-point), 60F2h. Halt interrupts a move, which goes on when halt is over.
@@ -169,8 +169,7 @@ class CyclicTorque(CyclicMode):
 _PROFILE_SPEED = key_of(0x6081)
 
 
-@dataclass(frozen=True, slots=True)
-class SetPoint:
+class SetPoint(NamedTuple):
     """One move.
 
     Attributes:
@@ -184,7 +183,7 @@ class SetPoint:
     limited: bool
 
 
-class ProfilePosition(DriveMode):
+class ProfilePosition(ProfiledMode):
     """Mode 1."""
 
     number = OperationMode.PROFILE_POSITION
@@ -192,7 +191,6 @@ class ProfilePosition(DriveMode):
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
-        self._timer = parts.node.core.timers.new(self._watch)
         self._active: SetPoint | None = None
         self._next: SetPoint | None = None
         self._last = 0
@@ -206,10 +204,6 @@ class ProfilePosition(DriveMode):
         self._last = round(self._units.position(self._motion.demand(t_ns)))
         super().start(word, t_ns)
         self._timer.arm(t_ns + STEP_NS)
-
-    def leave(self, t_ns: int) -> None:
-        """Set-points are forgotten."""
-        self._timer.cancel()
 
     def status(self) -> int:
         """Target reached (with halt: standing still), set-point acknowledge."""
@@ -226,27 +220,25 @@ class ProfilePosition(DriveMode):
             at_once = bool(word >> CHANGE_IMMEDIATELY & 1)
             if at_once or self._next is None:
                 self._offered = True
-                self._take(self._offer(bool(word >> RELATIVE & 1)), at_once, t_ns)
+                point = self._set_point(relative=bool(word >> RELATIVE & 1))
+                if at_once or self._active is None or self._reached:
+                    self._next = None
+                    self._begin(point, t_ns)
+                else:
+                    self._next = point
 
     def resume(self, t_ns: int) -> None:
         """The interrupted move goes on."""
         if self._active is not None and not self._reached:
             self._move(self._active, t_ns)
 
-    def _offer(self, relative: bool) -> SetPoint:
+    def _set_point(self, relative: bool) -> SetPoint:
         parameters, units = self._parameters, self._units
         wanted = int(self._values[_POSITION_TARGET]) + (self._last if relative else 0)
         target = self._last = parameters.clamp(wanted)
         speed = min(int(self._values.get(_PROFILE_SPEED, 0)) * units.magnitude, parameters.max_speed)
         rates = Rates(speed, parameters.acceleration, parameters.deceleration or parameters.acceleration)
         return SetPoint(units.counts(target), rates, limited=target != wanted)
-
-    def _take(self, point: SetPoint, at_once: bool, t_ns: int) -> None:
-        if at_once or self._active is None or self._reached:
-            self._next = None
-            self._begin(point, t_ns)
-        else:
-            self._next = point
 
     def _begin(self, point: SetPoint, t_ns: int) -> None:
         self._active, self._inside_ns, self._reached = point, None, False
@@ -261,28 +253,21 @@ class ProfilePosition(DriveMode):
         else:
             self._motion.decelerate(t_ns, point.rates.deceleration)
 
-    def _watch(self, due_ns: int) -> None:
-        if (look := self._look()) is None:
-            return
-        t_ns, counts = look
-        self._timer.arm_next(due_ns, STEP_NS)
+    def watch(self, t_ns: int, counts: float) -> None:
+        """Look whether the set-point is reached."""
         point = self._active
         if point is not None and not self._reached and not self.halted:
-            self._watch_window(point, counts, t_ns)
+            if abs(point.counts - counts) > self._parameters.position_window:
+                self._inside_ns = None
+            elif self._inside_ns is None:
+                self._inside_ns = t_ns
+            if self._inside_ns is not None and t_ns - self._inside_ns >= self._parameters.position_time_ns:
+                self._reached = True
+                following, self._next = self._next, None
+                if following is not None:
+                    self._begin(following, t_ns)
+                self.parts.show()
         self._limit((point is not None and point.limited) or self._strains())
-
-    def _watch_window(self, point: SetPoint, counts: float, t_ns: int) -> None:
-        if abs(point.counts - counts) > self._parameters.position_window:
-            self._inside_ns = None
-            return
-        if self._inside_ns is None:
-            self._inside_ns = t_ns
-        if t_ns - self._inside_ns >= self._parameters.position_time_ns:
-            self._reached = True
-            if self._next is not None:
-                point, self._next = self._next, None
-                self._begin(point, t_ns)
-            self.parts.show()
 
 
 # Homing: the present position (methods 35, 37), or the first index pulse in one direction (33 negative, 34 positive).
@@ -291,7 +276,7 @@ class ProfilePosition(DriveMode):
 # pulse a motor turn, where the counter is a multiple of 608Fh; it is caught by hardware, at its exact place, while the
 # motor searches at 6099h:02 with 609Ah, and then driven back to. Bits 13, 12, 10 of the statusword:
 # 000 under way, 001 not started or interrupted, 011 done, 100 error and moving, 101 error and at rest.
-# Zero is the home position *plus* the home offset, as the clause says: at home the actual position is then -607Ch.
+# Zero is the home position *plus* the home offset, by the clause: at home the actual position is then -607Ch.
 # An error is: no such method, a search speed of 0, no pulse within two turns. Software limits do not act meanwhile.
 # Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
 
@@ -316,7 +301,7 @@ _BITS = {Phase.DONE: REACHED | 1 << HOMING_ATTAINED, Phase.FAILED: 1 << HOMING_E
 _UNDER_WAY = frozenset({Phase.SEARCHING, Phase.RETURNING})
 
 
-class Homing(DriveMode):
+class Homing(ProfiledMode):
     """Mode 6."""
 
     number = OperationMode.HOMING
@@ -324,7 +309,6 @@ class Homing(DriveMode):
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
-        self._timer = parts.node.core.timers.new(self._watch)
         self._phase = Phase.IDLE
         self._direction = 1
         self._home = self._was = 0.0
@@ -401,11 +385,8 @@ class Homing(DriveMode):
         wanted = self.parts.node.dictionary.number(0x6099, 2) * self._units.magnitude
         return min(wanted, self._parameters.max_speed)
 
-    def _watch(self, due_ns: int) -> None:
-        if (look := self._look()) is None:
-            return
-        t_ns, counts = look
-        self._timer.arm_next(due_ns, STEP_NS)
+    def watch(self, t_ns: int, counts: float) -> None:
+        """Catch the index pulse."""
         if self._phase is Phase.SEARCHING:
             pulse = next_pulse(self._was, self._direction, self._units.turn)
             if (counts - pulse) * self._direction >= 0.0:

@@ -162,37 +162,33 @@ class HeartbeatProducer(Service):
     def __init__(self, core: NodeCore) -> None:
         self._core = core
         self._timer = core.timers.new(self._due)
-        self._period_ns = 0
         core.dictionary.on_write(0x1017, lambda _sub, _value: self._begin(core.now_ns))
 
     def reset(self, t_ns: int) -> None:
-        """The boot-up message stands for the first heartbeat."""
-        self._period_ns = self._core.dictionary.number(0x1017) * 1_000_000
+        """Silent until `boot_up`."""
         self._timer.cancel()
 
     def entered(self, t_ns: int) -> None:
-        """Boot-up out of initialisation, else a heartbeat with the new state."""
+        """A heartbeat with the new state."""
         self._begin(t_ns)
 
     def boot_up(self, t_ns: int) -> None:
         """Send the boot-up message, which is the first heartbeat."""
         self._core.send(*pack_heartbeat(self._core.node_id, NmtState.INITIALISING))
-        if self._period_ns:
-            self._timer.arm(t_ns + self._period_ns)
+        if self._period_ns():
+            self._timer.arm(t_ns + self._period_ns())
+
+    def _period_ns(self) -> int:
+        return self._core.dictionary.number(0x1017) * 1_000_000
 
     def _begin(self, t_ns: int) -> None:
-        self._period_ns = self._core.dictionary.number(0x1017) * 1_000_000
         self._timer.cancel()
-        if self._period_ns:
-            self._beat()
-            self._timer.arm(t_ns + self._period_ns)
-
-    def _beat(self) -> None:
-        self._core.send(*pack_heartbeat(self._core.node_id, self._core.state))
+        if self._period_ns():
+            self._due(t_ns)
 
     def _due(self, due_ns: int) -> None:
-        self._beat()
-        self._timer.arm_next(due_ns, self._period_ns)
+        self._core.send(*pack_heartbeat(self._core.node_id, self._core.state))
+        self._timer.arm_next(due_ns, self._period_ns())
 
 
 class HeartbeatConsumer(Service):

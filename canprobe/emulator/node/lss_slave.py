@@ -172,7 +172,7 @@ class Store:
             raise
 
     def _unverify(self, index: int) -> None:
-        """Another value came over SDO: what 1020h says of the configuration is no longer true."""
+        """Another value came over SDO: 1020h no longer identifies the configuration."""
         if index == _VERIFY or index in _NEVER or index in self.volatile:
             return
         for subindex in (1, 2):

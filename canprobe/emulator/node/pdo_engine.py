@@ -13,10 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from canprobe.emulator.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
-from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Tpdo
+from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
 from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, NmtState, is_restricted
-
-Sampler = Callable[[int], None]
 
 
 class _Group:
@@ -172,13 +170,12 @@ class PdoEngine(Service):
                     core.out += [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
                 except (struct.error, TypeError):
                     for tpdo in group.tpdos:
-                        tpdo.send()  # the one with the value that does not fit raises, with its name
+                        tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
-                tpdo.before(t_ns)
-                tpdo.send()
+                tpdo.send(t_ns)
 
     def _rebuild(self) -> None:
         dictionary = self._core.dictionary
@@ -195,7 +192,7 @@ class PdoEngine(Service):
                 key = tpdo.type, tpdo.start if counted else 0
                 groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
             else:
-                tpdo.before = _all(self._samplers_of([tpdo]))
+                tpdo.samplers = self._samplers_of([tpdo])
         phases = {(group.every, group.start): group.first for group in self._groups}
         self._groups = list(groups.values())
         for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
@@ -222,14 +219,6 @@ def _both(first: Route | None, second: Route) -> Route:
         second(data, t_ns)
 
     return route
-
-
-def _all(samplers: list[Sampler]) -> Sampler:
-    def sample(t_ns: int) -> None:
-        for sampler in samplers:
-            sampler(t_ns)
-
-    return sample
 
 
 # SYNC consumer: length, counter, lost SYNCs, and the time-out of the communication cycle period.

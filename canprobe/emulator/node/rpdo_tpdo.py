@@ -5,14 +5,14 @@ Source: CiA 301, objects 1400h–1BFFh (RPDO and TPDO communication and mapping 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 from canprobe.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
 from canprobe.emulator.node.core import INVALID, NodeCore, check_cob_id
-from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Slot, Value, key_of, nothing
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Slot, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
 from canprobe.protocol.frames import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT, RTR_FLAG
 from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry, PdoLayout
@@ -207,6 +207,7 @@ class Rpdo:
 BUFFERED, ON_REQUEST = 252, 253
 _NO_RTR = 1 << 30  # of the COB-ID
 
+Sampler = Callable[[int], None]
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
 Packing = tuple[int, Callable[..., bytes], Fetch]
 """Identifier, what packs the values, what takes them from the dictionary."""
@@ -224,7 +225,7 @@ class Tpdo:
 
     Attributes:
         active: valid and with something mapped.
-        before: samples what is mapped, at a time.
+        samplers: bring what is mapped up to date, each by `sampler(t_ns)`.
         keys: mapped dictionary keys.
         packing: how to make the frame; of an active PDO.
         type: transmission type.
@@ -245,7 +246,7 @@ class Tpdo:
         self.keys: tuple[int, ...] = ()
         self.remote_id: int | None = None
         self.type = self.start = 0
-        self.before: Callable[[int], None] = nothing
+        self.samplers: Sequence[Sampler] = ()
 
     def configure(self) -> None:
         """Read the parameters. A mapping that makes no sense leaves the PDO silent."""
@@ -297,15 +298,14 @@ class Tpdo:
         elif self._inhibit_timer.due_ns is None:
             self._inhibit_timer.arm(self._earliest_ns)
 
-    def send(self) -> None:
-        """Pack the present values and send them."""
+    def send(self, t_ns: int) -> None:
+        """Pack the values of `t_ns` and send them."""
         self.requested = False
-        self._core.send(self._cob_id, self._packed())
+        self._core.send(self._cob_id, self._packed(t_ns))
 
     def sample(self, t_ns: int) -> None:
         """Type 252: pack the values of this SYNC, for the next remote request."""
-        self.before(t_ns)
-        self._buffer = self._packed()
+        self._buffer = self._packed(t_ns)
 
     def remote(self, data: bytes, t_ns: int) -> None:
         """A remote request. Synchronous PDOs answer with the values of the last SYNC, the others with the present."""
@@ -313,17 +313,18 @@ class Tpdo:
             self.event(t_ns)
         elif self._buffer is not None:
             self._core.send(self._cob_id, self._buffer)
-        else:
-            if self.type in (BUFFERED, ON_REQUEST):
-                self.before(t_ns)
-            self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
+        else:  # an event that waits for a SYNC goes on waiting
+            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED, ON_REQUEST) else None))
 
-    def _packed(self) -> bytes:
+    def _packed(self, t_ns: int | None) -> bytes:
+        """The values of `t_ns`; None: as they were sampled last."""
+        if t_ns is not None:
+            for sampler in self.samplers:
+                sampler(t_ns)
         return self._layout.pack(*self.packing[2](self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
-        self.before(t_ns)
-        self.send()
+        self.send(t_ns)
         self._earliest_ns = t_ns + self._inhibit_ns
         if self._event_ns:
             self._event_timer.arm(t_ns + self._event_ns)
