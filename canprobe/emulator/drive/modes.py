@@ -14,7 +14,7 @@ from math import ceil, floor
 from typing import NamedTuple
 
 from canprobe.emulator.drive.mode import REACHED, CyclicMode, DriveMode, DriveParts, ProfiledMode
-from canprobe.emulator.drive.reference import STEP_NS, Fenced, Rates, torque_run, uniform
+from canprobe.emulator.drive.reference import STEP_NS, Rates, torque_run, uniform
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.protocol.cia402 import (
     CHANGE_IMMEDIATELY,
@@ -97,7 +97,7 @@ class CyclicVelocity(CyclicMode):
         velocity = min(max(wanted, -parameters.max_speed), parameters.max_speed)
         self.parts.loop.feed_torque()
         here, (low, high) = self._motion.demand(t_ns), parameters.fence
-        self._motion.follow(Fenced(uniform(here, velocity), low, high), t_ns)
+        self._motion.follow(uniform(here, velocity).fenced(low, high), t_ns)
         fenced = (here >= high and velocity > 0.0) or (here <= low and velocity < 0.0)
         self._limit(velocity != wanted or fenced or self._strains())
 
@@ -142,7 +142,7 @@ class CyclicTorque(CyclicMode):
         parts.feedback.show_torque(lambda: self._torque)
         here, speed, (low, high) = self._motion.demand(t_ns), self._motion.speed(t_ns), parameters.fence
         dynamics, limit = parts.plant.motor_dynamics(parts.axis), parameters.max_speed
-        self._motion.follow(Fenced(torque_run(here, speed, self._torque, dynamics, limit), low, high), t_ns)
+        self._motion.follow(torque_run(here, speed, self._torque, dynamics, limit).fenced(low, high), t_ns)
         pushes = abs(self._torque) > dynamics.coulomb
         fenced = pushes and ((here >= high and self._torque > 0) or (here <= low and self._torque < 0))
         fast = pushes and abs(speed) >= limit and speed * self._torque > 0

@@ -9,11 +9,13 @@ from typing import NamedTuple, Protocol
 from canprobe.emulator.node.core import Timers
 from canprobe.emulator.plant.ideal_arm import MotorDynamics
 
-# Trapezoidal motion to a target, from any position and speed, as pieces of constant acceleration.
+# Trapezoidal motion to a target, constant velocity, and what a constant torque does to the motor, as pieces one after
+# the other, from any position and speed.
 #
 # A motor that moves the wrong way, or too fast to stop in time, is braked to rest first and turned round. One that is
 # faster than allowed is braked to the profile velocity.
-# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0.
+# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0; cyclic
+# synchronous velocity and torque modes; software position limits 607Dh.
 
 
 class Piece(NamedTuple):
@@ -32,6 +34,22 @@ class Piece(NamedTuple):
         )
 
 
+class Decay(NamedTuple):
+    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
+
+    duration_s: float
+    position: float
+    velocity: float
+    final: float
+    damping: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """As of `Piece`."""
+        decay = exp(-self.damping * t_s)
+        excess = self.velocity - self.final
+        return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
+
+
 class Rates(NamedTuple):
     """Limits of a move: counts/s and counts/s², all positive."""
 
@@ -41,10 +59,10 @@ class Rates(NamedTuple):
 
 
 class Profile:
-    """Pieces one after the other, at rest at `end` after them.
+    """A reference as a function of the time since its start: pieces one after the other, at rest at `end` after them.
 
     Attributes:
-        duration_s: s.
+        duration_s: s; infinite for a motion without an end.
         end: position at rest, counts.
     """
 
@@ -52,16 +70,25 @@ class Profile:
         self._pieces = pieces
         self.end = end
         self.duration_s = sum(piece.duration_s for piece in pieces)
+        self._low, self._high = -inf, inf
+
+    def fenced(self, low: float, high: float) -> Profile:
+        """The same cut off at the software limits, counts: the motor waits there. One outside may only come in."""
+        start, _ = self.at(0.0)
+        self._low, self._high = min(low, start), max(high, start)
+        return self
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position (counts) and velocity (counts/s) `t_s` after the start."""
-        if t_s >= self.duration_s:
-            return self.end, 0.0
-        for piece in self._pieces:
+        position, velocity, over = self.end, 0.0, t_s >= self.duration_s
+        for piece in () if over else self._pieces:
             if t_s < piece.duration_s:
-                return piece.at(t_s)
+                position, velocity = piece.at(t_s)
+                break
             t_s -= piece.duration_s
-        return self.end, 0.0
+        if self._low <= position <= self._high:
+            return position, velocity
+        return min(max(position, self._low), self._high), 0.0
 
 
 def braking(position: float, velocity: float, deceleration: float) -> Profile:
@@ -70,19 +97,9 @@ def braking(position: float, velocity: float, deceleration: float) -> Profile:
     return Profile((piece,), piece.at(piece.duration_s)[0])
 
 
-def trapezoid(
-    position: float, velocity: float, target: float, *, speed: float, acceleration: float, deceleration: float
-) -> Profile:
-    """To rest at a target.
-
-    Args:
-        position: at the start, counts.
-        velocity: at the start, counts/s.
-        target: counts.
-        speed: of the flat part, counts/s, positive.
-        acceleration: counts/s², positive.
-        deceleration: counts/s², positive.
-    """
+def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> Profile:
+    """From a position (counts) and velocity (counts/s) to rest at a target (counts)."""
+    speed, acceleration, deceleration = rates
     pieces: list[Piece] = []
     stop = position + 0.5 * velocity * abs(velocity) / deceleration
     sign = copysign(1.0, target - stop) if target != stop else copysign(1.0, velocity)
@@ -109,40 +126,10 @@ def uniform(position: float, velocity: float) -> Profile:
     return Profile((Piece(inf, position, velocity, 0.0),), position)
 
 
-# What a constant torque does to the motor, and the fence at which a motion without an end is cut off.
-#
-# Source: CiA 402-2, cyclic synchronous torque mode; software position limits 607Dh.
-
-
-class Trajectory(Protocol):
-    """A reference as a function of the time since its start."""
-
-    duration_s: float
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-
-
-class Decay(NamedTuple):
-    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
-
-    duration_s: float
-    position: float
-    velocity: float
-    final: float
-    damping: float
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """As of `Piece`."""
-        decay = exp(-self.damping * t_s)
-        excess = self.velocity - self.final
-        return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
-
-
 def torque_run(
     position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
 ) -> Profile:
-    """Motion without an end under a constant torque, solved exactly; velocity stays within a limit.
+    """Motion under a constant torque, solved exactly; it has no end, and velocity stays within a limit.
 
     Friction first brings a motor to rest that moves against the torque, then keeps it there unless the torque is
     above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
@@ -173,23 +160,6 @@ def torque_run(
         pieces.append(driven)
         return Profile((*pieces, Piece(inf, driven.at(driven.duration_s)[0], limit, 0.0)), position)
     return Profile((*pieces, driven), position)
-
-
-class Fenced:
-    """A trajectory whose part outside the software limits is cut off: the motor waits at the limit."""
-
-    def __init__(self, inner: Trajectory, low: float, high: float) -> None:
-        """`low` and `high` in counts, infinite for none; a motor outside already may only come in."""
-        start, _ = inner.at(0.0)
-        self._inner, self._low, self._high = inner, min(low, start), max(high, start)
-        self.duration_s = inner.duration_s
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        position, velocity = self._inner.at(t_s)
-        if self._low <= position <= self._high:
-            return position, velocity
-        return min(max(position, self._low), self._high), 0.0
 
 
 # The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill.
@@ -245,7 +215,7 @@ class Motion:
         self._timer = timers.new(self._step)
         self._start = self._end = 0.0
         self._t0 = self._t1 = 0
-        self._trajectory: Trajectory | None = None
+        self._trajectory: Profile | None = None
         self._begin_ns = 0
         self._patience = 0
         self._was = 0.0
@@ -288,9 +258,9 @@ class Motion:
 
     def move(self, target: float, t_ns: int, rates: Rates, done: Done = None) -> None:
         """Move to `target`, counts, from the present position and speed; as `follow`."""
-        self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, **rates._asdict()), t_ns, done)
+        self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, rates), t_ns, done)
 
-    def follow(self, trajectory: Trajectory, t_ns: int, done: Done = None) -> None:
+    def follow(self, trajectory: Profile, t_ns: int, done: Done = None) -> None:
         """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
         self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
         self._patience, self._was = PATIENCE_STEPS, inf
