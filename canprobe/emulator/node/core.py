@@ -3,42 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from heapq import heapify, heappop, heappush, heapreplace
 from typing import Protocol
 
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, nothing
 from canprobe.protocol.frames import Frame, NmtCommand, NmtState, is_restricted
 
-# Deadlines of one node: a heap that forgives re-arming, because a cyclic node re-arms on every SYNC.
-
-_ROOM = 64
+# Deadlines of one node. Few of them are armed at once, and most are armed again before they fire, at every SYNC: the
+# first is looked for among those that are armed.
 
 
 class Timer:
-    """One deadline. Re-arming to a later time costs an assignment; the heap is put right when it becomes the first.
+    """One deadline.
 
     Attributes:
         due_ns: when it fires, or None while it is not armed.
-        queued_ns: where its entry on the heap is, at `due_ns` or before (for `Timers`).
     """
 
-    __slots__ = ("_owner", "callback", "due_ns", "queued_ns")
+    __slots__ = ("_owner", "callback", "due_ns")
 
     def __init__(self, owner: Timers, callback: Callable[[int], None]) -> None:
         self._owner = owner
         self.callback = callback
-        self.queued_ns: int | None = None
         self.due_ns: int | None = None
 
     def arm(self, due_ns: int) -> None:
         """Fire at `due_ns`, in place of any earlier order."""
-        self.due_ns = due_ns
-        queued = self.queued_ns
-        if queued is None or due_ns < queued:
-            self.queued_ns = due_ns
-            self._owner.queue(due_ns, self)
-        elif queued == self._owner.next_ns:
-            self._owner.tidy()
+        owner, before, self.due_ns = self._owner, self.due_ns, due_ns
+        owner.armed[self] = due_ns
+        first = owner.next_ns
+        if first is None or due_ns < first or before == first:
+            owner.find_next()
 
     def arm_next(self, due_ns: int, period_ns: int) -> None:
         """Fire one period after `due_ns`; periods already missed are skipped, the phase is kept."""
@@ -47,17 +41,11 @@ class Timer:
 
     def cancel(self) -> None:
         """Do not fire."""
-        self.due_ns = None
-        if self.queued_ns is not None:
-            self._owner.tidy()
-
-    def holds(self, queued_ns: int) -> bool:
-        """Whether the entry of `queued_ns` is still needed; if it is not, it counts as taken off the heap."""
-        if queued_ns != self.queued_ns:
-            return False
-        if self.due_ns is None:
-            self.queued_ns = None
-        return self.due_ns is not None
+        if self.due_ns is not None:
+            before, self.due_ns = self.due_ns, None
+            del self._owner.armed[self]
+            if before == self._owner.next_ns:
+                self._owner.find_next()
 
 
 class Holder(Protocol):
@@ -75,13 +63,12 @@ class Timers:
     Attributes:
         now_ns: the time up to which `run` was last called.
         next_ns: the earliest deadline, or None.
+        armed: deadlines by timer (for `Timer`).
     """
 
     def __init__(self, holder: Holder) -> None:
-        self._heap: list[tuple[int, int, Timer]] = []
-        self._count = 0
-        self._most = _ROOM
         self._holder = holder
+        self.armed: dict[Timer, int] = {}
         self.now_ns = 0
         self.next_ns: int | None = None
 
@@ -89,48 +76,17 @@ class Timers:
         """A timer that calls `callback(due_ns)`; not armed."""
         return Timer(self, callback)
 
-    def queue(self, due_ns: int, timer: Timer) -> None:
-        """Put an entry on the heap (for `Timer`)."""
-        self._count += 1
-        heappush(self._heap, (due_ns, self._count, timer))
-        if self.next_ns is None or due_ns < self.next_ns:
-            self.next_ns = self._holder.next_deadline_ns = due_ns
-        if len(self._heap) > self._most:
-            self._compact()
-
-    def tidy(self) -> None:
-        """Put the heap right where its first entry is of a deadline that was moved or cancelled (for `Timer`)."""
-        heap = self._heap
-        while heap:
-            queued, _, timer = heap[0]
-            due = timer.due_ns
-            if due == queued:
-                self.next_ns = self._holder.next_deadline_ns = due
-                return
-            if timer.holds(queued) and due is not None:
-                timer.queued_ns = due
-                self._count += 1
-                heapreplace(heap, (due, self._count, timer))
-            else:
-                heappop(heap)
-        self.next_ns = self._holder.next_deadline_ns = None
-
-    def _compact(self) -> None:
-        """Drop the entries of deadlines that were moved or cancelled, which else stay until their time."""
-        heap = self._heap
-        heap[:] = {timer: (due, count, timer) for due, count, timer in heap if timer.holds(due)}.values()
-        heapify(heap)
-        self._most = 2 * len(heap) + _ROOM
+    def find_next(self) -> None:
+        """The first deadline has changed (for `Timer`)."""
+        self.next_ns = self._holder.next_deadline_ns = min(self.armed.values()) if self.armed else None
 
     def run(self, t_ns: int) -> None:
-        """Fire everything due up to and at `t_ns`, in order of time, then of arming, each with the time ordered."""
+        """Fire everything due up to and at `t_ns`, in order of time, each with the time that was ordered."""
         self.now_ns = t_ns
-        heap = self._heap
-        while heap and heap[0][0] <= t_ns:
-            due, _, timer = heappop(heap)
-            timer.due_ns = timer.queued_ns = None
-            timer.callback(due)
-            self.tidy()
+        while (due_ns := self.next_ns) is not None and due_ns <= t_ns:
+            timer = next(timer for timer, ns in self.armed.items() if ns == due_ns)
+            timer.cancel()
+            timer.callback(due_ns)
 
 
 # What the services of one node share: identity, state, time, dictionary, timers and the frames to send.

@@ -57,7 +57,7 @@ def test_missed_periods_are_skipped_and_the_phase_kept():
     assert (fired, timers.next_ns) == ([100, 200], 1300)
 
 
-def test_the_heap_does_not_grow_by_deadlines_that_come_and_go():
+def test_nothing_is_kept_of_deadlines_that_come_and_go():
     """A far deadline, then a near one that fires, again and again: as when 1017h is written long, short, long."""
     fired: list[int] = []
     timers = Timers(SimpleNamespace())
@@ -70,7 +70,7 @@ def test_the_heap_does_not_grow_by_deadlines_that_come_and_go():
         timer.arm(t_ns + 1)
         timers.run(t_ns + 1)
     assert fired == list(range(1, 10_001))
-    assert len(timers._heap) < 200
+    assert not timers.armed
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.one_of(st.none(), st.integers(0, 40))), max_size=30))
