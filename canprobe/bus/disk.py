@@ -22,7 +22,7 @@ import can
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.port import ERR_BUS, ERR_FLAG, Clock, ControllerState, Port, PortCounters, TimedFrame
+from canprobe.bus.port import ERR_BUS, ERR_FLAG, Clock, ControllerState, PlainPort, Port, PortCounters, TimedFrame
 from canprobe.errors import ResultsError, UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
@@ -246,7 +246,7 @@ class FrameWriter(Protocol):
         ...
 
 
-class RecordingPort:
+class RecordingPort(PlainPort):
     """A `Port` that writes down what passes through it, sent frames with the time of sending.
 
     In real time a received frame is written when it is drained, with the time of its reception, so a line may be older

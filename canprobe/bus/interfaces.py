@@ -16,6 +16,7 @@ from canprobe.bus.port import (
     CanFilter,
     Clock,
     ControllerState,
+    PlainPort,
     Port,
     PortCounters,
     Reports,
@@ -121,7 +122,7 @@ _HAS_CLASSES = ("socketcan", "socketcand")
 """Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
-class PythonCanPort:
+class PythonCanPort(PlainPort):
     """One python-can bus.
 
     Args:

@@ -15,7 +15,7 @@ import ctypes
 import errno
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Protocol
@@ -348,9 +348,37 @@ class Port(Protocol):
         """
         ...
 
+    def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
+        """Wait for frames, until `until_ns` at the latest, and return them.
+
+        Raises:
+            InterfaceError: the interface is down, closed or lost.
+        """
+        ...
+
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Let frames with these 11-bit identifiers wake nobody, where the interface can: they come with the next other.
+
+        Raises:
+            InterfaceError: the port has filters, or the interface is lost.
+        """
+        ...
+
     def close(self) -> None:
         """Give the interface back; closing twice is allowed, everything else afterwards raises InterfaceError."""
         ...
+
+
+class PlainPort:
+    """Base class of ports that wait and drain in two calls, and are woken by every frame."""
+
+    def wait_and_drain(self: Port, until_ns: int) -> list[TimedFrame]:
+        """Wait for frames, until `until_ns` at the latest, and return them."""
+        self.wait(until_ns)
+        return self.drain()
+
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Nothing: these frames wake the port too."""
 
 
 # Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
@@ -362,7 +390,7 @@ _SLICE_NS = 200_000
 """How long one bus is waited for before the others are looked at again."""
 
 
-class JoinedPort:
+class JoinedPort(PlainPort):
     """A port on several buses.
 
     Args:

@@ -44,6 +44,7 @@ _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
+_SINGLE_WAIT_US = 2000  # how late a deadline may be served on an idle bus
 _CAN_ERR_MASK = 0x1FFFFFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
@@ -115,7 +116,8 @@ class SocketCanPort:
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
-        self._offset_ns = self._calibrated_ns = self._patience_ns = self._told_ns = 0
+        self._blocks = False
+        self._offset_ns = self._calibrated_ns = self._told_ns = 0
 
     stamps_arrival = True
 
@@ -172,23 +174,18 @@ class SocketCanPort:
             if self._poll(left_ns):
                 return
 
-    def receive(self, timeout_ns: int) -> list[TimedFrame]:
-        """Wait for frames and return them, as `wait` and `drain` do, with one system call where they take three.
-
-        Args:
-            timeout_ns: longest wait; it is set once and kept.
-        """
+    def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
+        """As `wait` and `drain`, with one system call where they take three. It waits 2 ms, whatever `until_ns` is."""
         self._check_open()
-        if timeout_ns != self._patience_ns:
+        if not self._blocks:
             self._socket.setblocking(True)
-            seconds, ns = divmod(timeout_ns, 1_000_000_000)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, ns // 1000))
-            self._patience_ns = timeout_ns
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, _SINGLE_WAIT_US))
+            self._blocks = True
         return self._take(wait=True)
 
     def defer(self, can_ids: Collection[int]) -> None:
-        """Let frames with these 11-bit identifiers wake nobody: `drain` and `receive` return them with the next other,
-        `receive` also at its time-out.
+        """Let frames with these 11-bit identifiers wake nobody: `drain` and `wait_and_drain` return them with the next
+        other, `wait_and_drain` also at its time-out.
 
         Whoever has to do nothing about them before that frame (synchronous PDOs: before the SYNC) is spared a wake-up
         for each. They keep their place by their time of arrival. At a change of the identifiers a frame may come twice.

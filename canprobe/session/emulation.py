@@ -18,9 +18,9 @@ from canprobe.session.links import Expected, check_links
 from canprobe.session.session import Say, data_bitrate, quiet, rehearse, resolve_scene
 
 if TYPE_CHECKING:
+    from canprobe.bus.lockstep import Participant
     from canprobe.bus.port import Port
     from canprobe.emulator.node.slave_node import SlaveNode
-    from canprobe.emulator.serve import Participant
 
 
 def emulate(

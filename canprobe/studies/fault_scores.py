@@ -36,6 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_candump
+from canprobe.bus.lockstep import Participant
 from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
@@ -213,24 +214,10 @@ class HangError(Exception):
     """The run did not come to its end."""
 
 
-class Silent:
+class Silent(Participant):
     """In the place of a participant that is not needed."""
 
-    name = "silent"
-    next_deadline_ns: int | None = None
-    listens: frozenset[int] = frozenset()
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing to say."""
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Nothing to hear."""
-        return ()
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing to do."""
-        return ()
+    listens = frozenset[int]()
 
 
 class Witness(Silent):
@@ -245,6 +232,7 @@ class Witness(Silent):
     """
 
     name = "witness"
+    next_deadline_ns: int | None = None
 
     def __init__(self, plant: Plant, period_ns: int) -> None:
         self.rows: list[tuple[int, float]] = []

@@ -12,6 +12,7 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.bus.lockstep import Participant
 from canprobe.bus.sdo_client import upload
 from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
@@ -58,15 +59,14 @@ def writes_to(log, node_id):
     return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
 
 
-class Somebody:
+class Somebody(Participant):
     """Does something 100 ms after the cell's port was opened, while it listens; or at a frame of the cell's."""
+
+    next_deadline_ns = None
 
     def __init__(self, act, at=None):
         self.next_deadline_ns = 100 * MS if at is None else None
         self._act, self._at = act, at
-
-    def start(self, t_ns):
-        return []
 
     def receive(self, can_id, data, t_ns):
         if self._at is not None and self._at(can_id, data):

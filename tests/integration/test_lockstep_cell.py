@@ -9,6 +9,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.disk import read_candump
+from canprobe.bus.lockstep import Participant
 from canprobe.cell.controller import Command
 from canprobe.errors import BusError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
@@ -182,14 +183,8 @@ def test_another_master_stops_bring_up():
     def opened():
         port = original()
 
-        class Foreign:
+        class Foreign(Participant):
             next_deadline_ns = 100_000_000
-
-            def start(self, t_ns):
-                return []
-
-            def receive(self, can_id, data, t_ns):
-                return []
 
             def advance(self, t_ns):
                 self.next_deadline_ns = t_ns + 100_000_000

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 import canprobe
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame, VirtualClock
 from canprobe.cell.assembly import make_cell
 from canprobe.errors import BusError, NodeError
@@ -20,19 +20,15 @@ from canprobe.session.children import END_TIMEOUT_S, EmulatorChild
 from canprobe.session.session import resolve_scene
 
 
-class Nodes:
+class Nodes(Participant):
     """The nodes of the process: they say nothing until they boot, all but ``silent``."""
 
+    next_deadline_ns: int | None = None
+
     def __init__(self, boots_ns: int, silent: int | None, beside: Sequence[Frame] = ()) -> None:
-        self.next_deadline_ns: int | None = boots_ns
+        self.next_deadline_ns = boots_ns
         self._silent = silent
         self._beside = tuple(beside)
-
-    def start(self, t_ns: int) -> list[Frame]:
-        return []
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        return []
 
     def advance(self, t_ns: int) -> list[Frame]:
         self.next_deadline_ns = None
