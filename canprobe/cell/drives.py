@@ -1,5 +1,4 @@
-"""The drives as one thing, TPDOs in and joint angles out, targets in and RPDOs out; and the sensor's frames, placed
-in time.
+"""The drives as one: TPDOs in and joint angles out, targets in and RPDOs out.
 
 The drives hold *motor* positions; the wrist's coupling is undone here and nowhere else.
 """
@@ -15,12 +14,11 @@ from operator import itemgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.controller import TactileSample
 from canprobe.errors import ProtocolError
+from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
-from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 from canprobe.robot.kinematics import PumaModel, counts_to_joints, joints_to_counts
 
 # The position of one motor as its TPDOs tell it: what it can have reached, and where it is when one is missing.
@@ -106,6 +104,7 @@ class PositionTrack:
 Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
+COMMAND_REPEAT_NS = 100_000_000
 _COMMAND_OBJECTS = (0x6040, 0x607A)
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
@@ -384,79 +383,13 @@ def _overlaid(data: bytes, part: bytes) -> bytes:
     return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
 
 
-# The sensor as the cell sees it: whole frames, placed in time.
-
-JITTER_NS = 300_000
-"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
-LATEST_CYCLES = 4
-"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
-
-
-class TactileReceiver:
-    """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
-
-    Args:
-        assembler: puts the frames together.
-        cob_ids: of its PDOs.
-        sync_overflow: at which the SYNC counter starts again.
-
-    Attributes:
-        newest_cycle: trigger of the newest sample.
-        stale: frames dropped because they name no SYNC that they can have followed.
-    """
-
-    def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
-        self.assembler = assembler
-        self.cob_ids = tuple(cob_ids)
-        self.newest_cycle: int | None = None
-        self.stale = 0
-        self._overflow = sync_overflow
-        self._complete: list[TactileFrame] = []
-
-    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one tactile PDO."""
-        frame = self.assembler.push(can_id, data, t_ns)
-        if frame is not None:
-            self._complete.append(frame)
-
-    def take(
-        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
-    ) -> TactileSample | None:
-        """The frame that becomes usable in ``cycle``, or None.
-
-        Args:
-            cycle: the present cycle; its SYNC has not been answered by this frame.
-            sync_counter: counter of the present cycle's SYNC; 0 where it has none.
-            sync_times: times of the last SYNCs (ns), the present one last.
-            sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
-                SYNC before its header.
-        """
-        if not self._complete:
-            return None
-        sample, early = None, []
-        for frame in self._complete:
-            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
-            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
-                early.append(frame)
-            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
-                self.stale += 1
-            else:
-                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
-                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
-                self.newest_cycle = sample.cycle
-        self._complete = early
-        return sample
-
-    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
-        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
-        if not sync_stamps:
-            return False
-        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
-            return True
-        later = cycles_ago - LATEST_CYCLES
-        return later > 0 and sync_stamps[-later] <= frame.t_ns
-
-    def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
-        if sync_counter and frame.header.sync_counter:
-            return (sync_counter - frame.header.sync_counter) % self._overflow
-        return next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= frame.t_ns), len(sync_stamps))
+def make_drives(plan: Plan) -> DriveGroup | None:
+    """The plan's drives as one; None without an arm."""
+    arm = plan.setup.arm
+    if arm is None:
+        return None
+    axes = tuple(
+        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, tuple(pdo.layout for pdo in plan.pdos_of(n, "rpdo")))
+        for n in arm.node_ids
+    )
+    return DriveGroup(axes, arm.model, max(1, COMMAND_REPEAT_NS // plan.sync.period_ns))

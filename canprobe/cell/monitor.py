@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import make_tactile, patch_from
+from canprobe.cell.array import make_tactile, patch_from
 from canprobe.cell.controller import TactileSample
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan

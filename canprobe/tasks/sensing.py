@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.assembly import patch_of
+from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.kinematics import PumaModel, count_sigma, forward
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope

@@ -15,8 +15,8 @@ import canprobe
 from canprobe.bus.port import ControllerState
 from canprobe.bus.scheduling import Terminated
 from canprobe.cell.controller import Command
+from canprobe.cell.lift_off import WAY
 from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.supervisor import WAY
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
 from canprobe.protocol.frames import SYNC_ID, NmtState
