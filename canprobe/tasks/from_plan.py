@@ -11,6 +11,7 @@ from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
 from canprobe.scene.setup import Calibrate, Free, Probe, Setup, Touch
+from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.tasks.touch import TouchTask
@@ -143,7 +144,7 @@ def make_task(plan: Plan) -> Controller:
     return ListenTask(array_calibration(task.array.full_scale), task.duration_s, period_s)
 
 
-# A task that somebody outside starts, stops and sets while it runs; what may be asked for was checked before.
+# A task that a bridge starts, stops and sets while it runs; its requests were checked before.
 #
 # A new target force or speed is approached at a bounded rate: no request makes a step.
 
@@ -186,7 +187,7 @@ class RequestedTask(Controller):
         command = self._task.step(measurement)
         if columns:
             command = replace(command, columns={**command.columns, **columns})
-        if self._stopping and not isinstance(self._task, TouchTask):
+        if self._stopping and not isinstance(self._task, ProbingTask):
             command = replace(command, done=True)
         if command.done and self._make is not None:
             self._task, self._stopping = None, False
@@ -216,7 +217,7 @@ class RequestedTask(Controller):
     def _take(self, kind: str, value: float | None) -> None:
         if kind == "stop":
             self._stopping = self._task is not None
-            if isinstance(self._task, TouchTask):
+            if isinstance(self._task, ProbingTask):
                 self._task.stop()
         elif kind == "start":
             if self._task is None and self._make is not None:

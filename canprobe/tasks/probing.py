@@ -289,6 +289,10 @@ class ProbingTask(Task):
         """Let go and end for a reason that the cell has."""
         raise NotImplementedError
 
+    def stop(self) -> None:
+        """Let go and be done, from whatever phase."""
+        raise NotImplementedError
+
     def _pass_time(self, t_ns: int) -> None:
         """Where an overrun has swallowed cycles the motion goes on by the time that has passed, within a bound."""
         passed = self._period_s if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
