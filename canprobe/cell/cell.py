@@ -278,7 +278,7 @@ class Cell:
         """Enable nothing that is not known to stand still: the first target of a drive is its reported position."""
         assert self.drives is not None
         for _ in range(int(ENABLE_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
-            if self.drives.at_rest:
+            if all(self.drives.rests):
                 return
             self._cycle_until((), 1.5e-9 * self._plan.sync.period_ns)
         axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)

@@ -21,7 +21,7 @@ from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
 from canprobe.robot.kinematics import PumaModel, counts_to_joints, joints_to_counts
 
-# The position of one motor as its TPDOs tell it: what it can have reached, and where it is when one is missing.
+# The position of one motor as its TPDOs report it: what it can have reached, and where it is when one is missing.
 
 STEADY = 5
 """Equal reports after which a motor is at rest."""
@@ -38,7 +38,7 @@ class PositionTrack:
 
     A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together, and
     an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
-    tell of a motion that grows from nothing.
+    make up a motion that grows from nothing.
 
     Attributes:
         counts: the last position that was believed.
@@ -108,7 +108,7 @@ COMMAND_REPEAT_NS = 100_000_000
 _COMMAND_OBJECTS = (0x6040, 0x607A)
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
-"""Of a statusword that tells operation enabled; see `known_state` for the other states."""
+"""Of a statusword of operation enabled; see `known_state` for the other states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +167,7 @@ class DriveGroup:
         torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
         late, missed, malformed: TPDOs that were not used, or not there.
         answer_ns: from the SYNC to the last TPDO that was used.
-        stopped: node ids of drives that are told to stop while the others go on.
+        stopped: node ids of drives that stop while the others go on.
     """
 
     def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
@@ -175,7 +175,7 @@ class DriveGroup:
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
         with_torque = [len(axis.feedback.entries) > 2 for axis in axes]
-        self.torque_permille = [0 if told else math.nan for told in with_torque] if any(with_torque) else []
+        self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
         self.late = 0
         self.missed = 0
         self.malformed = 0
@@ -247,7 +247,7 @@ class DriveGroup:
         self._heard[i] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
-        guarded = enabled and self._aimed is not None  # of a log without targets nobody knows where it was to go
+        guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
         if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
             self.implausible += 1
 
@@ -262,17 +262,12 @@ class DriveGroup:
         return min(self._heard) >= 0
 
     def ages(self) -> tuple[int, ...]:
-        """Cycles since each drive last told a position that can be believed."""
+        """Cycles since each drive last reported a position that can be believed."""
         return tuple([self._cycle - track.cycle for track in self._tracks])
 
     @property
-    def at_rest(self) -> bool:
-        """Every drive has told the same position for a while."""
-        return all(self.rests)
-
-    @property
     def rests(self) -> tuple[bool, ...]:
-        """Whether each drive has told the same position for a while."""
+        """Whether each drive has reported the same position for a while."""
         return tuple([track.steady >= STEADY for track in self._tracks])
 
     def joints(self) -> Vector:
@@ -294,18 +289,18 @@ class DriveGroup:
 
     @property
     def enabled(self) -> bool:
-        """Every drive tells operation enabled."""
+        """Every drive reports operation enabled."""
         if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
             return True  # as in every cycle of operation
         return self.all_in(DriveState.OPERATION_ENABLED)
 
     def enabled_ones(self) -> tuple[bool, ...]:
-        """Whether each drive told operation enabled last."""
+        """Whether each drive reported operation enabled last."""
         return tuple([word & _STATE_BITS == _ENABLED for word in self.statuswords])
 
     @property
     def disbelieved(self) -> bool:
-        """A drive was heard last with a position that it cannot have reached."""
+        """A drive reported last a position that it cannot have reached."""
         return any(heard > track.cycle for heard, track in zip(self._heard, self._tracks, strict=True))
 
     def all_in(self, *states: DriveState) -> bool:
@@ -323,14 +318,14 @@ class DriveGroup:
         return np.array(targets, dtype=float)
 
     def aim(self, targets: Sequence[int]) -> None:
-        """The drives are told ``targets`` (counts) in this cycle: what they may do next follows from it."""
+        """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
         before = self._aimed if self._aimed is not None else [track.counts for track in self._tracks]
         for track, target, last in zip(self._tracks, targets, before, strict=True):
             track.aim(abs(target - last))
         self._aimed = tuple(targets)
 
     def frames(self) -> list[Frame]:
-        """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
+        """The RPDOs of this cycle; until a target is set, the target of a drive is its reported position."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         self.aim(targets)
         key = (self.goal, self.stopped, *self.statuswords)
@@ -364,7 +359,7 @@ class DriveGroup:
 
 
 def _controlword(state: DriveState | None, goal: DriveState, previous: int) -> int:
-    """What a drive is told; one whose state nobody knows is stopped, which is right in every state."""
+    """The controlword for a drive; one in an unknown state is stopped, which is right in every state."""
     if state is None:
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
     return controlword_toward(state, goal, previous)
@@ -379,7 +374,7 @@ def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[
 
 
 def _overlaid(data: bytes, part: bytes) -> bytes:
-    """What two drives of one frame are told: each leaves zeros where the other's values are."""
+    """One frame for two drives: each leaves zeros where the other's values are."""
     return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
 
 
