@@ -16,7 +16,7 @@ from canprobe.cell.bringup import BringUp
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
-from canprobe.cell.drives import Vector, make_drives
+from canprobe.cell.drives import make_drives
 from canprobe.cell.log import Notes, RunLog
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
@@ -32,7 +32,7 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
-FREE_IT = "free it; a run does not begin while the array feels a force"
+FREE_IT = "free it; a run does not begin while the array measures a force"
 OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
 """Of the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
@@ -194,33 +194,34 @@ class Cell:
         runs = as_controller(controller)
         if self._running:
             raise UsageError("the cell runs a controller already, which must not run another one in its step")
-        self._running = True
+        self._controller, self._retreats_for, self._running = runs, None, True
         try:
-            self._run(runs, progress)
+            self._enable()
+            with Interrupts(self._stuck) as interrupts:
+                while not self._run_cycle(interrupts, progress):
+                    pass
         finally:
             self._running = False
 
-    def _run(self, controller: Controller, progress: Callable[[Measurement], None]) -> None:
-        self._controller = controller
-        self._retreats_for = None
-        self._enable(controller.inspect)
+    def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
+        """One cycle of the controller; True where it is done."""
         assert self.cycle is not None
-        with Interrupts(self._stuck) as interrupts:
-            while True:
-                measurement = self.cycle.begin()
-                held = self._supervise(measurement)
-                command = self._or_lift_off(self._ask, _hold if held else controller.step, measurement, interrupts)
-                command = self._guarded(measurement, command)
-                self.cycle.end(command)
-                self._or_lift_off(controller.update)
-                self.cycle.count_work()
-                self._record(measurement, command)
-                progress(measurement)
-                if command.stop_reason is not None:
-                    found = self._retreats_for
-                    raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
-                if command.done:
-                    return
+        measurement = self.cycle.begin()
+        held = self._supervise(measurement)
+        step = _hold if held else self._controller.step
+        command = self._or_lift_off(self._ask, step, measurement, interrupts)
+        command, finding = self.supervisor.guard_target(command)
+        if finding is not None:
+            self._react(finding)
+        self.cycle.end(command)
+        self._or_lift_off(self._controller.update)
+        self.cycle.count_work()
+        self._record(measurement, command)
+        progress(measurement)
+        if command.stop_reason is not None:
+            found = self._retreats_for
+            raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
+        return bool(command.done)
 
     def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
         """What the controller wants.
@@ -237,7 +238,7 @@ class Cell:
             raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
         if not OWN_COLUMNS.isdisjoint(command.columns):
             taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
-            raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
+            raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
         return command
 
     def _or_lift_off(self, work: Callable[..., Result], *arguments: object) -> Result:
@@ -249,20 +250,20 @@ class Cell:
             raise
 
     def _stuck(self) -> bool:
-        """The controller, or whoever is called after it, has not come back for long."""
+        """The controller, or what is called after it, has not returned for long."""
         assert self.cycle is not None
         return self._port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
 
     # enabling and supervision
 
-    def _enable(self, inspect: Callable[[Vector], str | None]) -> None:
+    def _enable(self) -> None:
         if self.drives is None:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         self._cycle_until((), WARM_UP_S)
         self._await_rest()
-        if (reason := inspect(self.drives.joints())) is not None:
+        if (reason := self._controller.inspect(self.drives.joints())) is not None:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
@@ -292,14 +293,14 @@ class Cell:
         self,
         states: tuple[DriveState, ...],
         timeout_s: float,
-        check: Callable[[Measurement], None] = lambda _: None,
+        check: Callable[[], None] = lambda: None,
     ) -> bool:
         """Cycle with held targets until every drive is in one of the states; False after the time-out."""
         assert self.cycle is not None and self.drives is not None
         for _ in range(int(timeout_s * 1e9 / self._plan.sync.period_ns)):
             measurement = self.cycle.begin()
             self._look(measurement)
-            check(measurement)
+            check()
             reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)
             self.cycle.end(None)
             self._record(measurement, None)
@@ -320,7 +321,7 @@ class Cell:
             log_failure=self._log_failure(),
         )
 
-    def _supervise_enabling(self, _: Measurement) -> None:
+    def _supervise_enabling(self) -> None:
         finding = self.supervisor.finding(enabling=True)
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
             raise finding.error
@@ -339,13 +340,6 @@ class Cell:
             self._holding = True
             self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
         return self._holding
-
-    def _guarded(self, measurement: Measurement, command: Command) -> Command:
-        """The command that may be sent."""
-        command, finding = self.supervisor.guard_target(command)
-        if finding is not None:
-            self._react(finding)
-        return command
 
     def _react(self, finding: Finding) -> None:
         reaction = finding.condition.reaction

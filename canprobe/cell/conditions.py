@@ -266,7 +266,7 @@ def _preload(seen: Seen) -> SafetyStop | None:
     if not limits.tares or seen.preload <= limits.safety.preload_max:
         return None
     return SafetyStop(
-        f"the array feels {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
+        f"the array measures {seen.preload:.2f} N before the run, more than limits.preload_max_n ="
         f" {limits.safety.preload_max:g}, and its tare takes that for zero: free the probe; if it is free, it was"
         " pressed until just now, which its array forgets in a minute, or the array's offsets are larger than that"
     )

@@ -177,25 +177,22 @@ class Cycle:
         """Sleep to the deadline, send SYNC, collect the answers."""
         port = self._port
         port.clock.sleep_until_ns(self._deadline)
-        if not port.stamps_arrival:  # the only way to tell what came before the SYNC from what came after it
+        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
             self._route(port.drain())
         counter = self._sync.next()
         self.sync_ns = port.clock.now_ns()
         port.send_batch([pack_sync(counter)], self.sync_ns)
-        self._count_lateness()
+        late_ns = self.sync_ns - self._deadline
+        self.statistics.period_error_ns.append(late_ns)
+        if late_ns > self._period_ns // 2:
+            self.statistics.overruns += 1
+            self._deadline += late_ns // self._period_ns * self._period_ns
         self.number += 1
         self.t_ns = self._deadline - self.t_first_ns
         self._intake.begin(self.number, self.t_ns, self.sync_ns)
         self._collect()
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
         return self._intake.measure(counter or 0)
-
-    def _count_lateness(self) -> None:
-        error = self.sync_ns - self._deadline
-        self.statistics.period_error_ns.append(error)
-        if error > self._period_ns // 2:
-            self.statistics.overruns += 1
-            self._deadline += error // self._period_ns * self._period_ns
 
     def _collect(self) -> None:
         port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns

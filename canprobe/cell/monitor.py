@@ -26,7 +26,7 @@ CLASSIC_BYTES = 8
 
 @dataclass(slots=True)
 class NodeView:
-    """One node as it is heard.
+    """One node as its frames show it.
 
     Attributes:
         node_id, role: which.
@@ -46,7 +46,7 @@ class NodeView:
 
 @dataclass(slots=True, eq=False)
 class CellView:
-    """The cell at one instant; what was not heard is None.
+    """The cell at one instant; what was not received is None.
 
     Attributes:
         channel: of the bus, or buses.

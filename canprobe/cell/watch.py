@@ -123,12 +123,12 @@ class NodeWatch:
         return news
 
     def last_words(self, node_id: int) -> str:
-        """The node's last alarm, to be put behind an error; empty where there is none."""
+        """The node's last alarm, to be put behind an error; empty without one."""
         event = self.last_alarm.get(node_id)
         return "" if event is None else f"; {event}"
 
     def forget(self) -> None:
-        """Start the heartbeat supervision afresh: nobody has been heard yet."""
+        """Start the heartbeat supervision afresh: no heartbeat has been received yet."""
         self._heard.clear()
         self.states.clear()
 

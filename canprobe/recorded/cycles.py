@@ -345,7 +345,7 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     way_back = LoggedWayBack(plan)
     comparison = _Comparison(plan)
     for cycle in way_back.cycles_before(controller_cycles(cycles)):
-        if max(cycle.measurement.q_age, default=0) >= comparison.hold_cycles:
+        if max(cycle.measurement.q_age, default=0) >= HOLD_CYCLES:
             continue  # a late drive: the cell held, and asked its controller nothing
         command = task.step(cycle.measurement)
         comparison.add(cycle, command.q_target)
@@ -362,7 +362,6 @@ class _Comparison:
 
     def __init__(self, plan: Plan) -> None:
         assert plan.setup.arm is not None
-        self.hold_cycles = HOLD_CYCLES
         self.parted_s: float | None = None
         self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)

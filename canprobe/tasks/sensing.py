@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 SETTLING = 0.08
-"""Uncertainty of the curvatures over that of the probe at which they tell the layer's stiffness from the touch."""
+"""Uncertainty of the curvatures over that of the probe at which the touch yields the layer's stiffness."""
 MOST_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
 REFUTED = 0.25
@@ -110,7 +110,7 @@ class ContactSensing:
         self._history = JointHistory()
 
     def step(self, measurement: Measurement) -> Patch | None:
-        """Take one measurement; the patch of a new tactile sample, or None where there is none."""
+        """Take one measurement; the patch of a new tactile sample, or None without one."""
         if measurement.q is not None:
             self._history.add(measurement.t_ns, measurement.q)
         if measurement.tactile is None:
@@ -179,7 +179,7 @@ class ContactSensing:
         )
 
     def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
-        """Second moments of the image; None where nobody asked, or they are not those of the whole patch."""
+        """Second moments of the image; None where they are not wanted, or not those of the whole patch."""
         if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
             return None
         return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
-"""1/m; no pad feels a ball of 1 mm, so an answer beyond it has diverged."""
+"""1/m; no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class ShapeRecord:
         t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
-        told_s: instant of the cycle in which it was told, s, on the same clock.
+        told_s: instant of the cycle in which it was reported, s, on the same clock.
     """
 
     t_s: float
@@ -121,7 +121,7 @@ class ShapeTracker:
 
 
 def has_diverged(estimate: SurfaceEstimate) -> bool:
-    """Whether an answer is none: not finite, or sharper than anything that a pad can feel."""
+    """Whether an answer is not finite, or sharper than anything that a pad can measure."""
     known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
     finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
     return not (finite and bool((np.abs(known) < SHARPEST).all()))

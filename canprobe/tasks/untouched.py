@@ -120,7 +120,7 @@ class Operator(Protocol):
         """Put a question."""
 
     def answer(self) -> Answer | None:
-        """The answer to it, None as long as there is none."""
+        """The answer to it; None until it is given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +130,7 @@ class JointFinding:
     Attributes:
         joint: 0 to 5.
         start_deg: where it stood.
-        asked_deg: how far it was told to turn; 0 where it was not moved.
+        asked_deg: the way of its target; 0 where it was not moved.
         moved_deg: how far it turned, by its own motor's encoder.
         fault: what is wrong; None where nothing is.
         skipped: why it was not moved; None where it was.
@@ -147,8 +147,8 @@ class JointFinding:
         where = f"joint {self.joint + 1} at {self.start_deg:.2f} deg: "
         if self.skipped is not None:
             return where + f"not moved, {self.skipped}"
-        way = f"told {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
-        return where + way + (f": {self.fault}" if self.fault is not None else ", as it must")
+        way = f"asked {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
+        return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
 def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
@@ -180,7 +180,7 @@ def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
 #
 # Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
 # even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
-# can tell, as a drive's polarity turns target and feedback round together: that is what the operator is asked.
+# can show, as a drive's polarity turns target and feedback round together: that is what the operator is asked.
 
 Script = Generator[Command, Measurement, Measurement]
 ANGLE = math.radians(1.0)
@@ -194,7 +194,7 @@ class JointCheck(Controller):
 
     Args:
         plan: of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
-        operator: asked before each motion, and after it whether the joint turned the right way; None asks nobody.
+        operator: asked before each motion, and after it whether the joint turned the right way; None: no questions.
 
     Attributes:
         findings: one for each joint that its turn has come to.

@@ -94,7 +94,7 @@ def test_with_another_master_nothing_moves():
     (force,) = left_pressing(run.session)
     assert 1.8 < force < 2.2
     assert any(
-        fault.endswith("free it; a run does not begin while the array feels a force")
+        fault.endswith("free it; a run does not begin while the array measures a force")
         for fault in run.session.cell.faults
     )
 
