@@ -369,7 +369,7 @@ CONDITIONS = tuple(_TABLE)
 BY_KEY = {condition.key: condition for condition in CONDITIONS}
 CYCLE_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and not c.touch)
 TOUCH_CHECKS = tuple(c for c in CONDITIONS if c.check is not None and c.touch)
-COUNTED = tuple(c for c in CONDITIONS if c.count is not None)
+COUNTERS = tuple((c.key, c.count) for c in CONDITIONS if c.count is not None)
 
 
 def touch_finding(contact: Contact) -> Finding | None:

@@ -6,10 +6,9 @@ The drives hold *motor* positions; the wrist's coupling is undone here and nowhe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import copysign
-from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -195,7 +194,7 @@ class DriveGroup:
             (
                 frame.cob_id,
                 frame.every_cycle,
-                [(layout.pack, _picker(axis, picks, len(axes))) for axis, layout, picks in frame.parts],
+                [(layout.pack, [axis + pick * len(axes) for pick in picks]) for axis, layout, picks in frame.parts],
             )
             for frame in command_frames(axes)
         ]
@@ -334,12 +333,12 @@ class DriveGroup:
             words = list(map(_controlword, self.states, goals, self._words))
             self._steady = key if words == self._words else None
             self._words = words
-        values = [*self._words, *targets]
+        values = [*self._words, *targets]  # an axis and its pick name the place
         frames = []
         for cob_id, every_cycle, parts in self._plan:
             data = b""
-            for pack, picks in parts:
-                part = pack(*picks(values))
+            for pack, places in parts:
+                part = pack(*[values[place] for place in places])
                 data = _overlaid(data, part) if data else part
             if every_cycle or self._due(cob_id, data):
                 frames.append((cob_id, data))
@@ -363,14 +362,6 @@ def _controlword(state: DriveState | None, goal: DriveState, previous: int) -> i
     if state is None:
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
     return controlword_toward(state, goal, previous)
-
-
-def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[int]], Sequence[int]]:
-    """What takes an axis's picks of (controlword, target) from all controlwords and, after them, all targets."""
-    places = [axis + pick * axes for pick in picks]
-    if len(places) == 1:
-        return lambda values: (values[places[0]],)
-    return itemgetter(*places) if places else lambda _: ()
 
 
 def _overlaid(data: bytes, part: bytes) -> bytes:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import ControllerState, PortCounters
-from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, touch_finding
+from canprobe.cell.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE, Contact, Finding, Reaction, Seen
 from canprobe.planning.model import Plan
@@ -198,7 +198,7 @@ class Supervisor:
         self, seen: Seen, guard: JointGuard | None, patch_from: Callable[[TactileSample], Patch] | None
     ) -> None:
         self.seen = seen
-        self.counts: dict[str, int] = {condition.key: 0 for condition in COUNTED}
+        self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
         self.first: dict[str, int] = {}
         self._patch_from = patch_from
         self._guard = guard
@@ -212,8 +212,6 @@ class Supervisor:
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
-        self._counters = [condition.count for condition in COUNTED if condition.count is not None]
-        self._counted = [0] * len(COUNTED)
 
     def step(
         self,
@@ -244,9 +242,10 @@ class Supervisor:
         if measurement.t_ns >= self._look_ns:
             self._look_ns = measurement.t_ns + LOOK_NS
             self._look()
-        counts = [count(seen) for count in self._counters]
-        if counts != self._counted:
-            self._note(counts, measurement.cycle)
+        for key, count in COUNTERS:
+            if (number := count(seen)) != self.counts[key]:
+                self.counts[key] = number
+                self.first.setdefault(key, measurement.cycle)
 
     def _count_late(self, late: int, t_ns: int) -> None:
         """Late cycles are longer than others: the last second has fewer of them."""
@@ -256,13 +255,6 @@ class Supervisor:
         while cycles[0][0] <= t_ns - SECOND_NS:
             self._late_sum -= cycles.popleft()[1]
         self.seen.late_share = self._late_sum / len(cycles)
-
-    def _note(self, counts: list[int], cycle: int) -> None:
-        self._counted = counts
-        for condition, count in zip(COUNTED, counts, strict=True):
-            if count != self.counts[condition.key]:
-                self.counts[condition.key] = count
-                self.first.setdefault(condition.key, cycle)
 
     def finding(self, *, enabling: bool = False) -> Finding | None:
         """The first condition of the table that holds now; a hold only where nothing worse is found."""
@@ -318,7 +310,7 @@ class Supervisor:
     def notes(self) -> list[str]:
         """What happened and was lived with, a line each."""
         return [
-            f"{condition.what}: {self.counts[condition.key]}, the first in cycle {self.first[condition.key]}"
-            for condition in COUNTED
-            if condition.key in NOTED_ONCE and self.counts[condition.key]
+            f"{BY_KEY[key].what}: {self.counts[key]}, the first in cycle {self.first[key]}"
+            for key in NOTED_ONCE
+            if self.counts[key]
         ]

@@ -139,17 +139,14 @@ class LineMotion:
         start: pose to leave.
         end: pose to reach.
         speed: mean speed, m/s.
-        angular_speed: mean angular speed of the pole, rad/s.
         at_once: leave with twice the mean speed, which then falls to zero: to let go of what is pressed.
     """
 
-    def __init__(
-        self, start: ProbePose, end: ProbePose, speed: float, angular_speed: float = 0.5, *, at_once: bool = False
-    ) -> None:
+    def __init__(self, start: ProbePose, end: ProbePose, speed: float, *, at_once: bool = False) -> None:
         self._start, self._end, self._at_once = start, end, at_once
         distance = float(np.linalg.norm(end.centre - start.centre))
         angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
-        self.duration = max(distance / speed, angle / angular_speed, 0.05)
+        self.duration = max(distance / speed, angle / 0.5, 0.05)  # the pole turns at 0.5 rad/s on average
 
     def at(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the start; the end pose afterwards."""
@@ -168,12 +165,9 @@ class ArcMotion:
         start: pose to leave, not at the centre.
         end: pose to reach; not opposite to the first.
         speed: mean speed, m/s.
-        angular_speed: mean angular speed of the pole, rad/s.
     """
 
-    def __init__(
-        self, centre: Vector, start: ProbePose, end: ProbePose, speed: float, angular_speed: float = 0.7
-    ) -> None:
+    def __init__(self, centre: Vector, start: ProbePose, end: ProbePose, speed: float) -> None:
         self._centre, self._poles = centre, (start.pole, end.pole)
         a, b = start.centre - centre, end.centre - centre
         self._radii = float(np.linalg.norm(a)), float(np.linalg.norm(b))
@@ -181,7 +175,7 @@ class ArcMotion:
         self._angle = math.acos(max(-1.0, min(1.0, float(self._a @ self._b))))
         pole_angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
         way = math.hypot(self._angle * max(self._radii), self._radii[1] - self._radii[0])
-        self.duration = max(way / speed, pole_angle / angular_speed, 0.05)
+        self.duration = max(way / speed, pole_angle / 0.7, 0.05)
 
     def at(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the start; the end pose afterwards."""

@@ -31,12 +31,16 @@ HOLLOWEST = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
 
+HISTORY = 64
+"""Cycles whose joints are kept."""
+
+
 class JointHistory:
     """The last joint angles with their times, to be interpolated at a tactile sample's instant."""
 
-    def __init__(self, length: int = 64) -> None:
-        self._times: deque[int] = deque(maxlen=length)
-        self._joints: deque[Vector] = deque(maxlen=length)
+    def __init__(self) -> None:
+        self._times: deque[int] = deque(maxlen=HISTORY)
+        self._joints: deque[Vector] = deque(maxlen=HISTORY)
 
     def add(self, t_ns: int, q: Vector) -> None:
         """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""

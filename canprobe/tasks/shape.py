@@ -48,7 +48,6 @@ class ShapeTracker:
     Args:
         estimator: the online estimator.
         every: samples between two answers.
-        gap_s: time without a contact after which the estimator starts afresh.
 
     Attributes:
         records: every answer.
@@ -57,14 +56,13 @@ class ShapeTracker:
         restarts: how often the estimator diverged and started afresh.
     """
 
-    def __init__(self, estimator: Estimator, every: int, gap_s: float = GAP_S) -> None:
+    def __init__(self, estimator: Estimator, every: int) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
         self.restarts = 0
         self._estimator = estimator
         self._every = max(1, every)
-        self._gap_s = gap_s
         self._waiting: list[ContactSample] = []
         self._taken = 0
         self._found: tuple[SurfaceEstimate, float] | None = None
@@ -73,7 +71,7 @@ class ShapeTracker:
         """Note one contact; `work` takes it."""
         if self.samples:
             last = self.samples[-1]
-            if sample.t_s - last.t_s > self._gap_s:
+            if sample.t_s - last.t_s > GAP_S:
                 self._estimator.reset()
                 self._waiting.clear()
                 self._taken, self._found = len(self.samples), None
