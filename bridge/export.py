@@ -10,8 +10,7 @@ from typing import Any
 
 from canprobe.bridge.database import need
 from canprobe.bus.disk import whole_file, write_text
-from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, make_setups
+from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, NodeSetup, Write, make_setups
 from canprobe.eds.packaged import eds_file
 from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
 from canprobe.errors import UsageError

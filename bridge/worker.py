@@ -36,14 +36,14 @@ from canprobe.bridge.sample import (
     Wrench,
 )
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import patch_of
+from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.make import make_plan
-from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
+from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.frames import EFF_FLAG, NO_ERROR, RTR_FLAG, NmtState, describe
 from canprobe.robot.kinematics import forward
@@ -74,7 +74,7 @@ class Health:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._watch = NodeWatch(plan.node_ids, MASTER_NODE_ID, HEARTBEAT_CONSUMED_MS * 1_000_000)
+        self._watch = NodeWatch(plan.node_ids)
         self._heard: dict[int, int] = {}
         self._due_ns: int | None = None
 

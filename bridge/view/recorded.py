@@ -16,7 +16,7 @@ from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.instants import Moment, curvature_error, curvature_sigma, true_kappa
 from canprobe.bridge.view.meshes import Array
 from canprobe.bus.disk import read_candump
-from canprobe.cell.assembly import make_tactile
+from canprobe.cell.array import make_tactile
 from canprobe.errors import UsageError
 from canprobe.planning.make import make_plan
 from canprobe.results.summary import SCHEMA, check_clock

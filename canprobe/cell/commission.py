@@ -1,4 +1,8 @@
-"""What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again."""
+"""What `canprobe scan --lss` does: list the nodes, find devices without an id, give them ids, list again.
+
+`commission` is the whole of it. Which device gets which id follows from identities; where two devices could be meant
+it is an error. Source: CiA 305, by canopen's LSS client.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from canprobe.errors import BusError, NodeError
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import HEARTBEAT_BASE, LssAddress, NmtCommand, pack_nmt
 
-# Which device gets which node id: nothing is left to chance.
+# Which device gets which node id.
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +44,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What one device is told.
-
-    Attributes:
-        address: of the device.
-        node_id: that it gets.
-        before: that it has; None for none.
-    """
+    """The device with this address gets `node_id`; `before` is the id that it has, None for none."""
 
     address: LssAddress
     node_id: int
@@ -61,22 +59,20 @@ def choose_assignments(
     channel: str,
     must: bool = True,
 ) -> list[Assignment]:
-    """Which device gets which id. Nothing is left to chance: where two devices could be meant, it is an error.
+    """Which device gets which id.
 
     Args:
         wanted: the ids to give.
         unconfigured: devices without an id.
         present: devices that have one; None where 1018h is not complete.
         channel: of the bus, for messages.
-        must: each wanted id needs a device; False: those that nobody fits are left out.
+        must: each wanted id needs a device; False: ids that no device fits are left out.
 
     Raises:
-        NodeError: an id is in use by another device, nobody fits, or more than one device does.
+        NodeError: an id is in use by another device, no device fits, or more than one does.
     """
-    chosen: list[Assignment] = []
-    for want in wanted:
-        if (assignment := _choose(want, unconfigured, present, channel, must)) is not None:
-            chosen.append(assignment)
+    choices = [_choose(want, unconfigured, present, channel, must) for want in wanted]
+    chosen = [assignment for assignment in choices if assignment is not None]
     taken: dict[LssAddress, int] = {}
     for one in chosen:
         if one.address in taken:
@@ -96,7 +92,7 @@ def _choose(
     if want.node_id in present and (not must or (holder is not None and want.fits(holder))):
         return None
     if want.node_id in present:
-        whose = f"the device {holder}" if holder is not None else "a device that does not tell its identity"
+        whose = f"the device {holder}" if holder is not None else "a device without a complete identity (1018h)"
         raise NodeError(want.node_id, f"({want.name}) the id is busy: {whose} on {channel} has it")
     fits = [Assignment(address, want.node_id) for address in unconfigured if want.fits(address)]
     if want.numbers[3] is not None:  # a device named by its serial number may have another id already
@@ -114,28 +110,23 @@ def _choose(
         )
     if not fits and must:
         there = ", ".join(map(str, unconfigured)) or "none"
+        identity = ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
         raise NodeError(
             want.node_id,
-            f"({want.name}) no device on {channel} is {_spelled(want)}; without an id:"
+            f"({want.name}) no device on {channel} is {identity}; without an id:"
             f" {there}; check its power, bit rate and whether it supports LSS",
         )
     return fits[0] if fits else None
 
 
-def _spelled(want: Wanted) -> str:
-    return ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
-
-
-# Ask nodes for their ids and tell them new ones over the bus.
-#
-# Source: CiA 305; canopen's LSS client does the asking.
+# Find devices without an id and give one, over the bus.
 
 BOOT_UP_S = 2.0
 MOST_NODES = 127
 
 
 class FoundTwiceError(BusError):
-    """A device that was found answers the search again: nobody of a higher address can be found beside it.
+    """A device that was found answers the search again and hides those of higher addresses.
 
     Attributes:
         found: every device that was found, that one last.
@@ -158,7 +149,7 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
         BusError: two devices have one address, or answers do not agree.
         InterfaceError: the interface failed.
     """
-    lss = _lss(network)
+    lss: Any = network.lss  # canopen has no types here
     lss.send_switch_state_global(lss.WAITING_STATE)
     found: list[LssAddress] = []
     try:
@@ -197,7 +188,8 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         NodeError: the device does not answer, refuses, or does not boot with its new id.
         InterfaceError: the interface failed.
     """
-    lss, node_id = _lss(network), assignment.node_id
+    lss: Any = network.lss
+    node_id = assignment.node_id
     booted: list[bytes] = []
     take = lambda can_id, data, t_s: booted.append(bytes(data)) if bytes(data) == b"\0" else None  # noqa: E731
     network.subscribe(HEARTBEAT_BASE + node_id, take)
@@ -234,10 +226,6 @@ def _configure(lss: Any, assignment: Assignment, store: bool) -> bool:
     return True
 
 
-def _lss(network: PumpedNetwork) -> Any:  # canopen has no types here
-    return network.lss
-
-
 # List the nodes on a bus with their identity, without knowing any of them.
 
 NUMBERS = {"vendor_id": 1, "product_code": 2, "revision_number": 3, "serial_number": 4}
@@ -258,8 +246,13 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
     for node_id in answering_nodes(port, range(1, 128), timeout_s):
         node = network.add_node(node_id, ObjectDictionary())  # type: ignore[no-untyped-call]
         node.sdo.RESPONSE_TIMEOUT = timeout_s
-        numbers = {name: _number(node, subindex) for name, subindex in NUMBERS.items()}
-        nodes.append({"node_id": node_id, **numbers, "device_name": _name(node)})
+        found: dict[str, Any] = {"node_id": node_id}
+        for name, subindex in NUMBERS.items():
+            number = _upload(node, 0x1018, subindex)
+            found[name] = None if number is None else int.from_bytes(number[:4], "little")
+        text = _upload(node, 0x1008, 0)
+        found["device_name"] = None if text is None else text.decode("ascii", errors="replace").rstrip("\0")
+        nodes.append(found)
     return nodes
 
 
@@ -270,17 +263,7 @@ def _upload(node: PumpedNode, index: int, subindex: int) -> bytes | None:
         return None
 
 
-def _number(node: PumpedNode, subindex: int) -> int | None:
-    data = _upload(node, 0x1018, subindex)
-    return None if data is None else int.from_bytes(data[:4], "little")
-
-
-def _name(node: PumpedNode) -> str | None:
-    data = _upload(node, 0x1008, 0)
-    return None if data is None else data.decode("ascii", errors="replace").rstrip("\0")
-
-
-# What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again.
+# All of it.
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +271,7 @@ class Commissioned:
     """What was found and done.
 
     Attributes:
-        nodes: those with an id, as `scan_nodes` tells them, at the end.
+        nodes: those with an id at the end, as `scan_nodes` returns them.
         unconfigured: devices that still have none.
         assigned: devices that got an id, and whether each keeps it when its power goes.
     """
@@ -322,8 +305,8 @@ def commission(
         timeout_s: for an SDO answer.
 
     Raises:
-        BusError: nobody without an id is there though ids are wanted, it is not clear who is meant, or a device hides
-            others from the search; nothing was changed.
+        BusError: no device without an id answers though ids are wanted, it is not clear which one is meant, or a device
+            hides others from the search; nothing was changed.
         NodeError: one device did not take its id; those before it have theirs.
         InterfaceError: the interface failed.
     """
@@ -333,7 +316,7 @@ def commission(
         unconfigured = find_unconfigured(network)
     except FoundTwiceError as error:
         if not wanted or any(want.numbers[3] is None for want in wanted):
-            raise  # who else could be meant is not known
+            raise  # which others could be meant is not known
         unconfigured = error.found
     present = {int(node["node_id"]): _address(node) for node in nodes}
     chosen = choose_assignments(wanted, unconfigured, present, channel=port.channel, must=must)
@@ -359,8 +342,8 @@ def _check_all_placed(
     if strangers := sorted(set(unconfigured) - {one.address for one in chosen}):
         ids = ", ".join(f"{want.node_id} ({want.name})" for want in wanted)
         raise BusError(
-            f"the device {strangers[0]} (vendor:product:revision:serial) on {channel} has no id, and is none of the"
-            f" scene's nodes that are missing, of {ids}; name it, as in --assign"
+            f"the device {strangers[0]} (vendor:product:revision:serial) on {channel} has no id, and is not one of"
+            f" the scene's missing nodes, of {ids}; name it, as in --assign"
             f" {strangers[0].serial_number:#x}=ID"
         )
 

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import limits_of, make_drives, make_tactile
+from canprobe.cell.array import make_tactile
 from canprobe.cell.controller import Measurement
 from canprobe.cell.cycle import SYNCS_REMEMBERED, Intake
-from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames
-from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.supervisor import WayBack
+from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames, make_drives
+from canprobe.cell.lift_off import WayBack
+from canprobe.cell.supervision import HOLD_CYCLES, TOUCH_FORCE
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
@@ -345,7 +345,7 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     way_back = LoggedWayBack(plan)
     comparison = _Comparison(plan)
     for cycle in way_back.cycles_before(controller_cycles(cycles)):
-        if max(cycle.measurement.q_age, default=0) >= comparison.hold_cycles:
+        if max(cycle.measurement.q_age, default=0) >= HOLD_CYCLES:
             continue  # a late drive: the cell held, and asked its controller nothing
         command = task.step(cycle.measurement)
         comparison.add(cycle, command.q_target)
@@ -362,7 +362,6 @@ class _Comparison:
 
     def __init__(self, plan: Plan) -> None:
         assert plan.setup.arm is not None
-        self.hold_cycles = limits_of(plan).hold_cycles
         self.parted_s: float | None = None
         self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)

@@ -22,7 +22,6 @@ from canprobe.bus.disk import CandumpWriter, RecordingPort, write_npz, write_tex
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
-from canprobe.cell.assembly import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.cell.cycle import Observation, Observer, Observers
@@ -296,7 +295,7 @@ class Session:
             self._say(f"warning: {warning}")
         try:
             port = self._open()
-            self._cell = make_cell(
+            self._cell = Cell(
                 self.plan,
                 port,
                 say=self._say,

@@ -53,7 +53,6 @@ def check_joints(
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.cell.assembly import limits_of
     from canprobe.robot.kinematics import MODELS
     from canprobe.tasks.untouched import JointCheck
 
@@ -62,7 +61,7 @@ def check_joints(
             resolve_scene(scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate)
         )
     )
-    check = JointCheck(MODELS[scene.arm.model], limits_of(plan), plan.sync.period_ns * 1e-9, operator)
+    check = JointCheck(plan, operator)
     try:
         with Session(plan.scene, None, say, (), ROWS_KEPT) as session:
             session.run(check)

@@ -37,11 +37,10 @@ from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import Participant
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
 from canprobe.cell.controller import Controller
-from canprobe.cell.supervision import Limits
+from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
 from canprobe.errors import CanprobeError
@@ -100,7 +99,7 @@ def peak_of(session: Session) -> Peak | None:
     assert session.world is not None
     kappa = session.world.plant.truth()["kappa"]
     return Peak(
-        limits.force_max,
+        limits.safety.force_max,
         indentation_from_force(1.0, scene.probe.stiffness_n_m3, scene.probe.radius_mm * 1e-3, kappa),
         scene.task.approach_mm_s * 1e-3 * blind_s,
         tuple((_torn_speeds(session) * torn_s).tolist()),
@@ -151,7 +150,7 @@ def score_force(
     longest = 0
     since: int | None = None
     for t_ns, force in rows:
-        if force <= limits.force_max:
+        if force <= limits.safety.force_max:
             since = None
             continue
         since = t_ns if since is None else since

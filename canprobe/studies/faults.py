@@ -24,8 +24,8 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from canprobe.bus.port import VirtualClock
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.controller import Measurement
+from canprobe.cell.supervision import limits_of
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.errors import CanprobeError, SafetyStop

@@ -18,9 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.supervision import Limits
+from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.faults import WrappedNode
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.ideal_arm import natural_frequency
@@ -431,7 +430,7 @@ class _Run:
         ended, reason = self._drive()
         assert self.witness is not None
         times, forces = (np.array(column) for column in zip(*self.witness.rows, strict=True))
-        longest_ns = longest_above(times, forces, self.limits.force_max)
+        longest_ns = longest_above(times, forces, self.limits.safety.force_max)
         allowed_ns = allowed_above(self.limits, self.case.late_ms)
         error, spread = self._error_and_spread()
         if not np.isfinite(forces).all():

@@ -14,7 +14,6 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.bus.lockstep import Participant
 from canprobe.bus.sdo_client import upload
-from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
 from canprobe.eds.packaged import eds_path
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
@@ -30,7 +29,9 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     beside = list(beside)
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
-    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
+    said = []
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path, say=said.append)
+    session.said = said
 
     def join(participant):
         while beside:
@@ -47,6 +48,11 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
 
     session.joins = join
     return session
+
+
+def done_to(session):
+    """What bring-up says of each node, in their order."""
+    return [line.split(") ", 1)[1] for line in session.said if re.match(r"node \d+: \(.*\) configur", line)]
 
 
 def frames(tmp_path):
@@ -149,8 +155,7 @@ def assert_left_pre_operational(tmp_path, before=(0x81,)):
 
 def test_the_nodes_are_configured_side_by_side(tmp_path):
     with open_session(tmp_path) as session:
-        reports = session.cell.bring_up_reports
-    assert [str(r) for r in reports] == [f"node {i}: (joint {i}) configured, software 1.0" for i in range(1, 7)]
+        assert done_to(session) == ["configured, software 1.0"] * 6
     asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
     for part in range(1, 6):
         so_far = asked[: len(asked) * part // 6]
@@ -161,9 +166,9 @@ def test_the_nodes_are_configured_side_by_side(tmp_path):
 def test_a_lost_answer_is_asked_for_again(tmp_path):
     lost = Fault(FaultKind.DROP, 3, 300 * MS, 300 * MS)
     with open_session(tmp_path, faults=[lost]) as session:
-        reports = session.cell.bring_up_reports
-    assert [report.repeated for report in reports] == [0, 0, 1, 0, 0, 0]
-    assert str(reports[2]) == "node 3: (joint 3) configured, software 1.0, 1 requests repeated"
+        done = done_to(session)
+    assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
+    assert done == ["configured, software 1.0"] * 5
 
 
 def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
@@ -203,7 +208,7 @@ def test_a_kept_configuration_is_not_written_again(tmp_path):
     logs, kept = [], []
     for run in range(2):
         with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
-            kept.append([report.kept for report in session.cell.bring_up_reports])
+            kept.append(["kept" in done for done in done_to(session)])
         nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
         logs.append(frames(tmp_path))
         assert session.cell.faults == [], run
@@ -219,10 +224,10 @@ def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed
     saved = {node_id: node.store.saved for node_id, node in nodes.items()}
     nodes = dict(saved)
     with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
-        assert not any(report.kept for report in session.cell.bring_up_reports)
+        assert not any("kept" in done for done in done_to(session))
     saved[3] = {**saved[3], 0x102001: 0}
     with open_session(tmp_path, nodes=dict(saved), store=True) as session:
-        assert [report.kept for report in session.cell.bring_up_reports] == [True, True, False, True, True, True]
+        assert ["kept" in done for done in done_to(session)] == [True, True, False, True, True, True]
 
 
 def test_any_write_over_sdo_takes_the_date_back():
@@ -230,7 +235,7 @@ def test_any_write_over_sdo_takes_the_date_back():
     session = open_session(None, nodes=nodes, store=True)
     with session:
         drive = nodes[1]
-        date = configuration_date(make_setups(session.plan)[0])
+        date = make_setups(session.plan)[0].configuration_date
         assert {sub: drive.dictionary.number(0x1020, sub) for sub in (1, 2)} == date and min(date.values()) > 0
         drive.receive(0x601, bytes.fromhex("2b6660001e000000"), drive.core.now_ns)
         assert [drive.dictionary.number(0x1020, sub) for sub in (1, 2)] == [0, 0]
@@ -238,8 +243,8 @@ def test_any_write_over_sdo_takes_the_date_back():
 
 def test_a_node_that_boots_late_is_reset_again(tmp_path):
     dark = Fault(FaultKind.FREEZE, 2, 200 * MS, 400 * MS)
-    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3) as session:
-        assert all(report.failure is None for report in session.cell.bring_up_reports)
+    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3):
+        pass
     resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
     assert [d[1] for d in resets].count(2) >= 2 and [d[1] for d in resets].count(1) == 1
 
@@ -304,8 +309,8 @@ def answering_in_other_lengths(node):
 
 def test_an_answer_of_another_length_is_read_in_the_objects_own(tmp_path):
     """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
-    with open_session(tmp_path, change=answering_in_other_lengths) as session:
-        assert [report.failure for report in session.cell.bring_up_reports] == [None] * 6
+    with open_session(tmp_path, change=answering_in_other_lengths):
+        pass
     answers = {d[0] for _, i, d in frames(tmp_path) if 0x581 <= i <= 0x584 and d[1:4] == b"\xc2\x60\x02"}
     assert answers == {0x60, 0x42, 0x43, 0x41}
 
@@ -372,9 +377,9 @@ def late(by_s, **bring_up):
 def test_late_answers_are_taken_for_what_they_answer(tmp_path):
     """A write is read back from the same entry: a late answer to the one is none to the other."""
     with open_session(tmp_path, **late(0.06)) as session:
-        reports = session.cell.bring_up_reports
-    assert str(reports[2]).startswith("node 3: (joint 3) configured, software 1.0, ")
-    assert reports[2].repeated > 20 and reports[1].repeated == 0
+        done = done_to(session)
+    assert int(re.fullmatch(r"configured, software 1.0, (\d+) requests repeated", done[2])[1]) > 20
+    assert "repeated" not in done[1]
 
 
 def test_a_late_answer_is_no_segment():
@@ -407,12 +412,8 @@ def boots_twice(node):
 
 
 def test_a_node_that_boots_twice_is_brought_up(tmp_path):
-    said = []
-    session = open_session(tmp_path, change=boots_twice)
-    session._say = said.append
-    with session:
-        pass
-    assert "node 3: (joint 3) sent 2 boot-ups after its reset" in said
+    with open_session(tmp_path, change=boots_twice) as session:
+        assert "node 3: (joint 3) sent 2 boot-ups after its reset" in session.said
 
 
 def test_two_nodes_with_one_id_are_told_from_one_that_boots_twice(tmp_path):

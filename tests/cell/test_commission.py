@@ -176,7 +176,7 @@ def test_the_one_device_that_fits_is_chosen():
         ([Wanted(3, "x", (*ANY, 7))], [8], {}, r"is any:any:any:0x7; without an id: 0xca5e:0x260:0x10000:0x8"),
         ([WANTED], [1, 2], {}, r"2 devices could be meant: .*:0x1, .*:0x2 .*--assign 0x1=3"),
         ([Wanted(3, "x", (*ANY, 7))], [7], {3: 9}, r"the id is busy: the device 0xca5e:0x260:0x10000:0x9"),
-        ([WANTED], [7], {3: None}, "the id is busy: a device that does not tell its identity"),
+        ([WANTED], [7], {3: None}, "the id is busy: a device without a complete identity"),
         ([WANTED, Wanted(4, "joint 4", WANTED.numbers)], [7], {}, "node 4: .* could also be node 3: .* serial number"),
     ],
 )
@@ -214,7 +214,7 @@ def test_commissioning_looks_gives_and_looks_again(bus):
 
 def test_a_scene_whose_blank_devices_are_strangers_is_refused(bus):
     put(bus, make_node(1, eds="tactile_array"))
-    with pytest.raises(BusError, match="has no id, and is none of the scene's nodes that are missing"):
+    with pytest.raises(BusError, match="has no id, and is not one of the scene's missing nodes"):
         commission(bus.port(), [WANTED], must=False)
     with pytest.raises(BusError, match="no node without an id answers on"):
         commission(LockstepBus(VirtualClock(), "empty").port(), [WANTED], must=False)

@@ -3,15 +3,8 @@
 import numpy as np
 import pytest
 
-from canprobe.cell.drives import (
-    BASE_COUNTS,
-    CARRIED_CYCLES,
-    STEADY,
-    DriveAxis,
-    DriveGroup,
-    PositionTrack,
-    TactileReceiver,
-)
+from canprobe.cell.array import TactileReceiver
+from canprobe.cell.drives import BASE_COUNTS, CARRIED_CYCLES, STEADY, DriveAxis, DriveGroup, PositionTrack
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_frame

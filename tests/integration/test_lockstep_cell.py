@@ -248,7 +248,7 @@ def test_what_is_no_controller_is_told_before_a_drive_is_enabled():
 
 def test_a_controller_cannot_write_the_cells_own_columns():
     session = session_of("free")
-    with pytest.raises(UsageError, match="expected columns of its own, got t_s, which the cell writes itself"), session:
+    with pytest.raises(UsageError, match="expected other columns than the cell's, got t_s"), session:
         session.run(lambda _: Command(columns={"t_s": 0.0}))
     assert_safe(session)
 

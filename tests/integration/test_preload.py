@@ -38,7 +38,7 @@ def press_begun_pressed(**limits):
 def test_no_drive_is_enabled():
     reason, session = press_begun_pressed()
     assert BY_KEY["preload"].reaction is Reaction.STOP and "preload" in session.cell.supervisor.first
-    force = float(reason.removeprefix("the array feels ").split(" N before the run")[0])
+    force = float(reason.removeprefix("the array measures ").split(" N before the run")[0])
     assert force == pytest.approx(session.truth["force"].max(), rel=0.15) and force > 0.5
     assert "limits.preload_max_n = 0.15" in reason and "free the probe" in reason
     assert np.ptp(session.truth["q"], axis=0).max() == 0.0

@@ -13,7 +13,7 @@ import pytest
 import canprobe
 from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame, VirtualClock
-from canprobe.cell.assembly import make_cell
+from canprobe.cell.cell import Cell
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import Frame
 from canprobe.session.children import END_TIMEOUT_S, EmulatorChild
@@ -98,7 +98,7 @@ def test_what_others_send_meanwhile_is_heard_by_the_cell(tmp_path: Path) -> None
     bus = LockstepBus(VirtualClock())
     bus.attach(Nodes(1_000_000_000, None, beside=[(0x080, b"")]))
     port = bus.port()
-    cell = make_cell(canprobe.plan(canprobe.load_scene("free")), port)
+    cell = Cell(canprobe.plan(canprobe.load_scene("free")), port)
     cell.listen()
     await_on(port, tmp_path, hear=cell.hear)
     sent: list[int] = []

@@ -109,8 +109,8 @@ def test_a_drive_that_obeys_the_wrong_way_round_is_named(cell):
     cell.joins, said = on_node(2, lambda node: Obeying(node, -1.0)), []
     with pytest.raises(NodeError, match=r"^node 2: \(joint 2\) it turned the wrong way$"):
         canprobe.api.check_joints(scene(), say=said.append)
-    assert "joint 2 at 65.00 deg: told +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
-    assert sum("as it must" in line for line in said) == 5
+    assert "joint 2 at 65.00 deg: asked +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
+    assert sum("as expected" in line for line in said) == 5
     assert_disabled(cell.session)
 
 
@@ -121,7 +121,7 @@ def test_a_flipped_polarity_that_no_encoder_shows_is_seen_by_the_operator(cell):
     with pytest.raises(NodeError, match=r"^node 3: \(joint 3\) the operator did not see it turn that way: polarity"):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
     (line,) = [line for line in said if line.startswith("joint 3 ")]
-    assert line.startswith("joint 3 at -15.00 deg: told +1.00 deg, turned +1.00 deg: the operator did not see")
+    assert line.startswith("joint 3 at -15.00 deg: asked +1.00 deg, turned +1.00 deg: the operator did not see")
     assert f"{REPORTED} 90.00, 65.00, -15.00," in said[-1]  # and the pose is not the arm's
     assert_disabled(cell.session)
 
@@ -145,7 +145,7 @@ def test_an_interrupt_between_two_joints_disables_and_reports_what_was_done(cell
     cell.operator, said = Interrupting(), []
     with pytest.raises(KeyboardInterrupt):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
-    assert said[-2].startswith("joint 1 at 90.00 deg: told +1.00 deg, turned +1.0")
+    assert said[-2].startswith("joint 1 at 90.00 deg: asked +1.00 deg, turned +1.0")
     assert_disabled(cell.session)
 
 

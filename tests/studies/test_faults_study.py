@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from canprobe.cell.assembly import limits_of
+from canprobe.cell.supervision import limits_of
 from canprobe.cell.supervisor import Supervisor
 from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind

@@ -8,9 +8,9 @@ from wrapped import Wrapped
 
 import canprobe
 from canprobe.bus.port import ControllerState
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.controller import Command, Controller
+from canprobe.cell.supervision import limits_of
 from canprobe.emulator.faults import Fault, FaultyNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
