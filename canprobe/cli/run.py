@@ -60,7 +60,6 @@ def add_parser(commands: Commands[Parser]) -> None:
         type=seconds,
         help="length of the scan, press, listen or free phase in seconds [the scene's]",
     )
-    parser.add_argument("--blf", action="store_true", help="also write the bus log as bus.blf at the end")
     add_json(parser)
     parser.set_defaults(run=run)
 
@@ -97,27 +96,13 @@ def run(args: argparse.Namespace) -> int:
     except CanprobeError as error:
         if args.json and error.summary is not None:
             print_json(error.summary)
-        try:
-            _write_blf(folder, wanted=args.blf and error.summary is not None)
-        except CanprobeError as unwritten:  # what stopped the run counts for more
-            error.add_note(str(unwritten))
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
-        _write_blf(folder, wanted=args.blf)
         raise
-    _write_blf(folder, wanted=args.blf)
     if args.json:
         print_json(result.summary)
     else:
         print(result.text())
     return 0
-
-
-def _write_blf(folder: Path, *, wanted: bool) -> None:
-    """The bus in the other form, where it was recorded."""
-    if wanted and (folder / "bus.log").is_file():
-        from canprobe.bus.disk import convert_log
-
-        convert_log(folder / "bus.log", folder / "bus.blf")

@@ -141,19 +141,12 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
     return timed
 
 
-class Sink:
-    """What a RecordingPort writes to."""
-
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
-        self.write = write
-
-
 # A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
 
 Array = NDArray[np.float64]
 LOCKSTEP = "lockstep"
 LEFT_BY_RUNS = (
-    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
     *("surface.png", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
@@ -459,7 +452,7 @@ class Session:
         real = self._ports = self._stack.enter_context(
             open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
         )
-        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, self._writer(name)) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""
