@@ -23,9 +23,8 @@ from typing import Any
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
-from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
-from canprobe.bus.sdo_client import hold_dialogues, upload
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of

@@ -12,7 +12,7 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.sdo_client import upload
+from canprobe.bus.network import upload
 from canprobe.cell.bringup import configuration_date
 from canprobe.cell.configuration import make_setups
 from canprobe.eds.packaged import eds_path
