@@ -1,4 +1,4 @@
-"""Where canprobe touches the world: clocks, CAN ports, canopen's network over them, and files.
+"""Where canprobe touches the world: clocks, CAN ports, requests and answers over them, and files.
 
 Everything above knows two small interfaces, both in `port`: a `Clock` (now, sleep until) and a `Port` (`send_batch`,
 `drain`, counters, the controller's state). Behind them:

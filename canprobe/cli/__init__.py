@@ -69,7 +69,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
     arguments = list(sys.argv[1:] if argv is None else argv)
     _prepare_streams()
     try:
-        args = _parser(arguments).parse_args(arguments)
+        args = parser_of(arguments).parse_args(arguments)
         with termination_interrupts():
             status = int(args.run(args))
         sys.stdout.flush()
@@ -109,7 +109,7 @@ def _forget_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _parser(arguments: Sequence[str]) -> Parser:
+def parser_of(arguments: Sequence[str]) -> Parser:
     """The parser with the named command only, or with all of them when none is named."""
     parser = Parser(
         prog="canprobe", description="Bring up, run, emulate and watch a robot cell on a CAN bus.", epilog=_EXAMPLE

@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_json, whole
+from canprobe.cli.parser import Commands, Parser, add_options, whole
 
 if TYPE_CHECKING:
     from canprobe.eds.reading import Reading
@@ -40,7 +40,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         description="List the packaged EDS files.",
         epilog="examples:\n  canprobe eds list\n  canprobe eds list --json\n",
     )
-    add_json(listing)
+    add_options(listing, "--json")
     listing.set_defaults(run=run, action="list")
     path = actions.add_parser(
         "path",
@@ -60,7 +60,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     check.add_argument(
         "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
     )
-    add_json(check)
+    add_options(check, "--json")
     check.set_defaults(run=run_check)
 
 

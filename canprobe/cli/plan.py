@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_json, add_scene
+from canprobe.cli.parser import Commands, Parser, add_options, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--figure", metavar="FILE.png", type=Path, help="draw the cycles and the response times (extra `study`)"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
-    add_json(parser)
+    add_options(parser, "--json")
     parser.set_defaults(run=run)
 
 

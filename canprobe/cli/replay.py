@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
+from canprobe.cli.parser import Commands, Parser, add_options
 from canprobe.errors import ResultsError
 
 _EXAMPLE = """\
@@ -37,8 +37,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="recursive, ml, chord or chen1996; may be repeated [those of the scene]",
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
-    add_bridge(parser)
-    add_json(parser)
+    add_options(parser, "--bridge", "--json")
     parser.set_defaults(run=run)
 
 

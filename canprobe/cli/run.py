@@ -10,23 +10,7 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import (
-    Commands,
-    Parser,
-    add_bridge,
-    add_bus,
-    add_force,
-    add_json,
-    add_patient,
-    add_realtime,
-    add_scene,
-    folder_path,
-    seconds,
-    target_of,
-    whole,
-    with_patience,
-    with_realtime,
-)
+from canprobe.cli.parser import BUS, Commands, Parser, add_options, add_scene, scene_of
 from canprobe.errors import CanprobeError
 
 _EXAMPLE = """\
@@ -42,38 +26,21 @@ def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser("run", help="run a scene and write the results", description=__doc__, epilog=_EXAMPLE)
     add_scene(parser)
-    add_bus(parser)
-    add_realtime(parser)
-    add_patient(parser)
-    add_bridge(parser)
-    parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder of the results [runs/<scene>-<time>]")
-    add_force(parser)
+    add_options(parser, *BUS, "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
     parser.add_argument(
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
-    parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of all random numbers [the scene's]"
-    )
-    parser.add_argument(
-        "--duration",
-        metavar="S",
-        type=seconds,
-        help="length of the scan, press, listen or free phase in seconds [the scene's]",
-    )
-    add_json(parser)
+    add_options(parser, "--json")
     parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
-    from canprobe.scene.load import load_scene
-
-    scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
+    scene = scene_of(args)
     if args.tool is not None:
         from canprobe.scene.geometry import with_tool
 
         scene = with_tool(scene, args.tool)
-    target = target_of(args, scene)
 
     from canprobe import api
 
@@ -81,17 +48,13 @@ def run(args: argparse.Namespace) -> int:
     try:
         result = api.run(
             scene,
-            interface=target.interface,
-            channel=target.channel,
-            sensor_channel=target.sensor_channel,
-            bitrate=target.bitrate,
             out=folder,
             seed=args.seed,
             duration_s=args.duration,
             force=args.force,
             progress=progress_bar(),
             say=say_on_terminal,
-            bridge=args.bridge or (),
+            bridge=args.bridge,
         )
     except CanprobeError as error:
         if args.json and error.summary is not None:

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import (
+    OPTIONS,
     Commands,
     Parser,
-    add_json,
+    add_options,
     add_scene,
     channel,
     number_of_32_bits,
     real_target,
     whole,
-    word,
 )
 from canprobe.errors import UsageError
 
@@ -46,14 +46,13 @@ def add_parser(commands: Commands[Parser]) -> None:
     add_scene(parser, optional=True)
     parser.add_argument(
         "--bus",
-        metavar="B",
-        type=word,
-        help="python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]",
+        **OPTIONS["--bus"]
+        | {"help": "python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"},
     )
     parser.add_argument(
         "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
     )
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
     parser.add_argument("--lss", action="store_true", help="also find nodes without an id")
     parser.add_argument(
         "--assign",
@@ -64,7 +63,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
-    add_json(parser)
+    add_options(parser, "--json")
     parser.set_defaults(run=run)
 
 
@@ -86,25 +85,24 @@ def run(args: argparse.Namespace) -> int:
 
     from canprobe import api
 
-    interface, name, bitrate = real_target(args.bus, args.channel[1], args.bitrate)
-    where, rate = name or "can0", bitrate or 1_000_000
+    target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
     if not args.lss:
-        nodes = api.scan(interface, where, rate, say=say)
+        nodes = api.scan(target, say=say)
         if args.json:
             print_json(nodes)
         else:
-            _print_nodes(nodes, where)
+            _print_nodes(nodes, target.channel)
         return 0
     scene = None
     if args.scene is not None:
         from canprobe.scene.load import load_scene
 
         scene = load_scene(args.scene)
-    done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store, say=say)
+    done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=say)
     if args.json:
         print_json(done.as_document())
     else:
-        _print_commissioned(done, where)
+        _print_commissioned(done, target.channel)
     return 0
 
 

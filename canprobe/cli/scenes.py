@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Commands, Parser, add_json
+from canprobe.cli.parser import Commands, Parser, add_options
 
 _EXAMPLE = """\
 examples:
@@ -17,7 +17,7 @@ examples:
 def add_parser(commands: Commands[Parser]) -> None:
     """Add the command."""
     parser = commands.add_parser("scenes", help="list the packaged scenes", description=__doc__, epilog=_EXAMPLE)
-    add_json(parser)
+    add_options(parser, "--json")
     parser.set_defaults(run=run)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from canprobe.bus.scheduling import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
-from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
+from canprobe.cli.parser import Commands, Parser, add_options, did_you_mean, whole
 
 _EXAMPLE = """\
 examples:
@@ -41,7 +41,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
     parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
-    add_json(parser)
+    add_options(parser, "--json")
     parser.set_defaults(run=run, complain=parser.error)
 
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_force, seconds, target_of, whole
+from canprobe.cli.parser import BUS, Commands, Parser, add_options, target_of, whole
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
@@ -34,7 +34,6 @@ def add_parser(commands: Commands[Parser]) -> None:
         "view", help="show a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE
     )
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
-    add_bus(parser)
     parser.add_argument(
         "--host",
         metavar="H",
@@ -46,10 +45,8 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder of the results")
-    add_force(parser)
-    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: seed of all random numbers")
-    parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase in seconds")
+    of_scene = parser.add_argument_group("options of a SCENE")
+    add_options(of_scene, *BUS, "--out", "--force", "--seed", "--duration")
     parser.set_defaults(run=run)
 
 
@@ -91,21 +88,18 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from canprobe.scene.model import BridgeSettings
 
     scene = load_scene(args.what)
-    target = target_of(args, scene)
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
+    scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
     live = args.html is None
     folder = api.results_folder(scene, args.out)
     api.run(
-        replace(scene, bridge=settings),
-        interface=target.interface,
-        channel=target.channel,
-        bitrate=target.bitrate,
+        scene,
         out=folder,
         seed=args.seed,
         duration_s=args.duration,
         force=args.force,
         bridge=("view",) if live else (),
-        observers=[_paced()] if live and target.interface == "lockstep" else [],
+        observers=[_paced()] if live and scene.bus.interface == "lockstep" else [],
         say=browser.say,
     )
     return folder

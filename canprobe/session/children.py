@@ -22,12 +22,14 @@ from numpy.typing import NDArray
 
 from canprobe.bus.disk import write_text
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame
+from canprobe.cell.controller import Controller
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import HEARTBEAT_BASE
 from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
+from canprobe.tasks.untouched import HoldTask
 
 # The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out.
 
@@ -237,12 +239,20 @@ class Bridges:
     ) -> None:
         self.end(None)
 
-    @property
-    def requests(self) -> tuple[Any, ...]:
-        """Where requests of other tools arrive; empty where none are allowed."""
+    def open_to_requests(self, task: Controller | None, make: Callable[[], Controller] | None = None) -> Controller:
+        """The task, which other tools may start, stop and set where the scene allows that.
+
+        Args:
+            task: None holds the arm still.
+            make: makes a new task at every start; None where the task runs once, from the beginning.
+        """
         settings = self._plan.scene.bridge
-        allowed = settings is not None and settings.ros2_commands
-        return tuple(bridge.requests for bridge in self.observers) if allowed else ()
+        if settings is None or not settings.ros2_commands or not self.observers:
+            return task if task is not None else HoldTask()
+        from canprobe.tasks.from_plan import RequestedTask
+
+        requests = tuple(bridge.requests for bridge in self.observers)
+        return RequestedTask(task, make, requests, self._plan.sync.period_ns * 1e-9)
 
     def status(self) -> dict[str, dict[str, Any]] | None:
         """What stands in the summary of each bridge; None without any."""

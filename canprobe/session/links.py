@@ -19,6 +19,7 @@ from canprobe.bus.link import (
 )
 from canprobe.errors import BusError, InterfaceError
 from canprobe.planning.model import Plan
+from canprobe.scene.model import BusSettings
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
@@ -125,16 +126,20 @@ class Expected:
     of_scene: bool = True
 
 
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Bit rate of the data phase of CAN FD frames; None where only classical frames are sent."""
+    return bus.data_bitrate if bus.fd is True else None
+
+
 def expected_of(plan: Plan) -> dict[str, Expected]:
     """What a plan wants of each of its channels.
 
     After a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO.
     """
     bus = plan.setup.bus
-    fast = bus.data_bitrate if bus.fd is True else None
     rpdos = {(pdo.channel, pdo.cob_id) for pdo in plan.pdos if pdo.direction == "rpdo"}
     numbers = {one.channel: sum(channel == one.channel for channel, _ in rpdos) for one in plan.buses}
-    return {channel: Expected(bus.bitrate, fast, 2 * (number + 2)) for channel, number in numbers.items()}
+    return {channel: Expected(bus.bitrate, data_bitrate(bus), 2 * (number + 2)) for channel, number in numbers.items()}
 
 
 def check_link(link: LinkState, expected: Expected) -> list[Remark]:

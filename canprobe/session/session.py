@@ -6,7 +6,6 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -35,10 +34,11 @@ from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene.load import dump_scene
-from canprobe.scene.model import BridgeSettings, BusSettings, Scene
+from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
-from canprobe.session.links import check_links, expected_of, need_controllers
+from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
+from canprobe.session.target import LOCKSTEP, Target
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
@@ -81,11 +81,6 @@ class TrafficCounter:
         """Count one frame and pass it on."""
         self._by_length[len(data)] += 1
         self._write(can_id, data, t_ns)
-
-
-def data_bitrate(bus: BusSettings) -> int | None:
-    """Of CAN FD frames, None where the scene has none."""
-    return bus.data_bitrate if bus.fd is True else None
 
 
 @contextmanager
@@ -144,7 +139,6 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
 # A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
 
 Array = NDArray[np.float64]
-LOCKSTEP = "lockstep"
 LEFT_BY_RUNS = (
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
     *("surface.png", "tool.toml", "truth.npz"),
@@ -161,26 +155,22 @@ def quiet(_: str) -> None:
 
 def resolve_scene(
     scene: Scene,
+    target: Target | None = None,
     *,
-    interface: str | None = None,
-    channel: str | None = None,
-    bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
-    sensor_channel: str | None = None,
     bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added.
+    """The scene on another bus, and with what the caller put in the place of its own values; bridges are added.
 
     Raises:
         UsageError: this is no scene, or a value is none that its file could have.
     """
     need_scene(scene)
-    bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
     info = with_values(scene.scene, seed=seed)
     task = with_values(scene.task, duration_s=duration_s)
-    sensor = scene.sensor if scene.sensor is None else with_values(scene.sensor, channel=sensor_channel)
-    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+    scene = replace(scene, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+    return scene if target is None else target.applied_to(scene)
 
 
 def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
@@ -191,16 +181,6 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
     check_bridges(names)
     known = settings or BridgeSettings()
     return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
-
-
-def hush_canopen() -> None:
-    """Keep canopen's warnings off a terminal that asked for no log: errors are raised and said once, by us.
-
-    Where somebody has set up logging, nothing changes.
-    """
-    logger = logging.getLogger("canopen")
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())
 
 
 class Session:
@@ -284,7 +264,6 @@ class Session:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
         self._entered = True
         self.started_ns = elapsed_ns()
-        hush_canopen()
         for warning in self.plan.warnings:
             self._say(f"warning: {warning}")
         try:
