@@ -1,4 +1,4 @@
-"""The CAN controllers on one timed bus: who has to wait, who is cut off, and when he comes back."""
+"""The CAN controllers on one timed bus: which have to wait, which are bus off, and when they come back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from canprobe.bus.lockstep import BusNode, LockstepPort
 from canprobe.bus.port import ControllerState
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
 
-# Error counters of one CAN controller: error active, error passive, bus off, and the way back.
+# Error counters of one controller: error active, error passive, bus off, and the way back.
 #
 # Source: ISO 11898-1:2015, fault confinement: rules for the transmit and the receive error counter.
 
@@ -87,7 +87,7 @@ class ErrorCounters:
         return True
 
 
-# The CAN controllers on one timed bus: who has to wait, who is cut off, and when he comes back.
+# All controllers of a bus.
 
 _RECESSIVE_BITS = 11
 _AFTER_ACK_BITS = (

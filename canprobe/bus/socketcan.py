@@ -25,7 +25,6 @@ from canprobe.bus.link import TX_QUEUE, drop_queued, emptying_line, ip_line, set
 from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
 from canprobe.bus.port import (
     ERR_FLAG,
-    CanFilter,
     Clock,
     ControllerState,
     PortCounters,
@@ -68,7 +67,6 @@ class SocketCanPort:
     Args:
         channel: the interface, such as `can0`.
         clock: a clock that shows CLOCK_MONOTONIC.
-        filters: what the kernel lets in; everything by default.
         batched: use recvmmsg and sendmmsg where they exist.
         bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
         data_bitrate: send and receive CAN FD frames too; None: classical frames only.
@@ -89,7 +87,6 @@ class SocketCanPort:
         channel: str,
         clock: Clock,
         *,
-        filters: Sequence[CanFilter] | None = None,
         batched: bool = True,
         bitrate: int = 1_000_000,
         data_bitrate: int | None = None,
@@ -107,10 +104,9 @@ class SocketCanPort:
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
-        self._socket = _open(channel, filters, fd=fd)
+        self._socket = _open(channel, fd=fd)
         self._frames = frame_socket(self._socket, batched, fd)
         self._batched = batched
-        self._filtered = filters is not None
         self._patient: socket.socket | None = None
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
@@ -194,18 +190,15 @@ class SocketCanPort:
         for each. They keep their place by their time of arrival. At a change of the identifiers a frame may come twice.
 
         Raises:
-            InterfaceError: this port was opened with filters of its own, or the interface is lost.
+            InterfaceError: the interface is lost.
         """
-        if self._filtered:
-            raise InterfaceError(f"{self.channel}: a port with filters cannot defer frames")
         self._check_open()
         mask = 0x7FF | EFF_FLAG | RTR_FLAG
         if self._patient is not None:
             self._patient.close()
             self._patient = self._patient_frames = None
         if can_ids:
-            filters = [(can_id, mask) for can_id in can_ids]
-            self._patient = _open(self.channel, filters, errors=False, fd=self._fd)
+            self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], fd=self._fd)
             self._patient_frames = frame_socket(self._patient, self._batched, self._fd)
         try:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
@@ -375,15 +368,16 @@ def _how_to_make(channel: str) -> str:
     return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
 
 
-def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True, fd: bool = False) -> socket.socket:
+def _open(channel: str, only: Sequence[tuple[int, int]] | None = None, *, fd: bool) -> socket.socket:
+    """A raw socket for all frames and error frames, or only for those with `can_id & mask == id & mask`: (id, mask)."""
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
         sock.setblocking(False)
         if fd:
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, struct.pack("=i", 1))
-        if filters is not None:
-            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(filters))
-        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if errors else 0))
+        if only is not None:
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(only))
+        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if only is None else 0))
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         _enlarge_buffer(sock)
@@ -394,7 +388,7 @@ def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = T
     return sock
 
 
-def _packed(filters: Sequence[CanFilter]) -> bytes:
+def _packed(filters: Sequence[tuple[int, int]]) -> bytes:
     return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
 
 

@@ -1,4 +1,4 @@
-"""What only a real SocketCAN interface shows: filters, overruns, error frames, a full queue, a link that goes down."""
+"""What only a real SocketCAN interface shows: overruns, error frames, a full queue, a link that goes down."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from canprobe.bus.port import ERR_FLAG, ControllerState, MonotonicClock, Reports
 from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import InterfaceError
 from canprobe.protocol.frames import EFF_FLAG, Frame
-from canprobe.vcan.guest_setup import make_link, remove_link, set_link
+from canprobe.vcan.guest_setup import make_link, set_link
 
 pytestmark = pytest.mark.vcan
 
@@ -40,7 +40,7 @@ def link() -> Iterator[str]:
         pytest.skip("making a link needs CAP_NET_ADMIN")
     set_link("vcan7", up=True)
     yield "vcan7"
-    remove_link("vcan7")
+    subprocess.run(["ip", "link", "delete", "vcan7"], check=True)
 
 
 def receive(port: SocketCanPort | PythonCanPort, count: int) -> list[TimedFrame]:
@@ -69,19 +69,6 @@ def test_deferred_frames_wake_nobody_and_come_in_their_place(vcan0: str, batched
     sender.close()
     with pytest.raises(InterfaceError, match="closed"):
         ours.defer({0x201})
-
-
-def test_the_kernel_filters(vcan0: str) -> None:
-    clock = MonotonicClock()
-    filters = [(0x180, 0x7F0), (0x700, 0x780)]
-    sender, ours = SocketCanPort(vcan0, clock), SocketCanPort(vcan0, clock, filters=filters)
-    theirs = PythonCanPort("socketcan", vcan0, 1_000_000, clock, filters=filters)
-    sender.send_batch([(can_id, b"") for can_id in (0x080, 0x181, 0x191, 0x18F, 0x77F, 0x7FF, 0x701)])
-    expected = [0x181, 0x18F, 0x77F, 0x701]
-    assert [i for i, _, _ in receive(ours, 4)] == expected
-    assert [i for i, _, _ in receive(theirs, 4)] == expected
-    for port in (sender, ours, theirs):
-        port.close()
 
 
 def test_dropped_frames_are_counted(vcan0: str, batched: bool) -> None:
