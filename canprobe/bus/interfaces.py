@@ -10,6 +10,7 @@ from typing import Any
 
 import can
 
+from canprobe.bus.mmsg import HAS_BATCHES
 from canprobe.bus.port import (
     ERR_BUS,
     ERR_FLAG,
@@ -53,7 +54,7 @@ def open_port(
         UsageError: there is no interface of that name.
         InterfaceError: it is missing, down, or cannot be opened; with what to do.
     """
-    if interface == "socketcan":
+    if interface == "socketcan" and HAS_BATCHES:  # else python-can's
         from canprobe.bus.socketcan import SocketCanPort
 
         return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)

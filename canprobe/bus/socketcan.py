@@ -22,7 +22,7 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
-from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
+from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.bus.port import (
     ERR_FLAG,
     Clock,
@@ -67,7 +67,6 @@ class SocketCanPort:
     Args:
         channel: the interface, such as `can0`.
         clock: a clock that shows CLOCK_MONOTONIC.
-        batched: use recvmmsg and sendmmsg where they exist.
         bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
         data_bitrate: send and receive CAN FD frames too; None: classical frames only.
         waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
@@ -87,7 +86,6 @@ class SocketCanPort:
         channel: str,
         clock: Clock,
         *,
-        batched: bool = True,
         bitrate: int = 1_000_000,
         data_bitrate: int | None = None,
         waits: bool = False,
@@ -105,8 +103,7 @@ class SocketCanPort:
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
         self._socket = _open(channel, fd=fd)
-        self._frames = frame_socket(self._socket, batched, fd)
-        self._batched = batched
+        self._frames = FrameSocket(self._socket, fd)
         self._patient: socket.socket | None = None
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
@@ -199,7 +196,7 @@ class SocketCanPort:
             self._patient = self._patient_frames = None
         if can_ids:
             self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], fd=self._fd)
-            self._patient_frames = frame_socket(self._patient, self._batched, self._fd)
+            self._patient_frames = FrameSocket(self._patient, self._fd)
         try:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
             others = [(can_id | _CAN_INV_FILTER, mask) for can_id in can_ids] or [(0, 0)]
