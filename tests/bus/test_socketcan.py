@@ -150,16 +150,21 @@ class FullQueue:
         return len(frames[:2])
 
 
-def test_a_full_queue_is_waited_for_then_an_error(vcan0: str) -> None:
+def test_a_full_queue_is_waited_for_then_an_error(vcan0: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = FullQueue(3)
+    monkeypatch.setattr("canprobe.bus.socketcan.FrameSocket", lambda *_: queue)
     port = SocketCanPort(vcan0, MonotonicClock())
     batch = [(0x100 + k, b"") for k in range(5)]
-    port._frames = queue = FullQueue(3)
     port.send_batch(batch)
     assert (queue.taken, port.counters.transmit_full, port.counters.sent) == (batch, 3, 5)
     port.close()
 
 
-def test_what_stays_full_is_named_and_a_longer_queue_advised_where_it_is_short(link: str) -> None:
+def test_what_stays_full_is_named_and_a_longer_queue_advised_where_it_is_short(
+    link: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    full = FullQueue(10**6)
+    monkeypatch.setattr("canprobe.bus.socketcan.FrameSocket", lambda *_: full)
     port = SocketCanPort(link, MonotonicClock())
     why = "stays full, as nobody acknowledges or the bus is overloaded, 5 frames not sent"
     queue, buffer = f"vcan7: the transmit queue {why}", f"vcan7: the socket's send buffer {why}"
@@ -171,7 +176,7 @@ def test_what_stays_full_is_named_and_a_longer_queue_advised_where_it_is_short(l
         (1000, errno.EAGAIN, buffer),
     ):
         subprocess.run(["ip", "link", "set", link, "txqueuelen", str(length)], check=True)
-        port._frames = FullQueue(10**6, number)
+        full.number = number
         with pytest.raises(InterfaceError) as caught:
             port.send_batch([(0x100 + k, b"") for k in range(5)])
         assert str(caught.value) == told
