@@ -1,7 +1,7 @@
 """The command line: parse, call, print. One module a command, imported only when it is used.
 
-A command module has `add_parser(commands)`, which adds its parser and sets `run=run`, and `run(args) -> int`. What it
-needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
+A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
+in its help. What it needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
 """
 
 from __future__ import annotations
@@ -122,7 +122,10 @@ def parser_of(arguments: Sequence[str]) -> Parser:
         parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for name in (named,) if named else COMMANDS:
-        importlib.import_module(f"canprobe.cli.{name}").add_parser(commands)
+        command = importlib.import_module(f"canprobe.cli.{name}")
+        one = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=command.EXAMPLE)
+        one.set_defaults(run=command.run)
+        command.add_arguments(one)
     return parser
 
 

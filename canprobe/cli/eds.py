@@ -6,13 +6,14 @@ import argparse
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_options, whole
+from canprobe.cli.parser import Parser, add_options, whole
 
 if TYPE_CHECKING:
     from canprobe.eds.reading import Reading
     from canprobe.eds.sections import Fault
 
-_EXAMPLE = """\
+HELP = "list, locate or check EDS files"
+EXAMPLE = """\
 examples:
   canprobe eds list
   canprobe eds path puma260_joint
@@ -30,9 +31,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("eds", help="list, locate or check EDS files", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     listing = actions.add_parser(
         "list",

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING
 from canprobe.cli.output import left_by_ctrl_c, say
 from canprobe.cli.parser import (
     BUS,
-    Commands,
     Parser,
     add_options,
     add_scene,
@@ -33,7 +32,8 @@ if TYPE_CHECKING:
     from canprobe.scene.model import Scene
     from canprobe.session.target import Target
 
-_EXAMPLE = """\
+HELP = "serve emulated nodes on a bus"
+EXAMPLE = """\
 examples:
   canprobe emulate cylinder --channel vcan0
   canprobe emulate cylinder --channel vcan0 --nodes 1-6
@@ -46,9 +46,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("emulate", help="serve emulated nodes on a bus", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser, optional=True)
     add_options(parser, *BUS, "--realtime", "--seed")
     parser.add_argument(
@@ -96,7 +95,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

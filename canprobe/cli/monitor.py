@@ -10,9 +10,10 @@ import sys
 
 from canprobe.bus.scheduling import Terminated
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import BUS, Commands, Parser, add_options, add_scene, seconds, target_of
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, seconds, target_of
 
-_EXAMPLE = """\
+HELP = "watch a running cell"
+EXAMPLE = """\
 examples:
   canprobe monitor cylinder --bus socketcan --channel can0
   canprobe monitor cylinder --bus socketcan --channel can0 --duration 2 --json
@@ -20,16 +21,14 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("monitor", help="watch a running cell", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS)
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
     )
     add_options(parser, "--json")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 # One clear line for a wrong command line.
 
-Commands = argparse._SubParsersAction
-
 
 class Parser(argparse.ArgumentParser):
     """An argument parser that keeps examples as written and complains in one line."""

@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_options, add_scene
+from canprobe.cli.parser import Parser, add_options, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
 
 if TYPE_CHECKING:
     from canprobe.planning.model import Plan
 
-_EXAMPLE = """\
+HELP = "show what a scene sends, needs and leaves out"
+EXAMPLE = """\
 files of --export:
   dcf      a device configuration file for each node
   dbc, kcd every frame with its signals (extra `can`)
@@ -34,11 +35,8 @@ examples:
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "plan", help="show what a scene sends, needs and leaves out", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
     parser.add_argument(
         "--measured", metavar="LOG", type=Path, help="compare a candump log or the folder of a run with the plan"
@@ -61,7 +59,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
     add_options(parser, "--json")
-    parser.set_defaults(run=run)
 
 
 def _draw(plan: Plan, path: Path) -> Path:

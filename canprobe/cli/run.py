@@ -10,10 +10,11 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import BUS, Commands, Parser, add_options, add_scene, scene_of
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
 from canprobe.errors import CanprobeError
 
-_EXAMPLE = """\
+HELP = "run a scene and write the results"
+EXAMPLE = """\
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
@@ -22,16 +23,14 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("run", help="run a scene and write the results", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS, "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
     parser.add_argument(
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
     add_options(parser, "--json")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

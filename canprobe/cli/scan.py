@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import (
     OPTIONS,
-    Commands,
     Parser,
     add_options,
     add_scene,
@@ -27,7 +26,8 @@ from canprobe.errors import UsageError
 if TYPE_CHECKING:
     from canprobe.cell.commission import Commissioned
 
-_EXAMPLE = """\
+HELP = "list the nodes on a bus"
+EXAMPLE = """\
 examples:
   canprobe scan --bus socketcan --channel can0
   canprobe scan --lss --channel can0                   # also the nodes without an id
@@ -40,9 +40,8 @@ _NUMBERS = 4
 Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("scan", help="list the nodes on a bus", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser, optional=True)
     parser.add_argument(
         "--bus",
@@ -64,7 +63,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
     add_options(parser, "--json")
-    parser.set_defaults(run=run)
 
 
 def assignment(text: str) -> Assignment:

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from canprobe.bus.scheduling import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
-from canprobe.cli.parser import Commands, Parser, add_options, did_you_mean, whole
+from canprobe.cli.parser import Parser, add_options, did_you_mean, whole
 
-_EXAMPLE = """\
+HELP = "measure accuracy, limits, faults and timing"
+EXAMPLE = """\
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
@@ -23,11 +24,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "study", help="measure accuracy, limits, faults and timing", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
     parser.add_argument("--list", action="store_true", help="list the studies, and end")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")
@@ -42,7 +40,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
     parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
     add_options(parser, "--json")
-    parser.set_defaults(run=run, complain=parser.error)
+    parser.set_defaults(complain=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:

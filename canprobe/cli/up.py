@@ -9,19 +9,19 @@ import argparse
 import sys
 
 from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import BUS, Commands, Parser, add_options, add_scene, scene_of
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
 from canprobe.errors import UsageError
 
-_EXAMPLE = """\
+HELP = "bring the cell up and hold it"
+EXAMPLE = """\
 examples:
   canprobe up free --bus socketcan --channel can0
   canprobe up free --bus socketcan --channel can0 --check-joints
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("up", help="bring the cell up and hold it", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
     add_options(parser, *BUS, "--realtime", "--patient", "--bridge")
     parser.add_argument(
@@ -30,7 +30,6 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="turn one joint after the other by 1 deg and back, compare the encoders, and end; asks before each motion",
     )
     parser.add_argument("--yes", action="store_true", help="with --check-joints: do not ask")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

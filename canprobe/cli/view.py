@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import BUS, Commands, Parser, add_options, target_of, whole
+from canprobe.cli.parser import BUS, Parser, add_options, target_of, whole
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
 
-_EXAMPLE = """\
+HELP = "show a scene or a run in a browser"
+EXAMPLE = """\
 examples:
   canprobe view cylinder
   canprobe view runs/cylinder-20260101-120000-000 --port 9000 --no-open
@@ -28,11 +29,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "view", help="show a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
     parser.add_argument(
         "--host",
@@ -47,7 +45,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
     of_scene = parser.add_argument_group("options of a SCENE")
     add_options(of_scene, *BUS, "--out", "--force", "--seed", "--duration")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
