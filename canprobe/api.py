@@ -82,14 +82,14 @@ def run(
         say: called with each step of bring-up and stop.
         files: False writes nothing.
         force: let the files replace those of an earlier run in ``out``; without, a folder that is not empty is refused.
-        observers: called after each cycle with what it saw, said and had on the bus (`Observation`).
+        observers: called after each cycle with its measurement, command and frames (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
-        ResultsError: a file could not be written, for want of room say. The drives are disabled.
+        ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
     target = Target.over(scene, interface, channel, bitrate, sensor_channel)
     resolved = resolve_scene(scene, target, seed=seed, duration_s=duration_s, bridge=bridge)
@@ -120,7 +120,7 @@ def check_free(folder: Path | None, *, force: bool) -> None:
     """Refuse a folder that holds anything: results never replace others unless that is wanted.
 
     Raises:
-        UsageError: it is not empty, and nobody said that this is well.
+        UsageError: it is not empty, and ``force`` is False.
     """
     if folder is not None and not force and folder.is_dir() and any(folder.iterdir()):
         raise UsageError(
@@ -136,7 +136,7 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
 
 
 def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
-    """What the estimator in the loop said, and the others on the same contacts."""
+    """The answers of the estimator in the loop, and of the others on the same contacts."""
     if tracker is None or scene.shape is None:
         return {}
     from canprobe.tasks.from_plan import estimates_of
@@ -147,7 +147,7 @@ def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[Sha
 def _mapped(
     scene: Scene, tracker: ShapeTracker | None, start_s: float
 ) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
-    """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
+    """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
     if tracker is None or scene.shape is None:
         return None, None, None
     from canprobe.results.scores import map_of_scan, summarise_map
@@ -302,9 +302,9 @@ class OpenCell(Session):
             unwritten = ResultsError("\n".join(self.unwritten))
             unwritten.summary = summary
             raise unwritten
-        for told in self.unwritten:  # what stopped the run counts for more
-            if failure is not None and told != str(failure):
-                failure.add_note(told)
+        for line in self.unwritten:  # what stopped the run comes first
+            if failure is not None and line != str(failure):
+                failure.add_note(line)
 
 
 def _reason(failure: BaseException) -> str:

@@ -153,7 +153,7 @@ def _format_id(can_id: int) -> str:
 
 
 def _opened_alone(path: str | Path) -> FileIO:
-    """An empty file to write to, which nobody else can open so before it is closed."""
+    """An empty file to write to, locked against other runs until it is closed."""
     file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -261,7 +261,7 @@ class RecordingPort:
         return frames
 
 
-# Files that are whole or not there, whatever stops the writing, and one way to say why one could not be written.
+# Files that are whole or not there, whatever stops the writing.
 
 _WRONG_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
 
@@ -277,8 +277,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
 
     Raises:
-        ResultsError: it cannot be written, for want of room say; an older one is as it was.
-        UsageError: it cannot be there: no such folder, or nobody may write there.
+        ResultsError: it cannot be written, for example on a full disk; an older one is as it was.
+        UsageError: it cannot be there: no such folder, or no permission to write.
     """
     whole = path.resolve()
     part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
@@ -304,7 +304,7 @@ def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str |
         part.write_text(text, encoding=encoding, newline=newline)
 
 
-# Columns in an ``.npz`` file: written, read, or told what is wrong with it.
+# Columns in an ``.npz`` file.
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:

@@ -127,7 +127,7 @@ class PythonCanPort:
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
-        state: the controller's state as the last error frame told, or python-can at that time.
+        state: the controller's state as of the last error frame.
 
     Raises:
         UsageError: python-can has no such interface.

@@ -292,7 +292,7 @@ SETTLE_S = 0.005
 """Several nodes may give the same answer to one question, one after another: so long the later ones are waited for."""
 ANSWER_S = 0.5
 SEARCH_S = 0.05
-"""How long nobody has to answer a question of fastscan before it is taken for a no."""
+"""Time without an answer after which a question of fastscan counts as answered with no."""
 
 
 class LssAnswerError(BusError):

@@ -199,7 +199,7 @@ TimedFrame = tuple[int, bytes, int]
 
 
 class ControllerState(IntEnum):
-    """Error state of the CAN controller, as far as error frames tell (ISO 11898-1 fault confinement)."""
+    """Error state of the CAN controller, as far as error frames show it (ISO 11898-1 fault confinement)."""
 
     ACTIVE = 0
     WARNING = 1
@@ -210,7 +210,7 @@ class ControllerState(IntEnum):
 def is_bus_error(can_id: int) -> bool:
     """Whether this is an error frame of a frame that went wrong: protocol, acknowledgement or bit error.
 
-    A lost arbitration, which some drivers report every time, and a change of the controller's state are none.
+    A lost arbitration, which some drivers report every time, and a change of the controller's state do not count.
     """
     return bool(can_id & ERR_FLAG and can_id & _BUS_ERRORS)
 
@@ -221,13 +221,13 @@ def state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerS
         return ControllerState.BUS_OFF
     if can_id & ERR_RESTARTED:
         return ControllerState.ACTIVE
-    for bits, told in (
+    for bits, reported in (
         (_PASSIVES, ControllerState.PASSIVE),
         (_WARNINGS, ControllerState.WARNING),
         (_ACTIVE, ControllerState.ACTIVE),
     ):
         if _of_controller(can_id, data) & bits:
-            return told
+            return reported
     return state
 
 
@@ -272,7 +272,7 @@ class Reports:
 
     Attributes:
         error_frame: called with (can_id, data, t_ns) of every error frame.
-        say: called with what the user has to know.
+        say: called with each message for the user.
     """
 
     error_frame: Callable[[int, bytes, int], None] = _nobody
@@ -299,7 +299,7 @@ class Port(Protocol):
 
     @property
     def state(self) -> ControllerState:
-        """The CAN controller's error state, as far as the port can tell."""
+        """The CAN controller's error state, as far as the port knows it."""
         ...
 
     @property
@@ -343,7 +343,7 @@ class Port(Protocol):
 # Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
 #
 # SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus. A bus that is lost
-# is told once; then the others go on without it, so that their nodes can be stopped in an orderly way.
+# is reported once; then the others go on without it, so that their nodes can be stopped in an orderly way.
 
 _SLICE_NS = 200_000
 """How long one bus is waited for before the others are looked at again."""
@@ -381,7 +381,7 @@ class JoinedPort:
         """Send each frame on the bus of its identifier, or on all.
 
         Raises:
-            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each bus is told
+            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each is reported
                 once, as long as there is another.
         """
 

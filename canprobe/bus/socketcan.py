@@ -55,7 +55,7 @@ _RECEIVE_BUFFER = 4 << 20
 _RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
 _PATIENCE_NS = 10_000_000
 _TELL_NS = 1_000_000_000
-"""A queue that has been full for so long is told to the user, where it is waited for."""
+"""A port that waits reports a queue that has been full for so long."""
 _STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
 """How long a port that closes waits for the next queued frame to leave, and for all of them."""
 _RECALIBRATE_NS = 1_000_000_000
@@ -74,7 +74,7 @@ class SocketCanPort:
 
     Attributes:
         counters: what has passed.
-        state: the controller's state as the last error frame told; ACTIVE before the first.
+        state: the controller's state as of the last error frame; ACTIVE before the first.
 
     Raises:
         InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to

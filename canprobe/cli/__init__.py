@@ -64,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
 
     Returns:
         The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away; 70 after
-        an error that nobody foresaw.
+        an unexpected error.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     _prepare_streams()

@@ -20,7 +20,7 @@ examples:
   canprobe eds check drive.eds
 """
 _CHECK = """\
-A fault means that the file does not say how the device answers: it cannot be served. A warning names what was corrected
+A fault means that the file leaves open how the device answers: it cannot be served. A warning names what was corrected
 or ignored.
 
 exit status: 0 without faults, 2 with faults

@@ -67,7 +67,7 @@ def _draw(plan: Plan, path: Path) -> Path:
     except ImportError as error:
         raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
     if not path.suffix:
-        path = path.with_suffix(".png")  # as matplotlib would do by itself, and tell nobody
+        path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:
         draw_plan(plan, path)
     except ValueError as error:  # matplotlib knows no such form

@@ -39,7 +39,7 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay the log and print what the estimators say."""
+    """Replay the log and print the estimates."""
     from canprobe.recorded import reestimate as recorded
 
     if args.bridge:
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_into(args: argparse.Namespace) -> int:
-    """Feed the log to bridges, and print what the estimators and the bridges say."""
+    """Feed the log to bridges; print the estimates and the state of the bridges."""
     from canprobe.recorded.into_bridges import replay_into
     from canprobe.results.summary import bridge_lines
 

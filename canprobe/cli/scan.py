@@ -1,7 +1,7 @@
 """List the nodes on a bus with their identities; with --lss also assign ids to nodes that have none.
 
 LSS (CiA 305) finds nodes without an id by vendor, product, revision and serial number (1018h). --assign gives an id to
-one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers say which device is which. A device
+one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers identify the devices. A device
 boots with its new id at once and keeps it, unless --no-store is given.
 """
 
@@ -78,7 +78,7 @@ def assignment(text: str) -> Assignment:
 def run(args: argparse.Namespace) -> int:
     """Print one row a node."""
     if args.bus == "lockstep":
-        raise UsageError("scan: a lockstep bus lives inside one run and has nobody on it; name a real interface")
+        raise UsageError("scan: a lockstep bus lives inside one run; name a real interface with --bus")
     _check(args)
 
     from canprobe import api

@@ -58,9 +58,9 @@ def run(args: argparse.Namespace) -> int:
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
     if args.vcan and args.name != "faults":
-        args.complain(f"--vcan: study {args.name} has no form of its own on vcan0; faults has")
+        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
     if args.vcan and args.seed is not None:
-        args.complain("--seed: the runs on vcan0 hang on the machine's own time too and cannot be told again")
+        args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.seed is not None:
         return _replay(args)
     from canprobe.studies.harness import as_document, text_of, write_study

@@ -40,7 +40,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("up: --check-joints feeds no --bridge")
     scene = scene_of(args)
     if args.check_joints and not args.yes and not sys.stdin.isatty():
-        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes asks nobody")
+        raise UsageError(
+            "up --check-joints asks before each motion and needs a terminal; --yes leaves the questions out"
+        )
 
     from canprobe import api
 

@@ -53,7 +53,9 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
-    with contextlib.nullcontext() if args.html is not None else left_by_ctrl_c():  # a page is left, a file is not
+    with (
+        contextlib.nullcontext() if args.html is not None else left_by_ctrl_c()
+    ):  # Ctrl-C is the normal end of a page, not of a file
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.browser import serve_run, write_page
@@ -103,11 +105,11 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
 
 
 class _Browser:
-    """Says where it is to be seen, and opens that in the user's browser, once.
+    """Prints the address of the page and opens it in the user's browser, once.
 
     Args:
         port: that was asked for.
-        quiet: only say it.
+        quiet: only print the address.
 
     Attributes:
         port: where it was last, so that a page that is open finds the next one there.
@@ -126,7 +128,7 @@ class _Browser:
             webbrowser.open(address)
 
     def say(self, line: str) -> None:
-        """A step of the run; the bridge's own is its address."""
+        """Report a step of the run; the bridge's step is its address."""
         where = line.removeprefix("bridge view: ")
         if where != line:
             self.show(where)

@@ -33,7 +33,7 @@ from canprobe.tasks.untouched import HoldTask
 
 # The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out.
 
-TOLD_EVERY_S = 10.0
+REPORT_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
@@ -41,7 +41,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent(parent: int) -> None:
-    """In the child: be told to stop when the parent is killed. Linux only, and only a second line of defence.
+    """In the child: get SIGTERM when the parent is killed. Linux only, and only a second line of defence.
 
     Args:
         parent: its process id; if it has gone already, this process stops at once.
@@ -55,7 +55,7 @@ def end_with_parent(parent: int) -> None:
 class EmulatorChild:
     """``canprobe emulate`` as a child process.
 
-    It gets a session of its own, so that Ctrl-C reaches only the master, which stops the drives before their process.
+    It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
 
     Args:
         scene: the resolved scene.
@@ -118,7 +118,7 @@ class EmulatorChild:
 
         Args:
             port: of the nodes' bus.
-            say: is told now and then how long it has taken.
+            say: called every 10 s with how long it has taken.
             hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
 
         Raises:
@@ -130,16 +130,16 @@ class EmulatorChild:
         clock = port.clock
         start = clock.now_ns()
         deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
-        tell = start + round(TOLD_EVERY_S * 1e9)
+        report = start + round(REPORT_EVERY_S * 1e9)
         while waiting:
             now = clock.now_ns()
             if self._process.poll() is not None:
                 raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
             if now >= deadline:
                 self._raise_late(min(waiting))
-            if now >= tell:
+            if now >= report:
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
-                tell += round(TOLD_EVERY_S * 1e9)
+                report += round(REPORT_EVERY_S * 1e9)
             port.wait(min(deadline, now + 50_000_000))
             frames = port.drain()
             hear(frames)

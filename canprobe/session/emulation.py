@@ -54,7 +54,7 @@ def emulate(
         UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `truth_path` or `store_folder` cannot be there; told before anything is served.
+        OSError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
     """
     from canprobe.emulator.world import make_world
     from canprobe.planning.make import make_plan
@@ -104,7 +104,7 @@ def emulate_eds(
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
-        say: called with what is odd about the files, and when the nodes are there.
+        say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
         EdsError: a file cannot be served; one line a fault.
@@ -112,7 +112,7 @@ def emulate_eds(
             not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `store_folder` cannot be there.
+        OSError: `store_folder` cannot be written.
     """
     from canprobe.eds.packaged import check_eds
     from canprobe.emulator.world import make_eds_node
@@ -128,7 +128,7 @@ def emulate_eds(
         nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
         if warnings := len(reading.warnings):
             check = f"canprobe eds check {name} --node-id {od.node_id}"
-            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` tells them")
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")
     _check_addresses(nodes)
     _make_places(None, store_folder)
     wanted, way_out = Expected(target.bitrate, of_scene=False), "end that node, or give another --node-id"
@@ -141,7 +141,7 @@ def emulate_eds(
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
-    """Where the files will go: what cannot be written at the end is told at the beginning."""
+    """Make the folders of the files, so that a place that cannot be written fails at the beginning."""
     if store_folder is not None:
         store_folder.mkdir(parents=True, exist_ok=True)
     if truth_path is not None:
@@ -178,7 +178,7 @@ def _free_port(
 
 
 def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
-    """Nodes without an id can only be told apart by their LSS addresses."""
+    """Nodes without an id differ only by their LSS addresses."""
     addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
     for address in addresses:
         if addresses.count(address) > 1:
@@ -215,7 +215,7 @@ def _named(nodes: Sequence[SlaveNode]) -> str:
 
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
-    """Let each node keep what a master stores by 1010h in a file of its own."""
+    """Let each node keep what a master stores by 1010h in its file."""
     from canprobe.emulator.serve import keep_in_file
 
     if folder is not None:
@@ -224,7 +224,7 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
 
 def _file_name(node: SlaveNode) -> str:
-    """By node id; one that has none yet is told by its serial number."""
+    """By node id, or by serial number where the node has no id yet."""
     if node.node_id != UNCONFIGURED:
         return f"node{node.node_id:03}.json"
     return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

@@ -1,4 +1,4 @@
-"""How the SocketCAN interfaces of a cell are set, before it is brought up: warnings are said, an error ends it."""
+"""How the SocketCAN interfaces of a cell are set, before it is brought up: warnings and errors."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from canprobe.bus.port import Port
 
 
-# SocketCAN interfaces and CAN controllers: what is wrong with them is said, or ends what was begun.
+# SocketCAN interfaces and CAN controllers: a wrong setting gives a warning or an error.
 
 SOCKETCAN = "socketcan"
 
@@ -52,8 +52,8 @@ def check_links(
     for channel, expected in channels.items():
         link = read_link(channel)
         if link is None:
-            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not tell it")
-        elif link.is_up:  # else it cannot be opened either, which is told with the line to type
+            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not show it")
+        elif link.is_up:  # else opening it fails, with the line to type
             for remark in check_link(link, expected):
                 if must and remark.is_error:
                     errors.append(f"{channel}: {remark.text}")
@@ -82,7 +82,7 @@ def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseExcep
     troubles: list[str] = []
     for channel, port in ports.items():
         link = (read_link(channel) if interface == SOCKETCAN else None) or LinkState(channel)
-        if link.state is None:  # a virtual one, another interface, or no `ip`: as the last error frame told
+        if link.state is None:  # a virtual one, another interface, or no `ip`: as of the last error frame
             state = port.state
             link = replace(link, state="BUS-OFF" if state is ControllerState.BUS_OFF else f"ERROR-{state.name}")
         if (trouble := controller_trouble(link, typed=interface == SOCKETCAN)) is not None:
@@ -210,7 +210,7 @@ def _state(link: LinkState, _: Expected) -> Iterator[Remark]:
 
 
 def _symptom(link: LinkState) -> str:
-    """By its counters; a driver that does not tell them leaves both open."""
+    """From its counters; a driver without them leaves both causes open."""
     sent, heard = link.tx_errors or 0, link.rx_errors or 0
     unheard = "nobody acknowledges what it sends: nodes without power, another bit rate, a broken wire"
     broken = "frames arrive broken: another bit rate or sample point somewhere, or the termination"

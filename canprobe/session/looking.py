@@ -30,7 +30,7 @@ def scan(target: Target, *, say: Say = quiet) -> list[dict[str, Any]]:
 
     Args:
         target: the bus.
-        say: called with what is wrong with the interface's setting.
+        say: called with each warning about the interface's setting.
 
     Raises:
         InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
@@ -57,7 +57,7 @@ def commission(
         scene: whose nodes get their ids, as far as EDS files and serial numbers show which device is which.
         assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
         store: let the devices keep their ids when their power goes.
-        say: called with what is wrong with the interface's setting.
+        say: called with each warning about the interface's setting.
 
     Raises:
         UsageError: the scene does not fit.
@@ -77,7 +77,7 @@ def commission(
 
 @contextlib.contextmanager
 def _open(target: Target, say: Say) -> Iterator[Port]:
-    """A port of a bus of which no scene says anything; a wrong setting is said, and the bus is opened all the same."""
+    """A port of a bus without a scene; a wrong setting is only a warning."""
     from canprobe.bus.interfaces import open_port
 
     interface, channel = target.interface, target.channel
@@ -98,7 +98,7 @@ def monitor(scene: Scene, *, duration_s: float | None = None, say: Say = quiet) 
     Args:
         scene: what is on the bus.
         duration_s: how long; for ever by default.
-        say: called with what is wrong with the interface's setting.
+        say: called with each warning about the interface's setting.
 
     Yields:
         What is known by then; the same object each time.

@@ -146,11 +146,11 @@ LEFT_BY_RUNS = (
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
-"""Is told each step, in words."""
+"""Called with a line of text for each step."""
 
 
 def quiet(_: str) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 def resolve_scene(
@@ -190,7 +190,7 @@ class Session:
         scene: what to bring up, resolved; or the plan of it.
         out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
         say: called with each step.
-        observers: called after each cycle with what it saw, said and had on the bus.
+        observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
@@ -314,10 +314,10 @@ class Session:
             self.wall_ns = elapsed_ns() - self.started_ns
             self._note_unwritten(self._log_failure())
 
-    def _note_unwritten(self, told: str | None) -> None:
-        if told is not None and self._cell is not None:
-            self.unwritten.append(told)
-            self._note(told)
+    def _note_unwritten(self, failure: str | None) -> None:
+        if failure is not None and self._cell is not None:
+            self.unwritten.append(failure)
+            self._note(failure)
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
@@ -342,7 +342,7 @@ class Session:
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
                 for name in LEFT_BY_RUNS:
                     (self.out / name).unlink(missing_ok=True)  # of an earlier run
-                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:

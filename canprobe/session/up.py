@@ -42,21 +42,21 @@ def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
     plan = make_plan(resolve(resolve_scene(scene, bridge=bridge)))
     with Bridges(plan, None, virtual=False, say=say) as bridges:
         session = Session(plan, None, say, bridges.observers, ROWS_OF_UP)
-        with saying_notes(session, say) as say_news:
+        with reporting_notes(session, say) as report_news:
             say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
-            session.run(bridges.open_to_requests(None, lambda: make_task(plan)), say_news)
+            session.run(bridges.open_to_requests(None, lambda: make_task(plan)), report_news)
 
 
 @contextlib.contextmanager
-def saying_notes(session: Session, say: Say) -> Iterator[Callable[[Measurement], None]]:
-    """Open the session; when it is over, say what went wrong in it without ending it, each kind counted.
+def reporting_notes(session: Session, say: Say) -> Iterator[Callable[[Measurement], None]]:
+    """Open the session; at its end report the faults that did not stop it, each kind with its number.
 
     Yields:
-        A function to be called after each cycle, which says each kind once when it is new.
+        A function to be called after each cycle, which reports each kind when it is new.
     """
     said = 0
 
-    def say_news(_: Measurement) -> None:
+    def report_news(_: Measurement) -> None:
         nonlocal said
         notes = session.cell.notes
         if len(notes) > said:
@@ -66,7 +66,7 @@ def saying_notes(session: Session, say: Say) -> Iterator[Callable[[Measurement],
 
     try:
         with session:
-            yield say_news
+            yield report_news
     finally:
         for line in session.cell.faults if session.started else ():
             say(f"noted: {line}")
@@ -80,7 +80,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
 
     Args:
         scene: with an arm.
-        operator: asked before and after each motion; None asks nobody.
+        operator: asked before and after each motion; None leaves the questions out.
         say: called with each step and each finding.
 
     Returns:
