@@ -40,9 +40,7 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("up: --check-joints feeds no --bridge")
     scene = scene_of(args)
     if args.check_joints and not args.yes and not sys.stdin.isatty():
-        raise UsageError(
-            "up --check-joints asks before each motion and needs a terminal; --yes leaves the questions out"
-        )
+        raise UsageError("up --check-joints asks before each motion and needs a terminal; --yes leaves that out")
 
     from canprobe import api
 

@@ -53,9 +53,8 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
-    with (
-        contextlib.nullcontext() if args.html is not None else left_by_ctrl_c()
-    ):  # Ctrl-C is the normal end of a page, not of a file
+    leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
+    with leave:
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.browser import serve_run, write_page

@@ -157,7 +157,7 @@ def test_a_scene_without_an_arm_is_refused():
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        (("--check-joints",), "needs a terminal; --yes leaves the questions out"),
+        (("--check-joints",), "needs a terminal; --yes leaves that out"),
         (("--yes",), "--yes goes with --check-joints"),
         (("--check-joints", "--yes", "--bridge", "mcap"), "--check-joints feeds no --bridge"),
     ],
