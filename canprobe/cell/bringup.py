@@ -21,8 +21,15 @@ from typing import Any
 from canopen.objectdictionary import ODVariable
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.network import UPLOAD_DEVICE_TYPE, PumpedNetwork
-from canprobe.bus.sdo_client import SdoTimeoutError, download, hold_dialogues, read_value, upload
+from canprobe.bus.network import (
+    UPLOAD_DEVICE_TYPE,
+    PumpedNetwork,
+    SdoTimeoutError,
+    download,
+    hold_dialogues,
+    read_value,
+    upload,
+)
 from canprobe.cell.configuration import NodeSetup, Write
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
@@ -169,8 +176,8 @@ class BringUp:
         answers: list[bytes] = []
         cob_id = SDO_TX_BASE + setup.node_id
 
-        def take(_id: int, data: bytearray, _t_s: float) -> None:
-            answers.append(bytes(data))
+        def take(_id: int, data: bytes, _t_ns: int) -> None:
+            answers.append(data)
 
         self._network.subscribe(cob_id, take)
         try:

@@ -100,9 +100,9 @@ class Cell:
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
-        for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
+        for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
-                self._network.subscribe(base + node_id, self._watched)
+                self._network.subscribe(base + node_id, self.watch.push)
 
     @property
     def start_ns(self) -> int:
@@ -126,11 +126,8 @@ class Cell:
         except Exception as error:
             self.notes.add(f"steps could not be reported: {type(error).__name__}")
 
-    def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
-        self.watch.push(can_id, bytes(data), round(t_s * 1e9))
-
     def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """A frame that arrived during an SDO transfer and is not canopen's."""
+        """A frame that arrived during bring-up and that nobody subscribed to."""
         if self.tactile is not None and can_id in self.tactile.cob_ids:
             self.tactile.push(can_id, data, t_ns)
         else:

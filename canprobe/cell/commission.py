@@ -6,15 +6,13 @@ it is an error. Source: CiA 305, by canopen's LSS client.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from canopen import ObjectDictionary
-from canopen.lss import ERROR_STORE_NOT_SUPPORTED, LssError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.network import PumpedNetwork, PumpedNode, answering_nodes
+from canprobe.bus.network import Lss, LssAnswerError, PumpedNetwork, answering_nodes, hold_dialogues, upload
 from canprobe.bus.port import Port
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.model import Plan
@@ -119,7 +117,13 @@ def _choose(
     return fits[0] if fits else None
 
 
-# Find devices without an id and give one, over the bus.
+def _spelled(want: Wanted) -> str:
+    return ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
+
+
+# Ask nodes for their ids and tell them new ones over the bus.
+#
+# Source: CiA 305.
 
 BOOT_UP_S = 2.0
 MOST_NODES = 127
@@ -149,15 +153,14 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
         BusError: two devices have one address, or answers do not agree.
         InterfaceError: the interface failed.
     """
-    lss: Any = network.lss  # canopen has no types here
-    lss.send_switch_state_global(lss.WAITING_STATE)
+    lss = Lss(network)
+    lss.release()
     found: list[LssAddress] = []
     try:
         for _ in range(MOST_NODES):
-            is_there, numbers = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
-            if not is_there or numbers is None:
+            address = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
+            if address is None:
                 return found
-            address = LssAddress(*numbers)
             if address in found:
                 raise FoundTwiceError(network.port.channel, [*(one for one in found if one != address), address])
             found.append(address)
@@ -167,10 +170,8 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
                     " (vendor:product:revision:serial); connect them one at a time"
                 )
         return found
-    except LssError as error:
-        raise BusError(f"{network.port.channel}: {error}") from error
     finally:
-        lss.send_switch_state_global(lss.WAITING_STATE)
+        lss.release()
 
 
 def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True) -> bool:
@@ -188,42 +189,31 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         NodeError: the device does not answer, refuses, or does not boot with its new id.
         InterfaceError: the interface failed.
     """
-    lss: Any = network.lss
-    node_id = assignment.node_id
-    booted: list[bytes] = []
-    take = lambda can_id, data, t_s: booted.append(bytes(data)) if bytes(data) == b"\0" else None  # noqa: E731
+    lss, node_id, address = Lss(network), assignment.node_id, assignment.address
+    booted: list[int] = []
+
+    def take(_id: int, data: bytes, t_ns: int) -> None:
+        if data == b"\0":
+            booted.append(t_ns)
+
     network.subscribe(HEARTBEAT_BASE + node_id, take)
     try:
-        kept = _configure(lss, assignment, store)
-        lss.send_switch_state_global(lss.WAITING_STATE)
+        lss.release()
+        if not lss.select(address):
+            raise LssAnswerError("no answer to switch state selective")
+        lss.configure_node_id(node_id)
+        kept = store and lss.store()
+        lss.release()
         if assignment.before is not None:
             network.port.send_batch([pack_nmt(NmtCommand.RESET_COMMUNICATION, assignment.before)])
         if not network.pump_until(lambda: bool(booted), BOOT_UP_S):
-            raise NodeError(
-                node_id, f"the device {assignment.address} took the id but sent no boot-up within {BOOT_UP_S:g} s"
-            )
+            raise NodeError(node_id, f"the device {address} took the id but sent no boot-up within {BOOT_UP_S:g} s")
         return kept
-    except LssError as error:
-        lss.send_switch_state_global(lss.WAITING_STATE)
-        raise NodeError(node_id, f"the device {assignment.address} did not take the id: {error}") from error
+    except LssAnswerError as error:
+        lss.release()
+        raise NodeError(node_id, f"the device {address} did not take the id: {error}") from error
     finally:
         network.unsubscribe(HEARTBEAT_BASE + node_id, take)
-
-
-def _configure(lss: Any, assignment: Assignment, store: bool) -> bool:
-    lss.send_switch_state_global(lss.WAITING_STATE)
-    if not lss.send_switch_state_selective(*assignment.address.numbers):
-        raise LssError("no answer to switch state selective")
-    lss.configure_node_id(assignment.node_id)
-    if not store:
-        return False
-    try:
-        lss.store_configuration()
-    except LssError as error:
-        if str(error) != f"LSS Error: {ERROR_STORE_NOT_SUPPORTED}":
-            raise LssError(f"it could not store it: {error}") from error
-        return False
-    return True
 
 
 # List the nodes on a bus with their identity, without knowing any of them.
@@ -242,28 +232,30 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
         InterfaceError: the interface failed.
     """
     network = PumpedNetwork(port)
-    nodes = []
+    nodes: list[dict[str, Any]] = []
     for node_id in answering_nodes(port, range(1, 128), timeout_s):
-        node = network.add_node(node_id, ObjectDictionary())  # type: ignore[no-untyped-call]
-        node.sdo.RESPONSE_TIMEOUT = timeout_s
-        found: dict[str, Any] = {"node_id": node_id}
-        for name, subindex in NUMBERS.items():
-            number = _upload(node, 0x1018, subindex)
-            found[name] = None if number is None else int.from_bytes(number[:4], "little")
-        text = _upload(node, 0x1008, 0)
-        found["device_name"] = None if text is None else text.decode("ascii", errors="replace").rstrip("\0")
-        nodes.append(found)
+        nodes.append({"node_id": node_id})
+        hold_dialogues(network, {node_id: _identify(nodes[-1])}, timeout_s=timeout_s)
     return nodes
 
 
-def _upload(node: PumpedNode, index: int, subindex: int) -> bytes | None:
+def _identify(node: dict[str, Any]) -> Generator[bytes | None, bytes, None]:
+    """Ask one node what it is; each answer goes into ``node``."""
+    for name, subindex in NUMBERS.items():
+        data = yield from _upload(0x1018, subindex)
+        node[name] = None if data is None else int.from_bytes(data[:4], "little")
+    data = yield from _upload(0x1008, 0)
+    node["device_name"] = None if data is None else data.decode("ascii", errors="replace").rstrip("\0")
+
+
+def _upload(index: int, subindex: int) -> Generator[bytes | None, bytes, bytes | None]:
     try:
-        return bytes(node.sdo.upload(index, subindex))
+        return (yield from upload(index, subindex))
     except (SdoAbortedError, SdoCommunicationError):
         return None
 
 
-# All of it.
+# What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again.
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,8 @@ from canprobe.results.summary import check_clock
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
-from canprobe.session.session import LOCKSTEP, Say
+from canprobe.session.session import Say
+from canprobe.session.target import LOCKSTEP
 from canprobe.touch.estimate.answer import SurfaceEstimate
 
 LOGGED = ("phase", "depth_at_1n_mm")

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_log
+from canprobe.bus.disk import read_candump
 from canprobe.bus.port import TimedFrame, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
@@ -104,7 +104,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     channels: dict[str, _Channel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
-    for t_ns, on, can_id, data in read_log(path):
+    for t_ns, on, can_id, data in read_candump(path):
         if on in others and can_id == SYNC_ID:
             continue  # the cell has one SYNC, which goes to all its buses
         name = main if on in others else on

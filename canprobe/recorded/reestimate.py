@@ -21,7 +21,7 @@ from canprobe.results.summary import curvature_text, finite_or_none, shape_lines
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import LOCKSTEP
+from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.from_plan import estimates_of
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.touch.consistency import check_consistency

@@ -26,7 +26,8 @@ from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibrati
 from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import LOCKSTEP, Session
+from canprobe.session.session import Session
+from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.tasks.task import TaskRecord
 from canprobe.tasks.touch import losses_text, summarise_losses

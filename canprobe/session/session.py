@@ -6,7 +6,6 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -34,10 +33,11 @@ from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene.load import dump_scene
-from canprobe.scene.model import BridgeSettings, BusSettings, Scene
+from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
-from canprobe.session.links import check_links, expected_of, need_controllers
+from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
+from canprobe.session.target import LOCKSTEP, Target
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
@@ -80,11 +80,6 @@ class TrafficCounter:
         """Count one frame and pass it on."""
         self._by_length[len(data)] += 1
         self._write(can_id, data, t_ns)
-
-
-def data_bitrate(bus: BusSettings) -> int | None:
-    """Of CAN FD frames, None where the scene has none."""
-    return bus.data_bitrate if bus.fd is True else None
 
 
 @contextmanager
@@ -140,53 +135,41 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
     return timed
 
 
-class Sink:
-    """What a RecordingPort writes to."""
-
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
-        self.write = write
-
-
 # A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
 
 Array = NDArray[np.float64]
-LOCKSTEP = "lockstep"
 LEFT_BY_RUNS = (
-    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
     *("surface.png", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
-"""Is told each step, in words."""
+"""Called with a line of text for each step."""
 
 
 def quiet(_: str) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 def resolve_scene(
     scene: Scene,
+    target: Target | None = None,
     *,
-    interface: str | None = None,
-    channel: str | None = None,
-    bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
-    sensor_channel: str | None = None,
     bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added.
+    """The scene on another bus, and with what the caller put in the place of its own values; bridges are added.
 
     Raises:
         UsageError: this is no scene, or a value is none that its file could have.
     """
     need_scene(scene)
-    bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
     info = with_values(scene.scene, seed=seed)
     task = with_values(scene.task, duration_s=duration_s)
-    sensor = scene.sensor if scene.sensor is None else with_values(scene.sensor, channel=sensor_channel)
-    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+    scene = replace(scene, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+    return scene if target is None else target.applied_to(scene)
 
 
 def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
@@ -199,16 +182,6 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
     return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
-def hush_canopen() -> None:
-    """Keep canopen's warnings off a terminal that asked for no log: errors are raised and said once, by us.
-
-    Where somebody has set up logging, nothing changes.
-    """
-    logger = logging.getLogger("canopen")
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())
-
-
 class Session:
     """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
 
@@ -216,7 +189,7 @@ class Session:
         scene: what to bring up, resolved; or the plan of it.
         out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
         say: called with each step.
-        observers: called after each cycle with what it saw, said and had on the bus.
+        observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
@@ -290,7 +263,6 @@ class Session:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
         self._entered = True
         self.started_ns = elapsed_ns()
-        hush_canopen()
         for warning in self.plan.warnings:
             self._say(f"warning: {warning}")
         try:
@@ -341,10 +313,10 @@ class Session:
             self.wall_ns = elapsed_ns() - self.started_ns
             self._note_unwritten(self._log_failure())
 
-    def _note_unwritten(self, told: str | None) -> None:
-        if told is not None and self._cell is not None:
-            self.unwritten.append(told)
-            self._note(told)
+    def _note_unwritten(self, failure: str | None) -> None:
+        if failure is not None and self._cell is not None:
+            self.unwritten.append(failure)
+            self._note(failure)
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
@@ -369,7 +341,7 @@ class Session:
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
                 for name in LEFT_BY_RUNS:
                     (self.out / name).unlink(missing_ok=True)  # of an earlier run
-                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
@@ -458,7 +430,7 @@ class Session:
         real = self._ports = self._stack.enter_context(
             open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
         )
-        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, self._writer(name)) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""

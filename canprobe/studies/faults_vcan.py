@@ -23,9 +23,8 @@ from typing import Any
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
-from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
-from canprobe.bus.sdo_client import hold_dialogues, upload
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
@@ -33,6 +32,7 @@ from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import resolve_scene
+from canprobe.session.target import Target
 from canprobe.studies.faults import scenario_scene
 from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -98,7 +98,8 @@ class ProcessRun:
 @cache
 def served_scene() -> Scene:
     """A press whose nodes are a process of their own, which outlives the master."""
-    scene = resolve_scene(scenario_scene(SCENARIO, True), interface="socketcan", channel=CHANNEL, duration_s=HOLD_S)
+    scene = scenario_scene(SCENARIO, True)
+    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=HOLD_S)
     assert scene.arm is not None
     limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
     return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)

@@ -96,7 +96,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 def measure(cell: tuple[str, int, float]) -> dict[str, Any]:
     """One scan: what its answers erred by, and what its contacts did."""
     name, seed, duration = cell
-    scene = resolve_scene(load_scene(name), interface="lockstep", seed=seed, duration_s=duration)
+    scene = resolve_scene(load_scene(name), seed=seed, duration_s=duration)
     if scene.shape is not None:
         scene = replace(scene, shape=replace(scene.shape, also=()))
     task: Any = make_task(make_plan(resolve(scene)))

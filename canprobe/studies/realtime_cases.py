@@ -29,6 +29,7 @@ from canprobe.scene.model import Scene, TactileModeName
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import Session, resolve_scene
+from canprobe.session.target import Target
 from canprobe.tasks.from_plan import make_task
 
 # What a cycle on a real interface took: lateness of SYNC, computing time, and how late the last TPDO was in.
@@ -224,7 +225,8 @@ def with_real_nodes(scene: Scene) -> Scene:
 
 def _scene(seconds: float | None = None, channel: str = CHANNEL, *, in_realtime: bool = True) -> Scene:
     """The scene `cylinder`, patient; in real time with the processor and the memory, as far as they are to be had."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel, duration_s=seconds)
+    scene = load_scene("cylinder")
+    scene = resolve_scene(scene, Target.over(scene, "socketcan", channel), duration_s=seconds)
     return replace(patient(scene), cycle=replace(scene.cycle, realtime=in_realtime))
 
 

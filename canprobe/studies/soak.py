@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from canprobe.api import ROWS_OF_UP
 from canprobe.bus.socketcan import check_interface
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
 from canprobe.session.children import EmulatorChild
-from canprobe.session.session import Session, resolve_scene
+from canprobe.session.session import Session
+from canprobe.session.target import Target
+from canprobe.session.up import ROWS_OF_UP
 from canprobe.studies.harness import Column, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import CHANNEL, PATIENCE, patient, served, with_real_nodes
 from canprobe.studies.sweep import Sweep
@@ -125,7 +126,8 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def soak(seconds: float) -> list[Sample]:
     """Hold the cell; a look every sixtieth of the time."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
+    scene = load_scene("cylinder")
+    scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
     with served(CHANNEL, child):
         session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)

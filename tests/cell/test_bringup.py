@@ -13,7 +13,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.lockstep import Participant
-from canprobe.bus.sdo_client import upload
+from canprobe.bus.network import upload
 from canprobe.cell.configuration import make_setups
 from canprobe.eds.packaged import eds_path
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode

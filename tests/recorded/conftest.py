@@ -116,7 +116,7 @@ def delayed_run(tmp_path_factory):
     for participant in make_world(plan, scene.emulated_node_ids).participants:
         bus.attach(participant)
     with CandumpWriter(out / "bus.log", "can0") as writer:
-        port = RecordingPort(DelayedPort(bus.port(), rng), writer)
+        port = RecordingPort(DelayedPort(bus.port(), rng), writer.write)
         controller = Stalling(plan, bus.clock)
         cell = Cell(plan, port)
         with cell:

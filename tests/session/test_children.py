@@ -17,7 +17,6 @@ from canprobe.cell.cell import Cell
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import Frame
 from canprobe.session.children import END_TIMEOUT_S, EmulatorChild
-from canprobe.session.session import resolve_scene
 
 
 class Nodes(Participant):
@@ -76,7 +75,8 @@ def test_a_node_that_does_not_boot_in_time_is_named_with_the_way_out(tmp_path: P
 
 def test_in_the_background_of_a_script_it_ends_at_once_too(tmp_path: Path) -> None:
     """A shell without job control starts there with SIGINT ignored, and the nodes' process inherits it."""
-    child = EmulatorChild(resolve_scene(canprobe.load_scene("free"), interface="virtual"), tmp_path, "nodes")
+    free = canprobe.load_scene("free")
+    child = EmulatorChild(replace(free, bus=replace(free.bus, interface="virtual")), tmp_path, "nodes")
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         child.start()

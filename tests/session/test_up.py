@@ -15,7 +15,7 @@ from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import EMCY_BASE, Emcy
 from canprobe.session import up as joint_report
 from canprobe.session.session import Session
-from canprobe.session.up import news_teller, telling_notes
+from canprobe.session.up import reporting_notes
 from canprobe.tasks.untouched import Answer
 
 REPORTED = "by its encoders the arm stands at"
@@ -157,7 +157,7 @@ def test_a_scene_without_an_arm_is_refused():
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        (("--check-joints",), "needs a terminal; --yes asks nobody"),
+        (("--check-joints",), "needs a terminal; --yes leaves that out"),
         (("--yes",), "--yes goes with --check-joints"),
         (("--check-joints", "--yes", "--bridge", "mcap"), "--check-joints feeds no --bridge"),
     ],
@@ -181,8 +181,8 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
             session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())])
         return Command(done=measurement.cycle > 80)
 
-    with telling_notes(session, lines.append):
-        session.run(disturb, news_teller(session, lines.append))
+    with reporting_notes(session, lines.append) as report_news:
+        session.run(disturb, report_news)
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
     first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log
