@@ -1,14 +1,15 @@
-"""An hour on a real SocketCAN interface: does memory stay flat, do the clocks stay together, do the counters agree.
+"""Study `soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
 
-The cell is held as `canprobe up` holds it, emulated nodes in their process, all PDOs on the bus. For a nightly run:
+The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus. For a nightly run:
 `canprobe vcan --realtime -- canprobe study soak`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +22,14 @@ from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import Session, resolve_scene
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
-from canprobe.studies.realtime_cases import CHANNEL, PATIENCE, patient, served, with_real_nodes
+from canprobe.studies.harness import CHANNEL, Column, StudyResult, measuring_facts
+from canprobe.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
 from canprobe.studies.sweep import Sweep
 
 HOUR_S = 3600.0
 SAMPLES = 60
 SETTLED = 0.25
-"""Share of the run after which memory is expected to have stopped growing."""
-
+"""Share of the run after which memory should be constant."""
 COLUMNS = (
     Column("t_s", "t s", ".0f"),
     Column("master_mib", "master MiB", ".2f"),
@@ -70,7 +70,7 @@ class Sample:
 
 
 class Soaker(Controller):
-    """The controller: holds the joints, and looks at everything now and then."""
+    """Holds the joints, and takes a sample periodically."""
 
     def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
         self.samples: list[Sample] = []
@@ -120,11 +120,11 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     samples = soak(seconds)
     facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
     rows = [asdict(sample) for sample in samples]
-    return StudyResult("soak", COLUMNS, rows, findings(samples), facts, _drawer(samples))
+    return StudyResult("soak", COLUMNS, rows, findings(samples), facts, partial(draw_soak, samples))
 
 
 def soak(seconds: float) -> list[Sample]:
-    """Hold the cell; a look every sixtieth of the time."""
+    """Hold the cell; a sample every sixtieth of the time."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
     with served(CHANNEL, child):
@@ -142,12 +142,12 @@ def resident_mib(pid: int) -> float:
 
 
 def packets_on(channel: str) -> int:
-    """Frames that a network interface has counted."""
+    """Frames that the kernel has counted on an interface."""
     return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
 
 
 def findings(samples: Sequence[Sample]) -> list[str]:
-    """What an hour showed."""
+    """Growth of memory, change of latency, frames and cycles."""
     first, last = samples[0], samples[-1]
     settled = [s for s in samples if s.t_s >= SETTLED * last.t_s]
     tenth = max(1, len(samples) // 10)
@@ -173,31 +173,19 @@ def _growth(samples: Sequence[Sample], name: str) -> float:
     return round(float(slope), 2) + 0.0  # no minus zero
 
 
-def _drawer(samples: Sequence[Sample]) -> Callable[[Path], None]:
-    def draw(path: Path) -> None:
-        draw_soak(samples, path)
-
-    return draw
-
-
-# The picture of study `soak`: memory, answer latency and overruns over time.
-
-
 def draw_soak(samples: Sequence[Sample], path: Path) -> None:
-    """Three panels over the same time axis."""
+    """Memory, answer latency and overruns over time."""
     with picture(path, f"The cell held for {samples[-1].t_s:.0f} s on vcan0", 6.6) as figure:
         panels = parts(figure, 3, 1)
         memory, latency, lost = (part.subplots() for part in panels)
         minutes = [s.t_s / 60 for s in samples]
         memory.plot(minutes, [s.master_mib for s in samples], color=BLUE, label="master")
         memory.plot(minutes, [s.nodes_mib for s in samples], "--", color=ORANGE, label="emulated nodes")
-        memory.set_ylabel("resident\nmemory (MiB)")
         latency.plot(minutes, [s.latency_us for s in samples], ".-", color=BLUE)
-        latency.set_ylabel("SYNC →\nlast TPDO (µs)")
         lost.plot(minutes, [s.overruns for s in samples], color=BLUE, label="overruns")
         lost.plot(minutes, [s.missed_pdos for s in samples], "--", color=ORANGE, label="PDOs missed")
-        lost.set_ylabel("number so far")
-        for axes, part in zip((memory, latency, lost), panels, strict=True):
+        labels = ("resident\nmemory (MiB)", "SYNC →\nlast TPDO (µs)", "number so far")
+        for axes, part, label in zip((memory, latency, lost), panels, labels, strict=True):
             axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])
-            axes.set_xlabel("time (min)")
+            axes.set(xlabel="time (min)", ylabel=label)
             legend(part)

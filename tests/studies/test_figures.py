@@ -145,8 +145,8 @@ def realtime(path):
 
     def times(rate):
         late, some = (1e3 * rng.lognormal(mean, 0.6, 4000) for mean in (4, 6))
-        return CycleTimes(2_500_000, late.astype(int), some.astype(int), 2 * some.astype(int), 3 * some.astype(int),
-                          0, 0, 4000 / rate, None)  # fmt: skip
+        some = some.astype(int)
+        return CycleTimes(2_500_000, late.astype(int), 4000 / rate, some, 2 * some, 3 * some)
 
     cases = [
         Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "plain canopen", "bare clock")

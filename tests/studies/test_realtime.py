@@ -36,17 +36,9 @@ def test_no_sync_no_latency(tmp_path):
 
 
 def times(cycles, overruns, seconds, response_us=(), compute_us=()):
-    return CycleTimes(
-        period_ns=2_500_000,
-        lateness_ns=np.zeros(cycles, np.int64),
-        response_ns=np.array(response_us, np.int64) * 1000,
-        compute_ns=np.array(compute_us, np.int64) * 1000,
-        latency_ns=np.zeros(0, np.int64),
-        overruns=overruns,
-        missed=0,
-        seconds=seconds,
-        processor_share=None,
-    )
+    late = np.where(np.arange(cycles) < overruns, 2_000_000, 0)
+    response, compute = (1000 * np.array(us, np.int64) for us in (response_us, compute_us))
+    return CycleTimes(2_500_000, late, seconds, response, compute)
 
 
 def test_findings_tell_rates_and_shares():
@@ -94,7 +86,7 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
     lateness: list[int] = []
     assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
     assert lateness == [0, 100, 2600, 0]
-    times = CycleTimes.of_wakes(1000, lateness, 5e-6)
+    times = CycleTimes(1000, np.array(lateness), 5e-6)
     assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
 
 
