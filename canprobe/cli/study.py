@@ -60,9 +60,9 @@ def run(args: argparse.Namespace) -> int:
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
     if args.vcan and args.name != "faults":
-        args.complain(f"--vcan: study {args.name} has no form of its own on vcan0; faults has")
+        args.complain(f"--vcan: expected study faults, got {args.name}")
     if args.vcan and args.seed is not None:
-        args.complain("--seed: the runs on vcan0 hang on the machine's own time too and cannot be told again")
+        args.complain("--seed: runs on vcan0 depend on the timing of the machine too and cannot be repeated")
     if args.seed is not None:
         return _replay(args)
     from canprobe.studies.harness import as_document, text_of, write_study
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
         with open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep:
             result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
-        say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
+        say(f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest")
         raise
     with interrupts_repeated():
         paths = write_study(result, out)
@@ -89,7 +89,7 @@ def run(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
     if args.name != "faults":
-        args.complain(f"--seed: the runs of study {args.name} are not numbered; those of faults are")
+        args.complain(f"--seed: expected study faults, got {args.name}")
     from canprobe.studies.faults import replay
 
     outcome = replay(args.seed, say)

@@ -1,4 +1,4 @@
-"""A recorded run, estimated again from its log alone: candump in, shape out, with a summary of its own."""
+"""A recorded run, estimated again from its log alone: candump in, shape and summary out."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.recorded.cycles import LogCycles, TaskReplay, replay_contacts, replay_task
 from canprobe.recorded.recording import Recording, read_recording
-from canprobe.results.scores import estimate_columns, map_of_scan, summarise_map
+from canprobe.results.scores import estimate_columns, map_of_scan
 from canprobe.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
@@ -24,7 +24,6 @@ from canprobe.scene.resolve import resolve
 from canprobe.session.session import LOCKSTEP
 from canprobe.tasks.from_plan import estimates_of
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.touch.consistency import check_consistency
 from canprobe.touch.estimate.fit import METHODS, unknown_method
 
 Array = NDArray[np.float64]
@@ -58,6 +57,7 @@ def summarise_replay(
     """
     truth = _truth(folder / "truth.npz") if folder is not None else {}
     start_s = cycles.start_ns * 1e-9
+    map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
@@ -69,22 +69,10 @@ def summarise_replay(
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, start_s) for name, records in estimates.items()},
         "shape": summarise_shape(
-            plan.scene,
-            tracker,
-            estimates,
-            truth,
-            np.array(cycles.sync_times_s),
-            map_summary=_map_summary(plan, tracker),
+            plan.scene, tracker, estimates, truth, np.array(cycles.sync_times_s), map_summary=map_summary
         ),
         "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
     }
-
-
-def _map_summary(plan: Plan, tracker: ShapeTracker) -> dict[str, Any] | None:
-    if plan.scene.shape is None:
-        return None
-    surface_map = map_of_scan(tracker, plan.scene.shape.method)
-    return summarise_map(surface_map, check_consistency(surface_map))
 
 
 def _arrays(path: Path) -> dict[str, Array]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.touch.consistency import PARTS, Consistency
+from canprobe.touch.consistency import PARTS, Consistency, check_consistency
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
 
@@ -55,21 +55,21 @@ class ShapeScore:
     """Errors of one estimator over a run; None where nothing could be scored.
 
     Attributes:
-        kappa_true: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as part
-            of the curvature was not observed, over all after the run-in, or else over all.
-        kappa_est: mean estimated ones (1/m).
-        kappa_rms: RMS Frobenius norm of K_est − K_true (1/m).
-        kappa_rms_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
+        kappa_true_per_m: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as
+            part of the curvature was not observed, over all after the run-in, or else over all.
+        kappa_est_per_m: mean estimated ones (1/m).
+        kappa_rms_error_per_m: RMS Frobenius norm of K_est − K_true (1/m).
+        kappa_rms_error_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
         normal_rms_deg, position_rms_mm: of the estimated contact frame.
         estimates: how many were scored.
         observed_fraction: share of the answers after the run-in that observed all curvature.
         patch_fraction: share of the scored answers to which the contact patch contributed a tenth or more.
     """
 
-    kappa_true: tuple[float, float] | None
-    kappa_est: tuple[float, float] | None
-    kappa_rms: float | None
-    kappa_rms_percent: float | None
+    kappa_true_per_m: tuple[float, float] | None
+    kappa_est_per_m: tuple[float, float] | None
+    kappa_rms_error_per_m: float | None
+    kappa_rms_error_percent: float | None
     normal_rms_deg: float | None
     position_rms_mm: float | None
     estimates: int
@@ -108,10 +108,10 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
         offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
     rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
     return ShapeScore(
-        kappa_true=kappa_true,
-        kappa_est=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
-        kappa_rms=rms,
-        kappa_rms_percent=100 * rms / scale if scale > 1e-9 else None,
+        kappa_true_per_m=kappa_true,
+        kappa_est_per_m=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
+        kappa_rms_error_per_m=rms,
+        kappa_rms_error_percent=100 * rms / scale if scale > 1e-9 else None,
         normal_rms_deg=float(np.degrees(np.sqrt(np.mean(tilts)))),
         position_rms_mm=float(np.sqrt(np.mean(offsets)) * 1e3),
         estimates=len(seen),
@@ -180,28 +180,34 @@ SAME_DIRECTION_RAD = math.radians(30.0)
 """Passes whose directions differ by less have the same hysteresis of the array."""
 
 
-def map_of_scan(tracker: ShapeTracker, method: str, start_s: float = 0.0) -> SurfaceMap:
+def map_of_scan(
+    tracker: ShapeTracker, method: str, start_s: float = 0.0
+) -> tuple[SurfaceMap, Consistency, dict[str, Any]]:
     """Merge the answers of the estimator in the loop along a scan.
 
     Args:
         tracker: with the answers and the contacts of the scan.
         method: name of the estimator.
         start_s: deadline of the first SYNC on the run's clock.
+
+    Returns:
+        The map, the tests at its crossings, and its section of ``summary.json``: None without a test.
     """
     patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
     path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
-    return merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
-
-
-def summarise_map(surface_map: SurfaceMap, consistency: Consistency) -> dict[str, Any]:
-    """Patches, crossings and their tests for ``summary.json``; None without a test."""
-    return {
-        "patches": len(surface_map),
-        "crossings": len(consistency.crossings),
-        "independent_crossings": len(consistency.independent),
-        "consistent": consistency.consistent,
-        **{part: _verdict(consistency, part) for part in PARTS},
-    }
+    surface_map = merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
+    consistency = check_consistency(surface_map)
+    return (
+        surface_map,
+        consistency,
+        {
+            "patches": len(surface_map),
+            "crossings": len(consistency.crossings),
+            "independent_crossings": len(consistency.independent),
+            "consistent": consistency.consistent,
+            **{part: _verdict(consistency, part) for part in PARTS},
+        },
+    )
 
 
 def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:

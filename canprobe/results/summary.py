@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -336,24 +336,16 @@ def summarise_shape(
     if not truth:
         return shape
     scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
-    methods = {
-        name: {
-            "kappa_rms_error_per_m": score.kappa_rms,
-            "kappa_rms_error_percent": score.kappa_rms_percent,
-            "normal_rms_deg": score.normal_rms_deg,
-            "position_rms_mm": score.position_rms_mm,
-            "estimates": score.estimates,
-            "observed_fraction": score.observed_fraction,
-            "patch_fraction": score.patch_fraction,
-        }
-        for name, score in scores.items()
+    score = asdict(scores[method])
+    score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
+    shape |= {name: value for name, value in score.items() if name in names}
+    shape["cramer_rao_ratio"] = _bound_ratio(scene, tracker, scores[method], truth, sync_times)
+    of_run = ("kappa_true_per_m", "kappa_est_per_m")
+    shape["methods"] = {
+        method: {name: value for name, value in asdict(one).items() if name not in of_run}
+        for method, one in scores.items()
     }
-    score = scores[method]
-    shape["kappa_true_per_m"] = score.kappa_true
-    shape["kappa_est_per_m"] = score.kappa_est or shape["kappa_est_per_m"]
-    shape |= {name: value for name, value in methods[method].items() if name in names}
-    shape["cramer_rao_ratio"] = _bound_ratio(scene, tracker, score, truth, sync_times)
-    return shape | {"methods": methods}
+    return shape
 
 
 def _bound_ratio(
@@ -366,7 +358,7 @@ def _bound_ratio(
     from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, SIGMA_POINT_M, centroid_coupling
 
     shape = scene.shape
-    if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,
@@ -377,7 +369,7 @@ def _bound_ratio(
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=centroid_coupling(resolve(scene).probe),
     )
-    return None if bound is None else score.kappa_rms / bound
+    return None if bound is None else score.kappa_rms_error_per_m / bound
 
 
 def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:

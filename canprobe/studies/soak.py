@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import Session, resolve_scene
-from canprobe.studies.harness import CHANNEL, Column, StudyResult, measuring_facts
+from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
 from canprobe.studies.sweep import Sweep
 
@@ -44,36 +43,11 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One look at the running cell.
-
-    Attributes:
-        t_s: since the first SYNC.
-        master_mib, nodes_mib: resident memory of the two processes.
-        cycles, overruns, missed_pdos, dropped_frames: since the start.
-        latency_us: from SYNC to the last TPDO in this cycle, by the kernel's stamp.
-        frames_counted: sent and received by the master since the start.
-        frames_on_bus: counted by the interface since the start.
-    """
-
-    t_s: float
-    master_mib: float
-    nodes_mib: float
-    cycles: int
-    overruns: int
-    missed_pdos: int
-    dropped_frames: int
-    latency_us: float
-    frames_counted: int
-    frames_on_bus: int
-
-
 class Soaker(Controller):
     """Holds the joints, and takes a sample periodically."""
 
     def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
-        self.samples: list[Sample] = []
+        self.samples: list[Row] = []
         self._session, self._nodes_pid, self._seconds = session, nodes_pid, seconds
         self._next_s = 0.0
         self._q: Any = None
@@ -96,20 +70,18 @@ class Soaker(Controller):
         counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
         if not self.samples:
             self._first_counted, self._first_packets = counted, packets
-        self.samples.append(
-            Sample(
-                t_s=t_s,
-                master_mib=resident_mib(os.getpid()),
-                nodes_mib=resident_mib(self._nodes_pid),
-                cycles=cycle.number,
-                overruns=cycle.statistics.overruns,
-                missed_pdos=drives.missed,
-                dropped_frames=counters.overruns,
-                latency_us=drives.answer_ns * 1e-3,
-                frames_counted=counted - self._first_counted,
-                frames_on_bus=packets - self._first_packets,
-            )
-        )
+        self.samples.append({
+            "t_s": t_s,
+            "master_mib": resident_mib(os.getpid()),
+            "nodes_mib": resident_mib(self._nodes_pid),
+            "cycles": cycle.number,
+            "overruns": cycle.statistics.overruns,
+            "missed_pdos": drives.missed,
+            "dropped_frames": counters.overruns,
+            "latency_us": drives.answer_ns * 1e-3,
+            "frames_counted": counted - self._first_counted,
+            "frames_on_bus": packets - self._first_packets,
+        })  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -117,13 +89,12 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     seconds = 10.0 if quick else HOUR_S
     sweep.say(f"hold the cell for {seconds:g} s")
-    samples = soak(seconds)
+    rows = soak(seconds)
     facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
-    rows = [asdict(sample) for sample in samples]
-    return StudyResult("soak", COLUMNS, rows, findings(samples), facts, partial(draw_soak, samples))
+    return StudyResult("soak", COLUMNS, rows, findings(rows), facts, partial(draw_soak, rows))
 
 
-def soak(seconds: float) -> list[Sample]:
+def soak(seconds: float) -> list[Row]:
     """Hold the cell; a sample every sixtieth of the time."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
@@ -146,44 +117,44 @@ def packets_on(channel: str) -> int:
     return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
 
 
-def findings(samples: Sequence[Sample]) -> list[str]:
+def findings(samples: Sequence[Row]) -> list[str]:
     """Growth of memory, change of latency, frames and cycles."""
     first, last = samples[0], samples[-1]
-    settled = [s for s in samples if s.t_s >= SETTLED * last.t_s]
+    settled = [s for s in samples if s["t_s"] >= SETTLED * last["t_s"]]
     tenth = max(1, len(samples) // 10)
-    begin, end = (float(np.median([s.latency_us for s in part])) for part in (samples[:tenth], samples[-tenth:]))
-    gone = last.frames_on_bus - last.frames_counted
+    begin, end = (float(np.median([s["latency_us"] for s in part])) for part in (samples[:tenth], samples[-tenth:]))
+    counted, seen = last["frames_counted"], last["frames_on_bus"]
+    since = {name: last[name] - first[name] for name in ("dropped_frames", "cycles", "overruns", "missed_pdos")}
     return [
         f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
         f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, after the first quarter",
         f"SYNC → last TPDO by the kernel's stamps: {begin:.0f} µs in the first tenth, {end:.0f} µs in the last",
-        f"{last.frames_counted} frames counted by the master, {last.frames_on_bus} by the interface in the same time:"
-        f" {gone:+d} under way or lost, {last.dropped_frames - first.dropped_frames} dropped by the kernel",
-        f"{last.cycles - first.cycles} cycles, {last.overruns - first.overruns} overruns,"
-        f" {last.missed_pdos - first.missed_pdos} PDOs missed",
+        f"{counted} frames counted by the master, {seen} by the interface in the same time:"
+        f" {seen - counted:+d} under way or lost, {since['dropped_frames']} dropped by the kernel",
+        f"{since['cycles']} cycles, {since['overruns']} overruns, {since['missed_pdos']} PDOs missed",
     ]
 
 
-def _growth(samples: Sequence[Sample], name: str) -> float:
+def _growth(samples: Sequence[Row], name: str) -> float:
     """Slope, MiB/h."""
     if len(samples) < 2:
         return 0.0
-    t_h = np.array([s.t_s for s in samples]) / 3600
-    slope = np.polyfit(t_h, [getattr(s, name) for s in samples], 1)[0]
+    t_h = np.array([s["t_s"] for s in samples]) / 3600
+    slope = np.polyfit(t_h, [s[name] for s in samples], 1)[0]
     return round(float(slope), 2) + 0.0  # no minus zero
 
 
-def draw_soak(samples: Sequence[Sample], path: Path) -> None:
+def draw_soak(samples: Sequence[Row], path: Path) -> None:
     """Memory, answer latency and overruns over time."""
-    with picture(path, f"The cell held for {samples[-1].t_s:.0f} s on vcan0", 6.6) as figure:
+    with picture(path, f"The cell held for {samples[-1]['t_s']:.0f} s on vcan0", 6.6) as figure:
         panels = parts(figure, 3, 1)
         memory, latency, lost = (part.subplots() for part in panels)
-        minutes = [s.t_s / 60 for s in samples]
-        memory.plot(minutes, [s.master_mib for s in samples], color=BLUE, label="master")
-        memory.plot(minutes, [s.nodes_mib for s in samples], "--", color=ORANGE, label="emulated nodes")
-        latency.plot(minutes, [s.latency_us for s in samples], ".-", color=BLUE)
-        lost.plot(minutes, [s.overruns for s in samples], color=BLUE, label="overruns")
-        lost.plot(minutes, [s.missed_pdos for s in samples], "--", color=ORANGE, label="PDOs missed")
+        minutes = [s["t_s"] / 60 for s in samples]
+        memory.plot(minutes, [s["master_mib"] for s in samples], color=BLUE, label="master")
+        memory.plot(minutes, [s["nodes_mib"] for s in samples], "--", color=ORANGE, label="emulated nodes")
+        latency.plot(minutes, [s["latency_us"] for s in samples], ".-", color=BLUE)
+        lost.plot(minutes, [s["overruns"] for s in samples], color=BLUE, label="overruns")
+        lost.plot(minutes, [s["missed_pdos"] for s in samples], "--", color=ORANGE, label="PDOs missed")
         labels = ("resident\nmemory (MiB)", "SYNC →\nlast TPDO (µs)", "number so far")
         for axes, part, label in zip((memory, latency, lost), panels, labels, strict=True):
             axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])

@@ -26,7 +26,7 @@ from canprobe.studies.faults import draw_ends, draw_faults
 from canprobe.studies.pipeline import draw_pipeline
 from canprobe.studies.realtime import draw_realtime
 from canprobe.studies.realtime_cases import CycleTimes, Measured
-from canprobe.studies.soak import Sample, draw_soak
+from canprobe.studies.soak import draw_soak
 from canprobe.studies.workprec import draw_workprec
 from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
 
@@ -157,7 +157,8 @@ def realtime(path):
 
 
 def soak(path):
-    samples = [Sample(60.0 * k, 128.0, 84.0, 24_000 * k, k // 9, 0, 0, 400.0 + 90 * np.sin(k), 0, 0) for k in range(61)]
+    still = {"master_mib": 128.0, "nodes_mib": 84.0, "missed_pdos": 0}
+    samples = [still | {"t_s": 60.0 * k, "overruns": k // 9, "latency_us": 400.0 + 90 * np.sin(k)} for k in range(61)]
     draw_soak(samples, path)
 
 

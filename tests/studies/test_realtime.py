@@ -2,7 +2,6 @@
 
 import mmap
 import os
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
 from canprobe.studies.realtime import findings
 from canprobe.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
-from canprobe.studies.soak import Sample, resident_mib
+from canprobe.studies.soak import COLUMNS, resident_mib
 from canprobe.studies.soak import findings as findings_of_soak
 
 
@@ -92,20 +91,20 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
 
 # The arithmetic of study `soak`; the study itself runs on vcan0 only.
 
-ZERO = Sample(0.0, 90.0, 80.0, 0, 0, 0, 0, 400.0, 0, 0)
+ZERO = {column.key: 0 for column in COLUMNS} | {"master_mib": 90.0, "nodes_mib": 80.0, "latency_us": 400.0}
 
 
 def hour(leak_mib_h=0.0, drift_us=0.0, lost=0):
     return [
-        replace(
-            ZERO,
-            t_s=60.0 * k,
-            master_mib=90.0 + leak_mib_h * k / 60,
-            cycles=24_000 * k,
-            latency_us=400.0 + drift_us * k / 60,
-            frames_counted=1000 * k,
-            frames_on_bus=1000 * k + (lost if k == 60 else 0),
-        )
+        ZERO
+        | {
+            "t_s": 60.0 * k,
+            "master_mib": 90.0 + leak_mib_h * k / 60,
+            "cycles": 24_000 * k,
+            "latency_us": 400.0 + drift_us * k / 60,
+            "frames_counted": 1000 * k,
+            "frames_on_bus": 1000 * k + (lost if k == 60 else 0),
+        }
         for k in range(61)
     ]
 

@@ -217,7 +217,7 @@ def test_an_ended_sweep_goes_on_where_it_was(demo, tmp_path, fate, status):
     assert ended.returncode == status, ended.stderr
     assert [x for x, _ in measured(tmp_path)] == [0, 1, 2, 3]
     if status > 0:
-        assert "interrupted; what is finished is kept" in ended.stderr
+        assert "interrupted; finished cells are kept" in ended.stderr
         assert "Traceback" not in ended.stderr
         assert all(gone(pid) for _, pid in measured(tmp_path))  # the workers ended with it
     again = run_demo(tmp_path)
