@@ -150,12 +150,9 @@ def _mapped(
     """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
     if tracker is None or scene.shape is None:
         return None, None, None
-    from canprobe.results.scores import map_of_scan, summarise_map
-    from canprobe.touch.consistency import check_consistency
+    from canprobe.results.scores import map_of_scan
 
-    surface_map = map_of_scan(tracker, scene.shape.method, start_s)
-    consistency = check_consistency(surface_map)
-    return surface_map, consistency, summarise_map(surface_map, consistency)
+    return map_of_scan(tracker, scene.shape.method, start_s)
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:

@@ -286,7 +286,7 @@ class LockstepPort(Participant, PlainPort):
     """A master's `Port` on a `LockstepBus`; see there for the order of frames.
 
     Attributes:
-        state: of a controller that this bus does not have: as it was set, to see what a cell does about it.
+        state: error state of the controller; a timed bus with bit errors sets it (`canprobe.bus.controllers`).
     """
 
     node: BusNode

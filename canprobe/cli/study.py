@@ -72,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         with open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep:
             result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
-        say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
+        say(f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest")
         raise
     with interrupts_repeated():
         paths = write_study(result, out)
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
     if args.name != "faults":
-        args.complain(f"--seed: the runs of study {args.name} are not numbered; those of faults are")
+        args.complain(f"--seed: expected study faults, got {args.name}")
     from canprobe.studies.faults import replay
 
     outcome = replay(args.seed, say)

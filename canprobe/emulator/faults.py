@@ -97,6 +97,11 @@ class WrappedNode(Participant):
         self.node = node
 
     @property
+    def node_id(self) -> int:
+        """As the node."""
+        return self.node.node_id
+
+    @property
     def name(self) -> str:
         """For messages."""
         return self.node.name

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -91,16 +91,18 @@ class World:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
         recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
+            recorder, which listens only.
     """
 
     nodes: tuple[SlaveNode, ...]
     plant: Plant
     recorder: TruthRecorder | None
+    participants: list[Any] = field(init=False)
 
-    @property
-    def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
-        """Everything that lives on the bus; the recorder listens only."""
-        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
+    def __post_init__(self) -> None:
+        recorders = () if self.recorder is None else (self.recorder,)
+        object.__setattr__(self, "participants", [*self.nodes, *recorders])
 
 
 def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:

@@ -147,8 +147,6 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
     },
     "tactile": {0x2000: "tactile mode"},
 }
-MOST_BITRATE = 1_000_000
-"""Of classical CAN, bit/s: the most that an EDS file can list."""
 
 
 def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
@@ -164,8 +162,7 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
 
 def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
     """That the device does not have the bus's bit rate, where its EDS tells which it has."""
-    beyond = setup.bus.bitrate > MOST_BITRATE  # no scene file may say so: a study's bus that no CAN is
-    if not device.bitrates or setup.bus.bitrate in device.bitrates or beyond:
+    if not device.bitrates or setup.bus.bitrate in device.bitrates:
         return []
     section = "arm" if kind == "drive" else "sensor"
     has = ", ".join(map(str, device.bitrates))

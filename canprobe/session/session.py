@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -195,7 +195,6 @@ class Session:
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
         unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
-        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
     def __init__(
@@ -222,13 +221,18 @@ class Session:
         self._ports: dict[str, Port] = {}
         self.unwritten: list[str] = []
         self._candump: CandumpWriter | None = None
-        self.world: World | None = None
-        self.joins: Callable[[Any], Any] = lambda participant: participant
         self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._entered = self._left = False
         self._cell: Cell | None = None
+
+    @cached_property
+    def world(self) -> World:
+        """The emulated nodes and their plant on a lockstep bus; their participants may be replaced until it opens."""
+        from canprobe.emulator.world import make_world
+
+        return make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
 
     @property
     def cell(self) -> Cell:
@@ -385,8 +389,6 @@ class Session:
             self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
-        from canprobe.emulator.world import make_world
-
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
@@ -396,17 +398,14 @@ class Session:
             bus.recorder = self._writer(channel)
             bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
-        self.world = make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
+        participants = self.world.participants
         self._stack.callback(self._keep_truth)
-        channel_of = {node.node_id: node.channel for node in self.plan.nodes}
-        for node in self.world.nodes:
-            buses[channel_of[node.node_id]].attach(self.joins(node))
-        if self.world.recorder is not None:
-            self.lockstep.attach(self.joins(self.world.recorder))
+        bus_of = {node.node_id: buses[node.channel] for node in self.plan.nodes}
+        for participant in participants:
+            bus_of.get(getattr(participant, "node_id", 0), self.lockstep).attach(participant)
         return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
-        assert self.world is not None
         if self.world.recorder is not None:
             self.truth = self.world.recorder.arrays()
             if self.out is not None:

@@ -26,27 +26,18 @@ MS = 1_000_000
 
 def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), scene="free", rate_hz=400.0, **bring_up):
     """A session in lockstep; `beside` are participants besides its nodes."""
-    beside = list(beside)
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
-    said = []
-    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path, say=said.append)
-    session.said = said
-
-    def join(participant):
-        while beside:
-            session.lockstep.attach(beside.pop())
-        if hasattr(participant, "node_id"):
-            if nodes is not None:
-                if participant.node_id in nodes:
-                    participant.store.saved = nodes[participant.node_id]
-                nodes[participant.node_id] = participant
-            if change is not None:
-                change(participant)
-            return FaultyNode(participant, faults)
-        return participant
-
-    session.joins = join
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
+    world = session.world
+    for node in world.nodes:
+        if nodes is not None:
+            if node.node_id in nodes:
+                node.store.saved = nodes[node.node_id]
+            nodes[node.node_id] = node
+        if change is not None:
+            change(node)
+    world.participants[:] = [*beside, *(FaultyNode(node, faults) for node in world.nodes), world.recorder]
     return session
 
 
@@ -485,7 +476,7 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
     arm = replace(session.scene.arm, serial_numbers=(1001, 1002, 1004, 1003, 1005, 1006))
     swapped = Session(replace(session.scene, arm=arm))
-    swapped.joins = session.joins
+    swapped.world.participants[:] = session.world.participants
     with (
         pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
         swapped,

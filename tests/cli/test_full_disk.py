@@ -13,7 +13,7 @@ from full_disk import room_for
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.disk import read_candump
+from canprobe.bus.disk import read_candump, read_npz
 from canprobe.cli import main
 from canprobe.errors import ResultsError
 from canprobe.studies.harness import CellStore, Column, StudyResult, write_study
@@ -70,7 +70,7 @@ def test_a_table_leaves_no_part_of_a_file(scan, tmp_path):
     table = pytest.importorskip("canprobe.results.files")
     pytest.importorskip("pyarrow")
     with room_for(ROOM), pytest.raises(ResultsError, match=r"log\.parquet: cannot be written"):
-        table.npz_to_parquet(scan / "log.npz", tmp_path / "log.parquet")
+        table.write_parquet(read_npz(scan / "log.npz"), tmp_path / "log.parquet")
     assert list(tmp_path.iterdir()) == []
 
 

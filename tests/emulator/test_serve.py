@@ -265,4 +265,4 @@ def test_nobody_records_what_nobody_wants_to_know():
     plan = canprobe.plan(load_scene("press"))
     world = build.make_world(plan, plan.node_ids, truth=False)
     assert world.recorder is None
-    assert world.participants == world.nodes
+    assert world.participants == list(world.nodes)

@@ -23,13 +23,8 @@ def press_begun_pressed(**limits):
     x, y, z = scene.object.position_mm
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
 
-    def raise_object(participant):
-        plant = session.world.plant
-        plant.config = replace(plant.config, object=raised)
-        plant._solved = None
-        return participant
-
-    session.joins = raise_object
+    plant = session.world.plant
+    plant.config = replace(plant.config, object=raised)
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(make_task(session.plan))
     return stopped.value.reason, session

@@ -414,12 +414,9 @@ def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stop
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     session = Session(canprobe.load_scene("free"))
 
-    def join(participant):
-        if getattr(participant, "node_id", None) == 3:
-            altered(participant := FaultyNode(participant), 0x183, lambda d: b"\x01\x06" + d[2:])
-        return participant
-
-    session.joins = join
+    participants = session.world.participants
+    participants[2] = FaultyNode(participants[2])
+    altered(participants[2], 0x183, lambda d: b"\x01\x06" + d[2:])
     told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
     with pytest.raises(NodeError, match=told), session:
         session.run(lambda _: Command())

@@ -67,7 +67,8 @@ def cell(monkeypatch):
 
     def make(*args, **more):
         Opened.session = Session(*args, **more)
-        Opened.session.joins = Opened.joins
+        participants = Opened.session.world.participants
+        participants[:] = map(Opened.joins, participants)
         if Opened.operator is not None:
             Opened.operator.session = Opened.session
         return Opened.session

@@ -88,7 +88,7 @@ def terms(a: Any, b: Any, t: Any) -> tuple[Any, ...]:
 
 @dataclass(frozen=True, slots=True)
 class MomentFit:
-    """What a calibration found, free of units: `canprobe.studies.array_calibration` makes it.
+    """What a calibration found, free of units: `tests/support/array_calibration.py` makes it.
 
     With i, j the principal axes of the patch, m the ideal moments over the squared pitch and t the level over
     the peak pressure, the image's moment V_i over the squared pitch is the sum of the coefficients times `terms`.
