@@ -1,4 +1,8 @@
-"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR."""
+"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
+
+The encoder is `rosbags`. Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
+ros2_socketcan_msgs, which it does not carry.
+"""
 
 from __future__ import annotations
 
@@ -18,12 +22,9 @@ from canprobe.bridge.sample import (
     JOINT_NAMES,
     PROBE,
     CanFrame,
-    ContactFrame,
-    Joints,
     Sample,
     SurfacePatch,
-    TaxelImage,
-    Wrench,
+    TouchFrame,
     flange_transform,
     link_transforms,
     quaternion_of,
@@ -31,11 +32,6 @@ from canprobe.bridge.sample import (
 from canprobe.planning.model import Plan
 from canprobe.robot.kinematics import MODELS
 from canprobe.scene.geometry import T_flange_probe
-
-# The one encoder of all sinks: ROS 2 messages → CDR, their definitions, and their RIHS01 hashes, by `rosbags`.
-#
-# Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
-# ros2_socketcan_msgs, which it does not.
 
 CAN_FRAME = "can_msgs/msg/Frame"
 CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"
@@ -77,7 +73,7 @@ def encode_can_frame(t_ns: int, frame: CanFrame) -> bytes:
 
 
 class Encoder:
-    """Messages of one type store.
+    """ROS 2 messages → CDR, their definitions, and their RIHS01 hashes; one for each sink.
 
     Attributes:
         store: of rosbags; `types[name]` are the message classes.
@@ -142,8 +138,6 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS)
 
 
-# One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
-
 Array = NDArray[np.float64]
 Message = tuple[Topic, int, bytes]
 """Topic, time in ns since the epoch, CDR."""
@@ -157,7 +151,7 @@ class Messages:
         plan: of the run.
         encoder: the one encoder.
         wanted: whether anybody takes a topic; nothing is made of the others.
-        static_every_ns: when the fixed frames are told again; by default once is enough.
+        static_every_ns: when the fixed frames are sent again; by default once is enough.
     """
 
     def __init__(
@@ -210,20 +204,19 @@ class Messages:
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
         """What there is in a sample: topic, time, and how to make the message."""
-        t_ns, joints, patch = sample.t_ns, sample.joints, sample.patch
-        taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
+        t_ns, q, touch, patch = sample.t_ns, sample.q, sample.touch, sample.patch
         if self._model is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
             yield TF_STATIC, t_ns, lambda: self._static(t_ns)
-        if joints is not None and self._model is not None:
-            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
-            yield TF, t_ns, lambda: self._links(t_ns, joints)
-        if taxels is not None:
-            yield TAXELS, taxels.t_ns, lambda: self._image(taxels)
-        if wrench is not None:
-            yield WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
-        if contact is not None:
-            yield TF, contact.t_ns, lambda: self._contact(contact)
+        if q is not None and (model := self._model) is not None:
+            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, q)
+            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(model, q))
+        if touch is not None:
+            if (counts := touch.counts) is not None:
+                yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
+            yield WRENCH, touch.t_ns, lambda: self._wrench(touch)
+            if (contact := touch.contact) is not None:
+                yield TF, touch.t_ns, lambda: self._tf(touch.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
         if patch is not None:
             yield PATCH, patch.t_ns, lambda: self._cloud(patch)
             yield CURVATURE, patch.t_ns, lambda: self._curvature(patch)
@@ -232,20 +225,16 @@ class Messages:
 
     # one function a message
 
-    def _joint_state(self, t_ns: int, joints: Joints) -> Any:
+    def _joint_state(self, t_ns: int, q: Array) -> Any:
         nothing = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
         return self._make(
             "sensor_msgs/msg/JointState",
             header=self._header(t_ns, BASE),
             name=list(JOINT_NAMES),
-            position=np.asarray(joints.position, np.float64),
+            position=np.asarray(q, np.float64),
             velocity=nothing,
             effort=nothing,
         )
-
-    def _links(self, t_ns: int, joints: Joints) -> Any:
-        assert self._model is not None
-        return self._tf(t_ns, link_transforms(self._model, joints.position))
 
     def _static(self, t_ns: int) -> Any:
         fixed = [flange_transform()]
@@ -253,26 +242,22 @@ class Messages:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
         return self._tf(t_ns, fixed)
 
-    def _contact(self, contact: ContactFrame) -> Any:
-        return self._tf(contact.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
+    def _wrench(self, touch: TouchFrame) -> Any:
+        force, torque = self._vector(touch.force), self._vector(np.zeros(3))
+        body = self._make("geometry_msgs/msg/Wrench", force=force, torque=torque)
+        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(touch.t_ns, PROBE), wrench=body)
 
-    def _wrench(self, wrench: Wrench) -> Any:
-        body = self._make(
-            "geometry_msgs/msg/Wrench", force=self._vector(wrench.force), torque=self._vector(wrench.torque)
-        )
-        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(wrench.t_ns, PROBE), wrench=body)
-
-    def _image(self, image: TaxelImage) -> Any:
-        rows, columns = image.counts.shape
+    def _image(self, t_ns: int, counts: NDArray[np.uint8]) -> Any:
+        rows, columns = counts.shape
         return self._make(
             "sensor_msgs/msg/Image",
-            header=self._header(image.t_ns, PROBE),
+            header=self._header(t_ns, PROBE),
             height=rows,
             width=columns,
             encoding="mono8",
             is_bigendian=0,
             step=columns,
-            data=image.counts.ravel(),
+            data=counts.ravel(),
         )
 
     def _cloud(self, patch: SurfacePatch) -> Any:

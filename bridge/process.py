@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bridge.sample import SurfacePatch
 from canprobe.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.cycle import Observation
@@ -44,16 +45,6 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class EstimateParts:
-    """What a bridge needs of a surface estimate; see `SurfaceEstimate`."""
-
-    T_frame_contact: Array
-    K: Array
-    covariance: Array
-    observed: tuple[bool, bool]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class Received:
     """An observation at the other end.
 
@@ -61,7 +52,7 @@ class Received:
         t_ns, measurement, frames: as in `Observation`.
         phase: column `phase` of the command, None without one.
         depth: column `depth_at_1n_mm`: indentation at 1 N with which its contact was placed, None without one.
-        estimate: of the command.
+        patch: the estimate of the command.
         dropped: observations that were lost before this one.
     """
 
@@ -69,7 +60,7 @@ class Received:
     measurement: Measurement | None
     phase: float | None
     depth: float | None
-    estimate: EstimateParts | None
+    patch: SurfacePatch | None
     frames: list[TimedFrame]
     dropped: int
 
@@ -82,9 +73,7 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
         dropped: how many were lost before it.
     """
     command = observation.command
-    phase: float | None = None
-    depth: float | None = None
-    estimate = None
+    phase = depth = estimate = None
     if command is not None:
         phase = _number(command.columns.get("phase"))
         depth = _number(command.columns.get("depth_at_1n_mm"))
@@ -108,7 +97,7 @@ def unpack_observation(data: bytes) -> Received:
         _unpack_measurement(parts) if parts is not None else None,
         phase,
         depth,
-        _unpack_estimate(estimate) if estimate is not None else None,
+        _unpack_estimate(t_ns, *estimate) if estimate is not None else None,
         frames,
         dropped,
     )
@@ -165,9 +154,10 @@ def _pack_estimate(estimate: SurfaceEstimate) -> tuple[bytes, bytes, bytes, bool
     return T, K, covariance, bool(first), bool(second)
 
 
-def _unpack_estimate(parts: tuple[bytes, bytes, bytes, bool, bool]) -> EstimateParts:
-    T, K, covariance, first, second = parts
-    return EstimateParts(
+def _unpack_estimate(t_ns: int, T: bytes, K: bytes, covariance: bytes, *observed: bool) -> SurfacePatch:
+    first, second = observed
+    return SurfacePatch(
+        t_ns,
         np.frombuffer(T).reshape(4, 4),
         np.frombuffer(K).reshape(2, 2),
         np.frombuffer(covariance).reshape(3, 3),

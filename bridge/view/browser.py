@@ -68,9 +68,10 @@ class LiveView:
     def write(self, sample: Sample) -> None:
         """Take one sample; now and then show where the cell is."""
         moment = self._follower.take(sample)
-        if sample.contact is not None and moment.phase not in _OFF_PATH:
+        contact = sample.touch.contact if sample.touch is not None else None
+        if contact is not None and moment.phase not in _OFF_PATH:
             value = moment.error if self._follower.shape is not None else moment.sigma
-            self._trail.add(moment.t_s, sample.contact.point, sample.contact.normal, value)
+            self._trail.add(moment.t_s, contact.point, contact.normal, value)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
         now_ns = self._clock.now_ns()

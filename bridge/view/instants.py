@@ -90,15 +90,12 @@ class Follower:
     def take(self, sample: Sample) -> Moment:
         """The moment with what was new in a sample."""
         now = replace(self.moment, t_s=sample.t_ns * 1e-9, phase=sample.phase, dropped=sample.dropped)
-        if sample.joints is not None:
-            now = replace(now, q=sample.joints.position)
-        if sample.taxels is not None:
+        if sample.q is not None:
+            now = replace(now, q=sample.q)
+        if (touch := sample.touch) is not None:
             self._felt_ns = sample.t_ns
-            force = 0.0 if sample.wrench is None else float(np.linalg.norm(sample.wrench.force))
-            now = replace(now, taxels=sample.taxels.counts, force=force, contact=sample.contact)
-        elif sample.wrench is not None:  # features only
-            self._felt_ns = sample.t_ns
-            now = replace(now, force=float(np.linalg.norm(sample.wrench.force)), contact=sample.contact)
+            taxels = now.taxels if touch.counts is None else touch.counts
+            now = replace(now, taxels=taxels, force=float(np.linalg.norm(touch.force)), contact=touch.contact)
         elif sample.t_ns - self._felt_ns > SILENT_NS:
             now = replace(now, contact=None)
         if sample.patch is not None:

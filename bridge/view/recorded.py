@@ -139,8 +139,7 @@ class RecordedRun:
         T = np.eye(4)
         T[:3, :3] = tangent_rotation(-self.log["normal"][row])
         T[:3, 3] = self.log["contact_mm"][row] * 1e-3
-        t_ns = round(float(self.log["t_s"][row]) * 1e9)
-        return ContactFrame(t_ns, T, float(self.log["force_n"][row]))
+        return ContactFrame(T)
 
 
 def read_run(folder: Path) -> RecordedRun:
