@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import math
 from collections import deque
@@ -15,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from canprobe.bridge.sample import Context, Sample
-from canprobe.bridge.view.instants import NAMES, Curves, Follower, Moment, curves_of, row_of
-from canprobe.bridge.view.meshes import UNKNOWN, heat, scale
+from canprobe.bridge.view.instants import NAMES, Follower, Moment, curves_of, row_of
+from canprobe.bridge.view.meshes import MAGMA, UNKNOWN, Array, scale
 from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.stage import Panel, Stage, address, open_server
@@ -47,7 +48,6 @@ class LiveView:
         errors = error_scale(shape)
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
-        self._address = address(server)
         self._stage = Stage(server, scene)
         self._panel = Panel(server, scene, errors)
         self._trail = Trail()
@@ -60,7 +60,7 @@ class LiveView:
     @property
     def where(self) -> str:
         """Its address."""
-        return self._address
+        return address(self._server)
 
     def start(self, epoch_ns: int) -> None:
         """Nothing to do: times are shown from the opening of the bus."""
@@ -83,8 +83,7 @@ class LiveView:
         curves = None
         if now_ns - self._plot_ns >= PLOT_NS:
             self._plot_ns = now_ns
-            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
-            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+            curves = curves_of(self._rows)
         with self._server.atomic():
             self._stage.show(moment)
             self._path.refresh()
@@ -157,8 +156,8 @@ class Player:
             self._play = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
         self._panel = Panel(server, run.scene, errors)
-        self._curves = curves_of(run.at(t) for t in run.times(max(FRAME_S, run.duration_s / MOST_POINTS)))
-        self._panel.show(run.at(start), self._curves)
+        times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
+        self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
 
     def step(self, dt_s: float) -> None:
@@ -219,16 +218,15 @@ def write_page(run: RecordedRun, file: Path) -> None:
         ResultsError: the file cannot be written.
     """
     times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
-    page = _record(run, times)
-    head, middle, tail = page.partition("</head>")
+    head, middle, tail = _record(run, times).partition("</head>")
     panel = files(__package__).joinpath("panel.html").read_text(encoding="utf-8")
     data = json.dumps(_panel_data(run, times), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    title = _escaped(f"canprobe: {run.title}")
+    title = html.escape(f"canprobe: {run.title}", quote=False)
     head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
     write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
 
 
-def _record(run: RecordedRun, times: Any) -> str:
+def _record(run: RecordedRun, times: Array) -> str:
     """Viser's page with every frame in it."""
     with open_server(0) as server:
         stage = Stage(server, run.scene)
@@ -244,10 +242,10 @@ def _record(run: RecordedRun, times: Any) -> str:
         return str(recorder.as_html())
 
 
-def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
+def _panel_data(run: RecordedRun, times: Array) -> dict[str, Any]:
     """What the panel plots: columns, taxel images, colours; None for what is not finite."""
     moments = [run.at(t) for t in times.tolist()]
-    curves = curves_of(moments)
+    curves = curves_of(map(row_of, moments))
     shape = shape_of(run)
     errors = error_scale(shape)
     task = run.scene.task
@@ -265,14 +263,10 @@ def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
         "sensor": run.scene.sensor is not None,
         "taxels": base64.b64encode(taxels).decode("ascii"),
         "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
-        "heat": heat(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0)).tolist(),
+        "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
         "unknown": list(UNKNOWN),
     }
 
 
 def _short(x: float) -> float | None:
     return float(f"{x:.5g}") if math.isfinite(x) else None
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

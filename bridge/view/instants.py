@@ -13,8 +13,6 @@ from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
 from canprobe.bridge.view.meshes import Array
 from canprobe.touch.shapes import PlacedShape
 
-# What is shown of one instant, and how it comes from samples, live or recorded.
-
 SILENT_NS = 250_000_000
 """A tactile frame, and the contact that was felt in it, is shown no longer than this after it came."""
 
@@ -112,18 +110,8 @@ class Follower:
 NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "true1", "true2", "error", "sigma")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curves:
-    """Columns of one length; NaN where there is nothing to plot.
-
-    Attributes:
-        columns: by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands.
-    """
-
-    columns: dict[str, Array]
-
-    def __getitem__(self, name: str) -> Array:
-        return self.columns[name]
+Curves = dict[str, Array]
+"""Columns by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands; NaN: nothing to plot."""
 
 
 def kappa_sigmas(patch: SurfacePatch) -> tuple[float, float]:
@@ -154,7 +142,7 @@ def row_of(moment: Moment) -> tuple[float, ...]:
     return (moment.t_s, moment.force, *bands, *moment.kappa_true, moment.error, sigma)
 
 
-def curves_of(moments: Iterable[Moment]) -> Curves:
-    """Columns of a run's moments."""
-    rows = np.array([row_of(moment) for moment in moments], dtype=np.float64).reshape(-1, len(NAMES))
-    return Curves(dict(zip(NAMES, rows.T, strict=True)))
+def curves_of(rows: Iterable[tuple[float, ...]]) -> Curves:
+    """Columns of rows from `row_of`."""
+    columns = np.array(list(rows), dtype=np.float64).reshape(-1, len(NAMES)).T
+    return dict(zip(NAMES, columns, strict=True))

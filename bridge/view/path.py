@@ -56,14 +56,9 @@ def error_scale(shape: PlacedShape | None) -> ErrorScale:
 
 
 class Trail:
-    """Collects contacts into segments.
+    """Collects contacts into segments."""
 
-    Args:
-        spacing_m: see `SPACING_M`.
-    """
-
-    def __init__(self, spacing_m: float = SPACING_M) -> None:
-        self._spacing = spacing_m
+    def __init__(self) -> None:
         self._last: Array | None = None
         self.segments: list[Array] = []
         self.values: list[float] = []
@@ -86,7 +81,7 @@ class Trail:
             self._last = lifted
             return False
         step = float(np.linalg.norm(lifted - self._last))
-        if step < self._spacing:
+        if step < SPACING_M:
             return False
         joined = step < GAP_M
         if joined:
@@ -156,8 +151,7 @@ class GrowingPath:
 
     def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
         self._api, self._trail, self._scale = api, trail, scale
-        self._done = 0
-        self._sent = 0
+        self._done = self._sent = 0
 
     def refresh(self) -> None:
         """Send what has come since."""

@@ -6,6 +6,7 @@ import json
 import math
 import zipfile
 from bisect import bisect_right
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,39 +27,6 @@ from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.tasks.probing import Phase
 from canprobe.touch.linear_algebra import tangent_rotation
-
-# The tactile images of a recorded bus, without the rest of the cell.
-
-TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
-
-
-def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
-    """Tactile frames with the time of their arrival, on the clock of the log.
-
-    Args:
-        file: a candump log; nothing comes from one that does not exist.
-        scene: with a sensor.
-
-    Returns:
-        (t_s, (16, 16) uint8 counts) by rising time; empty in features mode.
-
-    Raises:
-        UsageError: a line that is not candump's.
-    """
-    assert scene.sensor is not None
-    if scene.sensor.mode == "features" or not file.is_file():
-        return ()
-    receiver = make_tactile(make_plan(resolve(scene)))
-    assert receiver is not None
-    frames = []
-    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
-        frame = receiver.assembler.push(can_id, data, t_ns)
-        if frame is not None:
-            frames.append((t_ns * 1e-9, frame.taxels))
-    return tuple(frames)
-
-
-# A folder that `canprobe run` wrote → what there is to show, instant by instant.
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),
@@ -82,16 +50,14 @@ class RecordedRun:
 
     Attributes:
         scene: as resolved.
-        title: of the scene.
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answers: rows at which the estimator gave a new answer.
         patches: the answers.
         errors, sigmas, true: of each answer, 1/m, as in `Moment`; `true` (n, 2).
-        taxels: (t_s, (16, 16) counts) of each tactile frame.
+        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time on the clock of the log.
     """
 
     scene: Scene
-    title: str
     log: dict[str, Array]
     answers: NDArray[np.int64]
     patches: tuple[SurfacePatch, ...]
@@ -99,6 +65,11 @@ class RecordedRun:
     sigmas: Array
     true: Array
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
+
+    @property
+    def title(self) -> str:
+        """Of the scene."""
+        return self.scene.title or self.scene.name
 
     @property
     def duration_s(self) -> float:
@@ -165,11 +136,28 @@ def read_run(folder: Path) -> RecordedRun:
     shape = None if scene.object is None else true_object(scene.object)
     errors = [math.nan if shape is None else curvature_error(patch, shape) for patch in patches]
     true = [_UNKNOWN if shape is None else true_kappa(patch, shape) for patch in patches]
-    taxels = read_taxels(folder / "bus.log", scene) if scene.sensor is not None else ()
     return RecordedRun(
-        scene, scene.title or scene.name, log, answers, patches, np.array(errors),
-        np.array([curvature_sigma(patch) for patch in patches]), np.array(true).reshape(-1, 2), taxels,
-    )  # fmt: skip
+        scene=scene,
+        log=log,
+        answers=answers,
+        patches=patches,
+        errors=np.array(errors),
+        sigmas=np.array([curvature_sigma(patch) for patch in patches]),
+        true=np.array(true).reshape(-1, 2),
+        taxels=tuple(_read_taxels(folder / "bus.log", scene)),
+    )
+
+
+def _read_taxels(file: Path, scene: Scene) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """The tactile frames of a candump log; none where there is no log, or in features mode."""
+    if scene.sensor is None or scene.sensor.mode == "features" or not file.is_file():
+        return
+    receiver = make_tactile(make_plan(resolve(scene)))
+    assert receiver is not None
+    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
+        frame = receiver.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            yield t_ns * 1e-9, frame.taxels
 
 
 def _check_schema(file: Path) -> None:

@@ -166,7 +166,7 @@ def test_the_stated_deviation_is_the_expected_size_of_an_error():
 
 
 def test_curves_hold_the_bands_of_the_answers(run):
-    curves = curves_of(run.at(t) for t in run.times(0.04))
+    curves = curves_of(row_of(run.at(t)) for t in run.times(0.04))
     last = run.patches[-1]
     assert (curves["kappa1"][-1], curves["kappa2"][-1]) == pytest.approx(last.kappa)
     s1, s2 = kappa_sigmas(last)
