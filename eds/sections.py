@@ -57,7 +57,7 @@ class Faults:
         return tuple(sorted(self.found, key=lambda fault: fault.line))
 
 
-# Bytes of an EDS file → its sections, keys and values, each with its line.
+# The text of a file → its sections.
 
 LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
@@ -120,7 +120,7 @@ def decode(data: bytes, faults: Faults) -> str:
 
 
 def split_sections(text: str, faults: Faults) -> Sections:
-    """The sections of a text; what is neither section, key nor comment is told and left out."""
+    """The sections of a text; what is neither section, key nor comment is left out with a warning."""
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
     current: Section | None = None
@@ -139,7 +139,7 @@ def split_sections(text: str, faults: Faults) -> Sections:
         else:
             _add(current, line, number, faults)
     for first, again in repeated:
-        _tell_repetition(first, again, faults)
+        _warn_of_repetition(first, again, faults)
     return sections
 
 
@@ -162,7 +162,7 @@ def _add(section: Section, line: str, number: int, faults: Faults) -> None:
         faults.warn(number, section.name, item.key, f"was {first.value!r} in line {first.line} already, which counts")
 
 
-def _tell_repetition(first: Section, again: Section, faults: Faults) -> None:
+def _warn_of_repetition(first: Section, again: Section, faults: Faults) -> None:
     old, new = ({key: item.value for key, item in section.items.items()} for section in (first, again))
     how = "the same" if old == new else "but different"
     faults.warn(again.line, again.name, "", f"is in line {first.line} already, {how}; that one counts")
@@ -249,7 +249,7 @@ def parse_flag(text: str, remark: Remark) -> bool:
     return word
 
 
-# What the builders of a dictionary share: the sections, the node, and where they tell what is odd.
+# What the builders of a dictionary share.
 
 
 @dataclass(frozen=True, slots=True)
