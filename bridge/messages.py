@@ -102,12 +102,12 @@ class Encoder:
         return str(self.store.hash_rihs01(type_name))
 
 
-# The topics that every ROS sink has in common: names, types, and the quality of service that ROS expects of them.
+# The topics that every ROS sink has.
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic.
+    """One topic, with the quality of service that ROS expects of it.
 
     Attributes:
         name: as ROS writes it.
@@ -226,14 +226,10 @@ class Messages:
     # one function a message
 
     def _joint_state(self, t_ns: int, q: Array) -> Any:
-        nothing = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
+        unknown = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
+        header, names = self._header(t_ns, BASE), list(JOINT_NAMES)
         return self._make(
-            "sensor_msgs/msg/JointState",
-            header=self._header(t_ns, BASE),
-            name=list(JOINT_NAMES),
-            position=np.asarray(q, np.float64),
-            velocity=nothing,
-            effort=nothing,
+            "sensor_msgs/msg/JointState", header=header, name=names, position=q, velocity=unknown, effort=unknown
         )
 
     def _static(self, t_ns: int) -> Any:
@@ -284,17 +280,11 @@ class Messages:
         return self._make("geometry_msgs/msg/Vector3Stamped", header=self._header(patch.t_ns, CONTACT), vector=vector)
 
     def _diagnostics(self, sample: Sample) -> Any:
-        status = [
-            self._make(
-                "diagnostic_msgs/msg/DiagnosticStatus",
-                level=d.level,
-                name=d.name,
-                message=d.message,
-                hardware_id="canprobe",
-                values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values],
-            )
-            for d in sample.diagnostics
-        ]
+        status = []
+        for d in sample.diagnostics:
+            values = [self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values]
+            words = {"name": d.name, "message": d.message, "hardware_id": "canprobe"}
+            status.append(self._make("diagnostic_msgs/msg/DiagnosticStatus", level=d.level, values=values, **words))
         return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header(sample.t_ns, ""), status=status)
 
     # parts of messages
@@ -315,23 +305,15 @@ class Messages:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def _tf(self, t_ns: int, transforms: list[tuple[str, str, Array]]) -> Any:
-        return self._make(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[
+        stamped = []
+        for parent, child, T in transforms:
+            x, y, z, w = quaternion_of(T[:3, :3])
+            rotation = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+            transform = self._make("geometry_msgs/msg/Transform", translation=self._vector(T[:3, 3]), rotation=rotation)
+            header = self._header(t_ns, parent)
+            stamped.append(
                 self._make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self._header(t_ns, parent),
-                    child_frame_id=child,
-                    transform=self._transform(T),
+                    "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
                 )
-                for parent, child, T in transforms
-            ],
-        )
-
-    def _transform(self, T: Array) -> Any:
-        x, y, z, w = quaternion_of(T[:3, :3])
-        return self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._vector(T[:3, 3]),
-            rotation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
+            )
+        return self._make("tf2_msgs/msg/TFMessage", transforms=stamped)

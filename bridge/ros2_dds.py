@@ -149,7 +149,7 @@ def dds_name(type_name: str) -> str:
     return f"{package}::{kind}::dds_::{name}_"
 
 
-# Live ROS 2 topics without ROS: Cyclone DDS with ROS's names, types, hashes and quality of service; commands back.
+# The sink.
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)

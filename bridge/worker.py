@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -78,9 +78,7 @@ class Health:
         """Take what one observation says; the state of all where it is time for it, else nothing."""
         for frame in received.frames:
             self._push(frame)
-        if received.measurement is None:
-            return ()
-        if self._due_ns is not None and t_ns < self._due_ns:
+        if received.measurement is None or (self._due_ns is not None and t_ns < self._due_ns):
             return ()
         self._due_ns = t_ns + PERIOD_NS
         nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
@@ -101,7 +99,6 @@ class Health:
         drive = self._drive(node, measurement)
         event = watch.last_emcy.get(node_id)
         silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
-        level, message = WELL, "operational"
         if silent:
             level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
         elif event is not None and event.emcy.code != NO_ERROR:
@@ -110,6 +107,8 @@ class Health:
             level, message = FAILED, "drive fault"
         elif state is not NmtState.OPERATIONAL:
             level, message = LOOK, state.name.lower() if state is not None else "no heartbeat yet"
+        else:
+            level, message = WELL, "operational"
         values = [("nmt_state", state.name.lower() if state is not None else "unknown")]
         if drive is not None:
             values.append(("drive_state", drive.name.lower()))
@@ -226,7 +225,7 @@ def _contact(contact: ContactSample) -> ContactFrame:
     return ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))
 
 
-# The process of one bridge: records from the cell on stdin, lines of JSON back on stdout.
+# The process.
 
 NICE = 10
 """Whatever a bridge computes, the cell and its nodes come first."""
@@ -272,7 +271,7 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
     return 0
 
 
-def _context(config: dict[str, Any], send: Any) -> Context:
+def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) -> Context:
     plan = make_plan(resolve(parse_scene(config["scene"])))
     out = Path(config["out"]) if config["out"] is not None else None
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
@@ -281,19 +280,15 @@ def _context(config: dict[str, Any], send: Any) -> Context:
 def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[int, str | None]:
     """Give the sink every sample; how many there were, and the summary."""
     received = 0
-    summary: str | None = None
-    started = False
     for record in records:
         body = record[1:]
         if record[0] == END:
-            summary = body.decode() or None
-            break
-        if not started:
-            started = True
+            return received, body.decode() or None
+        if not received:
             sink.start(int.from_bytes(body[:8], "little"))
         sink.write(source.sample(unpack_observation(body[8:])))
         received += 1
-    return received, summary
+    return received, None
 
 
 def main() -> int:
