@@ -68,9 +68,7 @@ class FoxgloveSink:
         return self._channels[topic.name].has_sinks()
 
 
-def open_sink(context: Context) -> FoxgloveSink:
-    """Start the server."""
-    return FoxgloveSink(context)
+open_sink = FoxgloveSink
 
 
 def _channel(topic: Topic, encoder: Encoder, room: foxglove.Context) -> foxglove.Channel:

@@ -102,9 +102,7 @@ class McapSink:
         return self._writer.register_channel(topic.name, "cdr", schema, metadata)
 
 
-def open_sink(context: Context) -> McapSink:
-    """Begin the file."""
-    return McapSink(context)
+open_sink = McapSink
 
 
 def _qos_yaml(topic: Topic) -> str:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.bridge.sample import Context, Sample
-from canprobe.bridge.view.instants import NAMES, Follower, Moment, curves_of, row_of
+from canprobe.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
 from canprobe.bridge.view.meshes import MAGMA, UNKNOWN, Array, scale
 from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
 from canprobe.bridge.view.recorded import RecordedRun
@@ -70,7 +70,7 @@ class LiveView:
         moment = self._follower.take(sample)
         contact = sample.touch.contact if sample.touch is not None else None
         if contact is not None and moment.phase not in _OFF_PATH:
-            value = moment.error if self._follower.shape is not None else moment.sigma
+            value = _colour_value(moment.answer, self._follower.shape is not None)
             self._trail.add(moment.t_s, contact.point, contact.normal, value)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
@@ -95,9 +95,7 @@ class LiveView:
         self._stack.close()
 
 
-def open_sink(context: Context) -> LiveView:
-    """The bridge `view`."""
-    return LiveView(context)
+open_sink = LiveView
 
 
 # A recorded run in a browser, with a time slider, play and pause.
@@ -182,6 +180,13 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
     return None if run.scene.object is None else true_object(run.scene.object)
 
 
+def _colour_value(answer: Answer | None, truth: bool) -> float:
+    """What colours the path, see `error_scale`."""
+    if answer is None:
+        return math.nan
+    return answer.error if truth else answer.sigma
+
+
 def trail_of(run: RecordedRun) -> Trail:
     """The path of a run's contact, coloured by the error of its estimates; by their deviation without a true object."""
     trail, log = Trail(), run.log
@@ -189,9 +194,9 @@ def trail_of(run: RecordedRun) -> Trail:
         return trail
     touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
     rows = np.nonzero(touched)[0]
-    answers = np.searchsorted(run.answers, rows, side="right") - 1
-    known = run.sigmas if run.scene.object is None else run.errors
-    values = np.append(known, math.nan)[answers].tolist()  # the last for −1: before the first answer
+    latest = np.searchsorted(run.answer_rows, rows, side="right") - 1
+    answers = (*run.answers, None)  # the last for −1: before the first answer
+    values = [_colour_value(answers[at], run.scene.object is not None) for at in latest.tolist()]
     times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
     for t_s, point, normal, value in zip(times, points, log["normal"][rows], values, strict=True):
         trail.add(t_s, point, normal, value)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
-from canprobe.bridge.view.instants import Moment, curvature_error, curvature_sigma, true_kappa
+from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
 from canprobe.bus.disk import read_candump
 from canprobe.cell.assembly import make_tactile
@@ -41,7 +41,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "K_covariance_per_m2": (3, 3),
 }
 """Columns of ``log.npz`` that are shown, and the shape of a row."""
-_UNKNOWN = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,19 +50,15 @@ class RecordedRun:
     Attributes:
         scene: as resolved.
         log: the columns of `_SHAPES` that the run has; every row one cycle.
-        answers: rows at which the estimator gave a new answer.
-        patches: the answers.
-        errors, sigmas, true: of each answer, 1/m, as in `Moment`; `true` (n, 2).
+        answer_rows: rows at which the estimator gave a new answer.
+        answers: at each of them.
         taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time on the clock of the log.
     """
 
     scene: Scene
     log: dict[str, Array]
-    answers: NDArray[np.int64]
-    patches: tuple[SurfacePatch, ...]
-    errors: Array
-    sigmas: Array
-    true: Array
+    answer_rows: NDArray[np.int64]
+    answers: tuple[Answer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
 
     @property
@@ -85,19 +80,16 @@ class RecordedRun:
         """What the cell knew at an instant."""
         log = self.log
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
-        answer = int(np.searchsorted(self.answers, row, side="right")) - 1
+        answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
         frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
         return Moment(
             t_s=float(log["t_s"][row]),
             phase=self._phase(row),
             q=log["q_rad"][row] if "q_rad" in log and np.isfinite(log["q_rad"][row]).all() else None,
             contact=self._contact(row),
-            patch=self.patches[answer] if answer >= 0 else None,
+            answer=self.answers[answer] if answer >= 0 else None,
             taxels=self.taxels[frame][1] if frame >= 0 else None,
             force=float(log["force_n"][row]) if "force_n" in log else math.nan,
-            error=float(self.errors[answer]) if answer >= 0 else math.nan,
-            kappa_true=(float(self.true[answer, 0]), float(self.true[answer, 1])) if answer >= 0 else _UNKNOWN,
-            sigma=float(self.sigmas[answer]) if answer >= 0 else math.nan,
         )
 
     def _phase(self, row: int) -> str | None:
@@ -132,18 +124,13 @@ def read_run(folder: Path) -> RecordedRun:
     _check_schema(folder / "summary.json")
     scene = load_scene(folder / "scene.toml")
     log = _read_log(folder / "log.npz")
-    answers, patches = _answers(log)
+    rows = _new_answers(log)
     shape = None if scene.object is None else true_object(scene.object)
-    errors = [math.nan if shape is None else curvature_error(patch, shape) for patch in patches]
-    true = [_UNKNOWN if shape is None else true_kappa(patch, shape) for patch in patches]
     return RecordedRun(
         scene=scene,
         log=log,
-        answers=answers,
-        patches=patches,
-        errors=np.array(errors),
-        sigmas=np.array([curvature_sigma(patch) for patch in patches]),
-        true=np.array(true).reshape(-1, 2),
+        answer_rows=rows,
+        answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
         taxels=tuple(_read_taxels(folder / "bus.log", scene)),
     )
 
@@ -194,15 +181,14 @@ def _read_log(file: Path) -> dict[str, Array]:
     return log
 
 
-def _answers(log: dict[str, Array]) -> tuple[NDArray[np.int64], tuple[SurfacePatch, ...]]:
-    """Rows at which the estimate changed, and the estimates; the log repeats each until the next."""
+def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
+    """Rows at which the estimate changed; the log repeats each until the next."""
     if "K_per_m" not in log or "T_base_contact_m" not in log:
-        return np.empty(0, np.int64), ()
+        return np.empty(0, np.int64)
     key = np.concatenate([log[name].reshape(len(log["t_s"]), -1) for name in ("T_base_contact_m", "K_per_m")], axis=1)
     known = np.isfinite(log["T_base_contact_m"]).all(axis=(1, 2))
     new = np.append(True, (key[1:] != key[:-1]).any(axis=1)) & known
-    rows = np.nonzero(new)[0]
-    return rows, tuple(_patch(log, int(row)) for row in rows)
+    return np.nonzero(new)[0]
 
 
 def _patch(log: dict[str, Array], row: int) -> SurfacePatch:

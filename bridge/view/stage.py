@@ -187,7 +187,7 @@ class Stage:
         self._label.text = f"{moment.force:.2f} N"
 
     def _show_patch(self, moment: Moment) -> None:
-        patch = moment.patch
+        patch = moment.answer.patch if moment.answer is not None else None
         self._patch.visible = patch is not None
         if patch is None or patch is self._drawn_patch:
             return
@@ -317,12 +317,12 @@ class Panel:
             rows.append(("phase", moment.phase))
         if math.isfinite(moment.force):
             rows.append(("force", f"{moment.force:.2f} N"))
-        if moment.patch is not None:
-            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in moment.patch.kappa)
+        if (answer := moment.answer) is not None:
+            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in answer.patch.kappa)
             rows.append(("κ", f"{kappa} 1/m"))
-            if math.isfinite(moment.kappa_true[0]):
-                rows.append(("κ true", f"{moment.kappa_true[0]:.2f}, {moment.kappa_true[1]:.2f} 1/m"))
-            rows.append(("error of K", "–" if math.isnan(moment.error) else f"{moment.error:.2f} 1/m"))
+            if math.isfinite(answer.kappa_true[0]):
+                rows.append(("κ true", f"{answer.kappa_true[0]:.2f}, {answer.kappa_true[1]:.2f} 1/m"))
+            rows.append(("error of K", "–" if math.isnan(answer.error) else f"{answer.error:.2f} 1/m"))
         if moment.dropped:
             rows.append(("samples dropped", str(moment.dropped)))
         return "| | |\n|:--|:--|\n" + "\n".join(f"| {name} | **{text}** |" for name, text in rows)
