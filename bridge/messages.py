@@ -7,7 +7,7 @@ ros2_socketcan_msgs, which it does not carry.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,7 +21,6 @@ from canprobe.bridge.sample import (
     FLANGE,
     JOINT_NAMES,
     PROBE,
-    CanFrame,
     Sample,
     SurfacePatch,
     TouchFrame,
@@ -29,7 +28,10 @@ from canprobe.bridge.sample import (
     link_transforms,
     quaternion_of,
 )
+from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
+from canprobe.planning.traffic import CLASSIC_BYTES
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 from canprobe.robot.kinematics import MODELS
 from canprobe.scene.geometry import T_flange_probe
 
@@ -58,18 +60,24 @@ _CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
-def encode_can_frame(t_ns: int, frame: CanFrame) -> bytes:
+def encode_can_frame(t_ns: int, can_id: int, data: bytes) -> bytes:
     """A `can_msgs/msg/Frame` as the encoder makes it, for a fiftieth of its time.
 
     Args:
         t_ns: since the epoch.
-        frame: the frame.
+        can_id: with `EFF_FLAG` and `RTR_FLAG`.
+        data: up to 8 bytes.
     """
     seconds, ns = divmod(t_ns, 1_000_000_000)
-    data = frame.data
-    return _CAN_FRAME_CDR.pack(
-        _LITTLE_ENDIAN, seconds, ns, 1, 0, frame.can_id, frame.remote, frame.extended, False, len(data), data
-    )
+    identifier, extended = _identifier(can_id)
+    remote = bool(can_id & RTR_FLAG)
+    return _CAN_FRAME_CDR.pack(_LITTLE_ENDIAN, seconds, ns, 1, 0, identifier, remote, extended, False, len(data), data)
+
+
+def _identifier(can_id: int) -> tuple[int, bool]:
+    """The identifier without flags, and whether it has 29 bits."""
+    extended = bool(can_id & EFF_FLAG)
+    return can_id & (0x1FFFFFFF if extended else 0x7FF), extended
 
 
 class Encoder:
@@ -182,23 +190,24 @@ class Messages:
             if self._wanted(topic):
                 yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
 
-    def _can_frames(self, frames: tuple[CanFrame, ...]) -> Iterator[Message]:
+    def _can_frames(self, frames: Sequence[TimedFrame]) -> Iterator[Message]:
         """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
         classic, fd = self._wanted(CAN_FRAMES), self._wanted(CAN_FD_FRAMES)
-        for frame in frames:
-            t_ns = self._epoch_time(frame.t_ns)
-            if len(frame.data) <= 8:
+        for can_id, data, at_ns in frames:
+            t_ns = self._epoch_time(at_ns)
+            if len(data) <= CLASSIC_BYTES:
                 if classic:
-                    yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+                    yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, can_id, data)
             elif fd:
+                identifier, extended = _identifier(can_id)
                 message = self._make(
                     CAN_FD_FRAMES.type_name,
-                    header=self._header(frame.t_ns, ""),
-                    id=frame.can_id,
-                    is_extended=frame.extended,
+                    header=self._header(at_ns, ""),
+                    id=identifier,
+                    is_extended=extended,
                     is_error=False,
-                    len=len(frame.data),
-                    data=np.frombuffer(frame.data, np.uint8),
+                    len=len(data),
+                    data=np.frombuffer(data, np.uint8),
                 )
                 yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 

@@ -1,13 +1,13 @@
 """What every bridge is fed: one neutral sample of the cell in SI units; its tree of frames; and what a bridge offers.
 
-A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool, a
-message type or a bus. Times are in nanoseconds. z of the contact frame is the inward normal.
+A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool or a
+message type. Times are in nanoseconds. z of the contact frame is the inward normal.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,6 +15,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
 from canprobe.robot.kinematics import PumaModel
 from canprobe.scene.model import BridgeSettings
@@ -130,25 +131,6 @@ class SurfacePatch:
 
 
 @dataclass(frozen=True, slots=True)
-class CanFrame:
-    """One frame that was on the bus.
-
-    Attributes:
-        t_ns: when, on the clock of the samples.
-        can_id: 11 or 29 bits.
-        data: up to 8 bytes; up to 64 in CAN FD.
-        extended: the identifier has 29 bits.
-        remote: a remote request.
-    """
-
-    t_ns: int
-    can_id: int
-    data: bytes
-    extended: bool = False
-    remote: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Diagnostic:
     """The state of a node, or of the cell.
 
@@ -176,7 +158,7 @@ class Sample:
         q: (6,) joint angles at the SYNC, rad; None without an arm, or before all joints were heard.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
-        frames: what was on the bus since the sample before.
+        frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
         diagnostics: of all nodes and of the bridge, about once a second.
         dropped: samples that were lost on the way to this bridge so far.
     """
@@ -187,7 +169,7 @@ class Sample:
     q: Array | None = None
     touch: TouchFrame | None = None
     patch: SurfacePatch | None = None
-    frames: tuple[CanFrame, ...] = ()
+    frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0
 

@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 
 from canprobe.bridge.process import Received, read_records, unpack_observation
 from canprobe.bridge.sample import (
-    CanFrame,
     ContactFrame,
     Context,
     Diagnostic,
@@ -43,7 +42,7 @@ from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
-from canprobe.protocol.frames import EFF_FLAG, NO_ERROR, RTR_FLAG, NmtState, describe
+from canprobe.protocol.frames import NO_ERROR, NmtState, describe
 from canprobe.scene.load import parse_scene
 from canprobe.scene.model import BridgeSettings
 from canprobe.scene.resolve import resolve
@@ -158,23 +157,20 @@ class SampleSource:
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
         measurement, t_ns = received.measurement, received.t_ns
-        frames = tuple(_frame(frame) for frame in received.frames)
         diagnostics = self._health.step(t_ns, received)
+        sample = Sample(t_ns, frames=received.frames, diagnostics=diagnostics, dropped=received.dropped)
         if measurement is None:
-            return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
+            return sample
         self._place_on(received.patch)  # before the contact, as the task does
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
-        return Sample(
-            t_ns,
+        return replace(
+            sample,
             cycle=measurement.cycle,
             phase=_PHASES.get(received.phase) if received.phase is not None else None,
             q=measurement.q if self._has_arm else None,
             touch=self._touch(measurement, t_ns - measurement.t_ns),
             patch=received.patch,
-            frames=frames,
-            diagnostics=diagnostics,
-            dropped=received.dropped,
         )
 
     def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:
@@ -211,14 +207,6 @@ def _sensing(setup: Setup) -> ContactSensing | None:
     if touch is None:
         return None
     return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
-
-
-def _frame(frame: TimedFrame) -> CanFrame:
-    can_id, data, t_ns = frame
-    if can_id <= 0x7FF:
-        return CanFrame(t_ns, can_id, data)
-    extended = bool(can_id & EFF_FLAG)
-    return CanFrame(t_ns, can_id & (0x1FFFFFFF if extended else 0x7FF), data, extended, bool(can_id & RTR_FLAG))
 
 
 def _contact(contact: ContactSample) -> ContactFrame:
