@@ -267,7 +267,7 @@ def _slave(plan: Plan, node: PlannedNode, setup: NodeSetup, eds: str) -> dict[st
 
 
 def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
-    """Whether dcfgen has no key of its own for this write."""
+    """Whether dcfgen has no key that makes this write."""
     if write.index not in _PDO_OBJECTS:
         return write.index not in _OWN_KEYS
     direction: Direction = "rpdo" if write.index < 0x1800 else "tpdo"

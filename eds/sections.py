@@ -88,7 +88,7 @@ class Section:
     items: dict[str, Item] = field(default_factory=dict)
 
     def value(self, key: str) -> str:
-        """The value, empty where there is none."""
+        """The value; empty where the key is missing."""
         item = self.items.get(key.lower())
         return "" if item is None else item.value
 
@@ -188,7 +188,7 @@ def parse_integer(text: str, remark: Remark) -> int:
         remark: called with what is odd about it.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number.
     """
     if match := _HEX.fullmatch(text):
         return int(match[1] + match[2], 16)
@@ -209,7 +209,7 @@ def _leading_zeros(text: str, remark: Remark) -> int:
         if octal != int(text):
             remark(f"{text} is octal by CiA 306, {octal}; {int(text)} is written without the leading zero")
         return octal
-    remark(f"{text} begins with a zero, as octal numbers do, but is none; read as {int(text)}")
+    remark(f"{text} begins with a zero, as octal numbers do, but is not octal; read as {int(text)}")
     return int(text)
 
 
@@ -220,7 +220,7 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
         The value for this node, and whether it depends on the node.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number.
     """
     total, relative = 0, False
     for term in map(str.strip, text.split("+")):

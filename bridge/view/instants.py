@@ -14,7 +14,7 @@ from canprobe.bridge.view.meshes import Array
 from canprobe.touch.shapes import PlacedShape
 
 SILENT_NS = 250_000_000
-"""A tactile frame, and the contact that was felt in it, is shown no longer than this after it came."""
+"""A contact is shown no longer than this after the tactile frame that showed it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

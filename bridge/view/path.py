@@ -22,7 +22,7 @@ LIFT_M = 1e-3
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
 OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
-"""Phases in which what the array still feels, or feels first, is no point of the path."""
+"""Phases whose contacts are not points of the path."""
 SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 
@@ -39,7 +39,7 @@ class ErrorScale:
     text: str
 
     def colours(self, values: Array) -> Colours:
-        """(n, 3) colours of values (n,), 1/m; grey where there is none."""
+        """(n, 3) colours of values (n,), 1/m; grey where a value is not finite."""
         return scale(values, 0.0, self.high)
 
 

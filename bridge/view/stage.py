@@ -199,7 +199,7 @@ class Stage:
 
 
 def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Taxels that feel nothing are hardly there."""
+    """Taxels without pressure are almost transparent."""
     return np.where(counts > 0, 0.85, 0.04).astype(np.float32)
 
 
@@ -329,7 +329,7 @@ class Panel:
 
 
 def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:
-    """Fixed ends of the axes: uPlot finds none of its own where a value is missing (NaN)."""
+    """Fixed ends of the axes: uPlot cannot find them where a value is missing (NaN)."""
     scale_of = importlib.import_module("viser").uplot.Scale
     values = np.concatenate([column[np.isfinite(column)] for column in columns]) if columns else np.empty(0)
     low, high = np.percentile(values, (1.0, 99.0)).tolist() if len(values) else (0.0, 1.0)

@@ -40,7 +40,7 @@ class Message:
         deadline_ns: latest end of its transmission after the event; None: the period. May exceed the period.
         frame_ns: time of one frame, where it is not the worst case of a classical frame at the bit rate.
         offset_ns: earliest queueing after the event that all messages with an offset share, up to multiples of their
-            periods; None for a message of its own time, queued at its event at the earliest.
+            periods; None for a message that keeps its own time, queued at its event at the earliest.
     """
 
     name: str
