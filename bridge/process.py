@@ -256,7 +256,8 @@ CLOSE_TIMEOUT_S = 1.0
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
-_OBSERVATION, _END = b"o", b"e"
+OBSERVATION, END = b"o", b"e"
+"""First byte of a record: what follows."""
 
 
 class BridgeProcess:
@@ -333,7 +334,7 @@ class BridgeProcess:
             epoch = 0 if self._virtual else epoch_now_ns() - observation.t_ns
             self._epoch = epoch.to_bytes(8, "little")
         feed = self._feed
-        feed.put(_OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
+        feed.put(OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
         if self._takes_requests and not feed.broken:
             self._poll_in -= 1
             if self._poll_in <= 0:
@@ -383,7 +384,7 @@ class BridgeProcess:
         try:
             self._feed.flush(_left_s(deadline))
             taken, dropped = self._feed.taken, self._feed.dropped
-            self._feed.put(_END + (summary or "").encode())
+            self._feed.put(END + (summary or "").encode())
             self._feed.flush(_left_s(deadline))
             self._feed.taken, self._feed.dropped = taken, max(dropped, self._feed.dropped - 1)
             self._feed.close()

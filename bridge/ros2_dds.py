@@ -36,8 +36,6 @@ from canprobe.scene.resolve import resolve
 
 # Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass.
 
-KINDS = ("start", "stop", "target_force_n", "speed_m_s")
-
 
 def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     """Why a command is refused, or None.
@@ -47,7 +45,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
 
     Args:
         plan: of the run.
-        kind: one of `KINDS`.
+        kind: start, stop, target_force_n or speed_m_s.
         value: N or m/s; None for start and stop.
     """
     if kind in ("start", "stop"):

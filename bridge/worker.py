@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.process import Received, read_records, unpack_observation
+from canprobe.bridge.process import END, Received, read_records, unpack_observation
 from canprobe.bridge.sample import (
     ContactFrame,
     Context,
@@ -217,8 +217,6 @@ def _contact(contact: ContactSample) -> ContactFrame:
 
 NICE = 10
 """Whatever a bridge computes, the cell and its nodes come first."""
-OBSERVATION, END = b"o"[0], b"e"[0]
-"""First byte of a record: what follows."""
 
 
 def run(name: str, records: Iterator[bytes], fd: int) -> int:
@@ -270,7 +268,7 @@ def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[
     received = 0
     for record in records:
         body = record[1:]
-        if record[0] == END:
+        if record[:1] == END:
             return received, body.decode() or None
         if not received:
             sink.start(int.from_bytes(body[:8], "little"))
