@@ -15,7 +15,7 @@ from canprobe.cell.controller import Measurement
 from canprobe.cell.cycle import SYNCS_REMEMBERED, Intake
 from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames, make_drives
 from canprobe.cell.lift_off import WayBack
-from canprobe.cell.supervision import TOUCH_FORCE
+from canprobe.cell.supervision import HOLD_CYCLES, TOUCH_FORCE
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
