@@ -20,7 +20,6 @@ from canprobe.scene.setup import Array, Setup
 _COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
 _MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
 _SIGNED_TYPES = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
-_INVALID_BIT = 1 << 31
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,11 +98,6 @@ class Abilities:
         """The mapping that the EDS gives as default."""
         index = _MAPPING[direction] + number - 1
         return tuple(self._default(index, sub) or 0 for sub in range(1, (self._default(index, 0) or 0) + 1))
-
-    def active_by_default(self, direction: Direction, number: int) -> bool:
-        """Whether the PDO is valid when the device boots."""
-        cob_id = self._default(_COMMUNICATION[direction] + number - 1, 1)
-        return cob_id is None or not cob_id & _INVALID_BIT
 
     def _default(self, index: int, subindex: int) -> int | None:
         variable = self._variable(index, subindex)

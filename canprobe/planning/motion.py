@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.planning.choices import PITCH_M
 from canprobe.planning.model import JointSpeeds
+from canprobe.planning.window import PITCH_M
 from canprobe.protocol.tactile import SIDE
 from canprobe.robot.inverse import inverse_near, probe_pose
 from canprobe.robot.kinematics import forward

@@ -12,18 +12,17 @@ import canprobe
 from canprobe.cli import main
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning.choices import (
-    PITCH_M,
-    cut_patch,
-    measured_share,
-    opened,
-    patch_radius_m,
-    second_channel,
-    true_force_n,
-)
+from canprobe.planning.choices import opened, second_channel
 from canprobe.planning.devices import order_by_deadline
 from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
+from canprobe.planning.window import (
+    PITCH_M,
+    cut_patch,
+    measured_share,
+    patch_radius_m,
+    true_force_n,
+)
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.response_times import Message, worst_case_response
 from canprobe.scene.load import dump_scene, load_scene, parse_scene

@@ -31,7 +31,7 @@ from canprobe.scene.load import load_scene, packaged_scenes
 def test_what_each_scene_uses_and_leaves_out(name, kinds, estimator, strategy, absent):
     plan = canprobe.plan(load_scene(name))
     assert {node.kind for node in plan.nodes} == kinds
-    assert (plan.estimator, plan.strategy) == (estimator, strategy)
+    assert (plan_dict(plan)["estimator"], plan_dict(plan)["strategy"]) == (estimator, strategy)
     assert absent <= {what for what, _ in plan.left_out}
     assert all(why for _, why in plan.left_out)
 
