@@ -128,13 +128,13 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
 def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
     sync, problems = plan_sync(setup)
     ratio, found = plan_ratio(setup)
-    planning = PdoPlanning(problems=[*problems, *found])
+    not_available = []
     if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if SYNC_COUNTER not in device.od]:
         sync = replace(sync, overflow=0)
-        planning.not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
-    plan_drive_pdos(planning, setup, sync, devices)
-    if setup.array is not None:
-        plan_tactile_pdos(planning, setup, sync, ratio, devices[setup.array.node_id])
+        not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
+    planning = PdoPlanning(setup, sync, devices, problems=[*problems, *found], not_available=not_available)
+    plan_drive_pdos(planning)
+    plan_tactile_pdos(planning, ratio)
     planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
     planning.problems += identifier_problems(planned)
     buses: list[PlannedBus] = []

@@ -1,5 +1,6 @@
 """The bus part of a plan against the budget table of the cell, and what does not fit."""
 
+import dataclasses
 import importlib.resources
 import math
 import re
@@ -10,12 +11,14 @@ from scenes import change, reasons, refused, ways_out, without_torque
 
 import canprobe
 from canprobe.planning.devices import Abilities, identifier_problems
+from canprobe.planning.make import make_plan
 from canprobe.planning.measured import expected_messages
 from canprobe.planning.model import PlannedPdo
 from canprobe.planning.report import plan_dict
 from canprobe.planning.traffic import controller_starts
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene.load import dump_scene, load_scene, parse_scene
+from canprobe.scene.resolve import resolve
 
 
 @pytest.fixture(scope="module")
@@ -293,6 +296,19 @@ class TestOtherDevices:
         plan = canprobe.plan(without_torque(load_scene("free"), tmp_path, fixed=fixed))
         assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
         assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
+
+    def test_each_drive_is_planned_by_its_own_eds(self, edit):
+        """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
+        plain = load_scene("free")
+        scene = edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
+        setup = resolve(plain)
+        drives = list(setup.arm.drives)
+        drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
+        plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
+        assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
+        assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
+        assert {pdo.number for pdo in plan.pdos} == {1}
+        assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
 
     def test_target_that_cannot_be_mapped_is_refused(self, edit):
         problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
