@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
 from typing import Any, Literal
@@ -14,9 +14,9 @@ from canprobe.planning.model import (
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
     CycleBudget,
+    JointSpeeds,
     Plan,
     PlannedBus,
-    PlannedNode,
     PlannedPdo,
     Traffic,
 )
@@ -186,86 +186,63 @@ def _lines(plan: Plan) -> Iterator[str]:
     if bus.transmit_queue == "fifo":
         yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat holds up what follows it'
     yield from (f"warning: {warning}" for warning in plan.warnings)
-    yield from _titled("nodes", _node_rows(plan.nodes))
-    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
+    yield from _titled("nodes", _node_rows(plan))
+    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan))
     for one in plan.buses:
-        yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
+        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic))
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
-    yield from _titled(title, list(_budget_rows(plan.traffic.budget)))
-    yield from _titled(_timeline_title(plan), timeline_rows(plan, TIMELINE_WIDTH))
-    if plan.choices:
-        rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
-        yield from _titled("chosen by the plan", rows)
-    if plan.joint_speeds is not None:
-        rows = [["joint", "needed deg/s", "allowed deg/s"]]
-        speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
-        rows += [[str(i), f"{needed:.1f}", f"{limit:g}"] for i, (needed, limit) in enumerate(speeds, start=1)]
-        yield from _titled("joint speeds", rows)
-    yield from _titled("uses", list(_use_rows(plan)))
-    yield from _titled("leaves out", [list(row) for row in plan.left_out])
-    if plan.not_available:
-        yield from _titled("could not have", [list(row) for row in plan.not_available])
+    yield from _titled(title, _budget_rows(plan.traffic.budget))
+    each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // TIMELINE_WIDTH)} µs"
+    parts = "(S SYNC, f feedback, C controller, r commands, t tactile)"
+    yield from _titled(f"{each} {parts}", timeline_rows(plan, TIMELINE_WIDTH))
+    yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices))
+    yield from _titled("joint speeds", _speed_rows(plan.joint_speeds))
+    yield from _titled("uses", _use_rows(plan))
+    yield from _titled("leaves out", plan.left_out)
+    yield from _titled("could not have", plan.not_available)
 
 
-def _timeline_title(plan: Plan) -> str:
-    return (
-        f"as it goes, worst-case lengths, one character {_us(plan.sync.period_ns // TIMELINE_WIDTH)} µs "
-        "(S SYNC, f feedback, C controller, r commands, t tactile)"
-    )
-
-
-def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield ""
-    yield f"{title}:"
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right = [_is_numeric(column[1:]) for column in zip(*rows, strict=True)]
+def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """A table with its title; numbers, and a time without a bound, at the right; nothing without rows."""
+    if not (rows := list(rows)):
+        return
+    columns = list(zip(*rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    number = re.compile(r"-?[\d.]+( %)?|unbounded")
+    numeric = [len(rows) > 1 and all(map(number.fullmatch, column[1:])) for column in columns]
+    yield from ("", f"{title}:")
     for row in rows:
-        cells = (
-            cell.rjust(width) if numeric else cell.ljust(width)
-            for cell, width, numeric in zip(row, widths, right, strict=True)
-        )
-        yield "  " + "  ".join(cells).rstrip()
+        cells = zip(row, widths, numeric, strict=True)
+        yield "  " + "  ".join(f"{cell:{'>' if right else '<'}{width}}" for cell, width, right in cells).rstrip()
 
 
-def _is_numeric(cells: Sequence[str]) -> bool:
-    """Numbers belong to the right; a time without a bound is among them."""
-    return bool(cells) and all(re.fullmatch(r"-?[\d.]+( %)?|unbounded", cell) for cell in cells)
-
-
-def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
-    several = len({node.channel for node in nodes}) > 1
-    rows = [["id", "role", "identity (vendor product revision)", "EDS", "", *(["bus"] if several else [])]]
-    for node in nodes:
+def _node_rows(plan: Plan) -> Iterator[list[str]]:
+    several = len(plan.buses) > 1
+    yield ["id", "role", "identity (vendor product revision)", "EDS", "", *["bus"] * several]
+    for node in plan.nodes:
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in node.identity.numbers[:3])
         if node.identity.serial_number is not None:
             numbers += f" serial {node.identity.serial_number:08X}h"
         kind = "emulated" if node.emulated else "real"
-        rows.append([str(node.node_id), node.role, numbers, node.eds, kind, *([node.channel] if several else [])])
-    return rows
+        yield [str(node.node_id), node.role, numbers, node.eds, kind, *[node.channel] * several]
 
 
-def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
-    several = len({pdo.channel for pdo in pdos}) > 1
+def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
+    several = len(plan.buses) > 1
     times = ["response µs", "deadline µs", "slack µs"]
-    rows = [[*(["bus"] * several), "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]]
-    for pdo in pdos:
-        rows.append(
-            [
-                *([pdo.channel] * several),
-                f"{pdo.cob_id:03X}h",
-                str(pdo.node_id),
-                f"{pdo.direction.upper()}{pdo.number}",
-                str(pdo.transmission_type),
-                f"{pdo.rate_hz:g}",
-                str(pdo.layout.length),
-                str(pdo.bits_worst),
-                _us(pdo.response_ns),
-                _us(pdo.deadline_ns),
-                _us(pdo.slack_ns),
-                _content(pdo.entries),
-            ]
-        )
-    return rows
+    yield [*["bus"] * several, "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]
+    for pdo in plan.pdos:
+        name = [f"{pdo.cob_id:03X}h", str(pdo.node_id), f"{pdo.direction.upper()}{pdo.number}"]
+        frame = [str(pdo.transmission_type), f"{pdo.rate_hz:g}", str(pdo.layout.length), str(pdo.bits_worst)]
+        times = [_us(pdo.response_ns), _us(pdo.deadline_ns), _us(pdo.slack_ns)]
+        yield [*[pdo.channel] * several, *name, *frame, *times, _content(pdo.entries)]
+
+
+def _speed_rows(speeds: JointSpeeds | None) -> Iterator[list[str]]:
+    if speeds is not None:
+        yield ["joint", "needed deg/s", "allowed deg/s"]
+        for joint, (needed, limit) in enumerate(zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True), start=1):
+            yield [str(joint), f"{needed:.1f}", f"{limit:g}"]
 
 
 def _content(entries: Sequence[PdoEntry]) -> str:
