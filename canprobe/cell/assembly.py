@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from canprobe.bus.port import Port, VirtualClock
-from canprobe.cell.bringup import BringUpTimes
 from canprobe.cell.cell import Cell
 from canprobe.cell.configuration import make_setups
 from canprobe.cell.controller import TactileSample
@@ -20,7 +19,7 @@ from canprobe.cell.supervision import Limits, Vector
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
 from canprobe.robot.kinematics import PumaModel, forward
-from canprobe.scene.setup import Arm, BringUp, Probe, Setup, Touch
+from canprobe.scene.setup import Arm, Probe, Setup, Touch
 from canprobe.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
 
 if TYPE_CHECKING:
@@ -94,7 +93,6 @@ def make_cell(
     port: Port,
     *,
     say: Callable[[str], None] = lambda _: None,
-    times: BringUpTimes | None = None,
     log_failure: Callable[[], str | None] = lambda: None,
     observers: Observers | None = None,
     rows_kept: int | None = None,
@@ -106,7 +104,6 @@ def make_cell(
         plan: of the scene.
         port: the bus.
         say: called with each step of bring-up and stop.
-        times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
@@ -131,7 +128,7 @@ def make_cell(
         patch_from=patch_from(plan.setup) if plan.setup.arm is not None else None,
         lift_from=_lift_from(plan, drives),
         say=say,
-        times=times or _times(plan.setup.bring_up),
+        times=plan.setup.bring_up,
         log_failure=log_failure,
         observers=observers,
         rows_kept=rows_kept,
@@ -147,17 +144,6 @@ def _lift_from(plan: Plan, drives: DriveGroup | None) -> Callable[[Callable[[int
 
     period_s = plan.sync.period_ns * 1e-9
     return lambda obeys: LiftOff(drives, arm.model, flange_probe, period_s, obeys)
-
-
-def _times(settings: BringUp) -> BringUpTimes:
-    return BringUpTimes(
-        listen=settings.listen_s,
-        boot_up=settings.boot_up_s,
-        sdo=settings.sdo_s,
-        start=settings.start_s,
-        retries=settings.retries,
-        store=settings.store,
-    )
 
 
 def make_drives(plan: Plan) -> DriveGroup | None:

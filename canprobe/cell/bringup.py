@@ -22,12 +22,17 @@ from canprobe.bus.sdo_client import SdoTimeoutError, download, hold_dialogues, r
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
+from canprobe.scene.setup import BringUpTimes
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
 MOST_DAYS, DAY_MS = 0xFFFF, 86_400_000
+SECOND_BOOT_UP_S = 0.05
+"""In which a second boot-up, or a second answer to one request, is waited for."""
+RELEASE_S = 0.1
+"""For one answer when the nodes are let go."""
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 
 
@@ -90,31 +95,6 @@ class NodeSetup:
     lacks: tuple[int, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
-class BringUpTimes:
-    """How long the steps may take, s, and what is done about those that take longer.
-
-    Attributes:
-        listen: for another master.
-        boot_up: from the reset to the boot-up message.
-        second_boot_up: in which a second boot-up, or a second answer to one request, is waited for.
-        sdo: for one answer.
-        start: from NMT start to the first heartbeat that tells it.
-        release: for one answer when the nodes are let go.
-        retries: how often a reset, a request or a start without an answer is sent again.
-        store: let the nodes keep their configuration (1010h), and leave it out where 1020h says that it is there.
-    """
-
-    listen: float = 0.25
-    boot_up: float = 2.0
-    second_boot_up: float = 0.05
-    sdo: float = 0.5
-    start: float = 1.0
-    release: float = 0.1
-    retries: int = 2
-    store: bool = False
-
-
 @dataclass(slots=True)
 class NodeReport:
     """How far a node came.
@@ -150,7 +130,7 @@ class BringUp:
         network: SDO and NMT, pumped.
         watch: sees every boot-up, heartbeat and EMCY that arrives meanwhile.
         setups: the nodes.
-        times: time-outs.
+        times: how long the steps may take, and what is done about those that take longer.
         say: called with each step, for the user.
 
     Attributes:
@@ -188,7 +168,7 @@ class BringUp:
         self.listen()
         self._boot()
         self._say("identify and configure the nodes")
-        self._talk({s.node_id: self._configure(s, report) for s, report in self._pairs()}, self._times.sdo)
+        self._talk({s.node_id: self._configure(s, report) for s, report in self._pairs()}, self._times.sdo_s)
         self._raise_failures()
         for setup, report in self._pairs():
             self._say(str(report))
@@ -245,7 +225,7 @@ class BringUp:
         """
         if not self._listened:
             self._say("listen for another master")
-        listen_s = 0.0 if self._listened else self._times.listen
+        listen_s = 0.0 if self._listened else self._times.listen_s
         self._network.pump_until(lambda: self._watch.foreign is not None, listen_s)
         self._listened = True
         if self._watch.foreign is not None:
@@ -266,14 +246,14 @@ class BringUp:
                 resets[setup.node_id] += 1
             self._network.pump_until(
                 lambda: all(self._watch.boot_ups[s.node_id] > before[s.node_id] for s in self._setups),
-                self._times.boot_up,
+                self._times.boot_up_s,
             )
             missing = [s for s in self._setups if self._watch.boot_ups[s.node_id] == before[s.node_id]]
             if not missing:
                 break
         if missing:
             self._raise_missing(missing)
-        self._network.pump_until(lambda: False, self._times.second_boot_up)
+        self._network.pump_until(lambda: False, SECOND_BOOT_UP_S)
         self._booted = dict(self._watch.boot_ups)
         for setup in self._setups:
             count = self._booted[setup.node_id] - before[setup.node_id]
@@ -291,8 +271,8 @@ class BringUp:
         self._network.subscribe(cob_id, take)
         try:
             self._network.send_message(SDO_RX_BASE + setup.node_id, UPLOAD_DEVICE_TYPE)
-            self._network.pump_until(lambda: bool(answers), self._times.sdo)
-            self._network.pump_until(lambda: len(answers) > 1, self._times.second_boot_up)
+            self._network.pump_until(lambda: bool(answers), self._times.sdo_s)
+            self._network.pump_until(lambda: len(answers) > 1, SECOND_BOOT_UP_S)
         finally:
             self._network.unsubscribe(cob_id, take)
         if len(answers) > 1:
@@ -306,7 +286,7 @@ class BringUp:
     def _raise_missing(self, missing: Sequence[NodeSetup]) -> None:
         others = ", ".join(f"{s.node_id} ({s.name})" for s in missing[1:])
         raise self._error(
-            f"({missing[0].name}) sent no boot-up within {self._times.boot_up:g} s of its reset on"
+            f"({missing[0].name}) sent no boot-up within {self._times.boot_up_s:g} s of its reset on"
             f" {self._network.port.channel}"
             + (f"; nor did {others}" if others else "")
             + "; check power, node id, bit rate and termination, or mark it emulated in the scene",
@@ -421,7 +401,7 @@ class BringUp:
             which = "all nodes" if all_of_them else f"nodes {', '.join(str(s.node_id) for s in waiting)} again"
             self._say(f"start {which}")
             self._network.port.send_batch([pack_nmt(NmtCommand.START, s.node_id) for s in waiting])
-            self._network.pump_until(lambda: not self._not_operational(), self._times.start)
+            self._network.pump_until(lambda: not self._not_operational(), self._times.start_s)
             if not (waiting := self._not_operational()):
                 return
         self._raise_not_operational(waiting)
@@ -430,12 +410,12 @@ class BringUp:
         return [s for s in self._setups if self._watch.states.get(s.node_id) is not NmtState.OPERATIONAL]
 
     def _raise_not_operational(self, waiting: Sequence[NodeSetup]) -> None:
-        self._talk({setup.node_id: self._recall(setup) for setup in waiting}, self._times.release)
+        self._talk({setup.node_id: self._recall(setup) for setup in waiting}, RELEASE_S)
         slow, *others = waiting
         state = self._watch.states.get(slow.node_id)
         tries = f", {1 + self._times.retries} times" if self._times.retries else ""
         raise self._error(
-            f"({slow.name}) is not operational {self._times.start:g} s after NMT start{tries}:"
+            f"({slow.name}) is not operational {self._times.start_s:g} s after NMT start{tries}:"
             f" {'no heartbeat' if state is None else state.name}"
             + (f"; nor are {', '.join(f'{s.node_id} ({s.name})' for s in others)}" if others else ""),
             *waiting,
@@ -456,7 +436,7 @@ class BringUp:
             except NodeError as error:
                 failures.append(error)
 
-        self._talk({setup.node_id: let_go(setup) for setup in self._setups}, self._times.release)
+        self._talk({setup.node_id: let_go(setup) for setup in self._setups}, RELEASE_S)
         if failures:
             raise failures[0]
 

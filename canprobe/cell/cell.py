@@ -11,7 +11,7 @@ import numpy as np
 from canprobe.bus.network import PumpedNetwork
 from canprobe.bus.port import Port, PortCounters, TimedFrame
 from canprobe.bus.scheduling import Interrupts
-from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
+from canprobe.cell.bringup import BringUp, NodeReport, NodeSetup
 from canprobe.cell.controller import Command, Controller, Measurement, TactileSample, as_controller
 from canprobe.cell.cycle import Cycle, CycleSettings, Observers
 from canprobe.cell.drives import DriveGroup, TactileReceiver, Vector
@@ -22,6 +22,7 @@ from canprobe.cell.watch import NodeWatch, obeys
 from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
+from canprobe.scene.setup import BringUpTimes
 
 if TYPE_CHECKING:
     from canprobe.cell.supervisor import LiftOff

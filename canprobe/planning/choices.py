@@ -53,7 +53,7 @@ class _OpenKey:
         return getattr(getattr(setup, self.part), self.field, None)
 
     def written(self, setup: Setup) -> str:
-        """The value as a scene file writes it; an array without a channel of its own is on the scene's."""
+        """The value as a scene file writes it; an array without a channel is on the bus of the scene."""
         value = self.value(setup)
         return _written(setup.bus.channel if self.field == "channel" and value is None else value)
 
@@ -68,7 +68,7 @@ def _modes(setup: Setup) -> list[tuple[ArrayMode, str]]:
 
 
 def _channels(setup: Setup) -> list[tuple[str, str]]:
-    own = (second_channel(setup.bus.channel), "a bus of its own for the sensor")
+    own = (second_channel(setup.bus.channel), "a separate bus for the sensor")
     return [(setup.bus.channel, "one bus carries everything"), *([own] if setup.arm is not None else [])]
 
 
@@ -79,7 +79,7 @@ def second_channel(channel: str) -> str:
 
 
 _FD = ((False, "classical frames do"), (True, "PDOs of up to 64 bytes in CAN FD frames"))
-_GROUPED = ((False, "each drive has its target to itself"), (True, "two targets share an RPDO through dummies"))
+_GROUPED = ((False, "each drive has its own target RPDO"), (True, "two targets share an RPDO through dummies"))
 _COB_IDS = (
     ("default", "the cell's own identifiers do"),
     ("by_deadline", "priorities follow the deadlines"),
@@ -159,7 +159,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
         yield text, setup.changed("array", mode="features", window=WINDOW)
     if setup.arm is not None and array.channel in (None, bus.channel):
         own = second_channel(bus.channel)
-        yield f'a bus of its own for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
+        yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
     if not bus.fd and array.emulated:
         fd = setup.changed("bus", fd=True)
         yield "bus.fd = true", fd
@@ -167,7 +167,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
 
 
 def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
-    """The cheapest of what the plan could choose by itself, where it takes more than one change."""
+    """The cheapest combination of what the plan could choose, where one change is not enough."""
     now = {key.key: key.written(setup) for key in _KEYS}
     for changed, choices in candidates(opened(setup)):
         if fit(changed) is not None:

@@ -49,7 +49,7 @@ class Abilities:
 
     @property
     def bitrates(self) -> tuple[int, ...]:
-        """Bit rates that it has, bit/s; empty where its EDS tells none."""
+        """Bit rates that it has, bit/s; empty where its EDS lists none."""
         return tuple(sorted(self.od.device_information.allowed_baudrates))
 
     def has(self, index: int, subindex: int = 0) -> bool:
@@ -151,7 +151,7 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
 
 
 def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
-    """That the device does not have the bus's bit rate, where its EDS tells which it has."""
+    """That the device does not have the bus's bit rate, where its EDS lists them."""
     beyond = setup.bus.bitrate > MOST_BITRATE  # no scene file may say so: a study's bus that no CAN is
     if not device.bitrates or setup.bus.bitrate in device.bitrates or beyond:
         return []
@@ -172,7 +172,7 @@ _POOL = range(0x181, 0x580)
 def order_by_deadline(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
     """The same PDOs with identifiers in the order of their deadlines.
 
-    At one deadline feedback goes before commands, then as before. An RPDO that several drives read
+    At equal deadlines feedback has priority over commands; otherwise the order stays. An RPDO that several drives read
     keeps one identifier.
     """
     free = (cob_id for cob_id in _POOL if not is_restricted(cob_id))
@@ -298,7 +298,7 @@ def plan_drive_pdos(planning: PdoPlanning) -> None:
         _plan_feedback(planning, node_id)
     without = [devices[node_id].eds for node_id in arm.node_ids if devices[node_id].dummy(DUMMY_INTEGER32, 32) is None]
     for eds in without if arm.grouped else ():
-        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps a target RPDO of its own"
+        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps its own target RPDO"
         planning.not_available.append(("two targets in one RPDO", why))
     for axis, node_id in enumerate(arm.node_ids):
         if not arm.grouped or without:

@@ -32,7 +32,7 @@ from canprobe.planning.model import (
 from canprobe.planning.motion import check_motion
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
 from canprobe.planning.window import cut_patch
-from canprobe.scene.setup import Array, Drive, Setup
+from canprobe.scene.setup import Node, Setup
 
 SYNC_COUNTER = 0x1019
 
@@ -181,10 +181,10 @@ def _fits(setup: Setup, known: frozenset[str]) -> Traffic | None:
     return max((one.traffic for one in bus.buses), key=lambda traffic: traffic.load)
 
 
-def _roles(setup: Setup) -> list[tuple[NodeKind, str, Drive | Array]]:
+def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     """Every node with its kind and its role, the drives from the base, the array last."""
     drives = setup.arm.drives if setup.arm is not None else ()
-    roles: list[tuple[NodeKind, str, Drive | Array]] = [
+    roles: list[tuple[NodeKind, str, Node]] = [
         ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
     ]
     return [*roles, ("tactile", "tactile array", setup.array)] if setup.array is not None else roles

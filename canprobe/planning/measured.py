@@ -42,7 +42,7 @@ class ClassTraffic:
         bits: counted, exact where the meter measured them, else without stuff bits.
         planned_bits: in the same time at most; None for services.
         late: frames that came later behind their SYNC than the plan's worst case.
-        slowest: the largest share of its worst case behind SYNC that a frame took; None where there is none.
+        slowest: the largest share of its worst case behind SYNC that a frame took; None where no time was measured.
     """
 
     kind: Kind
@@ -189,7 +189,7 @@ class Expected:
         kind: its class.
         rate_hz: planned; None for a service that has no rate.
         bits_worst: of one frame; None where its length is open.
-        latest_ns: worst case from the end of the SYNC's frame to the end of its own; None where it keeps its own time.
+        latest_ns: worst case from the end of the SYNC's frame to the end of this one; None where SYNC triggers none.
     """
 
     cob_id: int

@@ -128,7 +128,7 @@ def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
         raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
     if radius * tilt > 0.5 * SIDE * PITCH_M:
         beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
-        reach = f"which reaches {500 * SIDE * PITCH_M:.1f} mm and would not feel it"
+        reach = f"which reaches {500 * SIDE * PITCH_M:.1f} mm and would not measure it"
         raise PlanError([f"task.approach_normal: {beside}, {reach}; {mend}"])
 
 

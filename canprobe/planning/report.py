@@ -68,7 +68,7 @@ def timeline(plan: Plan) -> tuple[Slot, ...]:
     period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
     starts: list[int | None] = [None] * cycles
     slots: list[Slot] = []
-    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may hold up
+    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may delay
         slots = [slot for bus in plan.buses for slot in _carried(_released(plan, bus, cyclic, starts))]
         found: list[int | None] = [_controller_start(plan, slots, cycle) for cycle in range(cycles)]
         if found == starts:
@@ -176,7 +176,7 @@ def _lines(plan: Plan) -> Iterator[str]:
         yield (
             f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s and counted in bits of "
             f"{bus.bitrate} bit/s; everything else classical; every controller on the bus must tolerate CAN FD, which "
-            "no EDS tells"
+            "no EDS states"
         )
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
@@ -184,7 +184,7 @@ def _lines(plan: Plan) -> Iterator[str]:
         f"heartbeat every {HEARTBEAT_PRODUCED_MS} ms, lost after {HEARTBEAT_CONSUMED_MS} ms"
     )
     if bus.transmit_queue == "fifo":
-        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat holds up what follows it'
+        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat delays what follows it'
     yield from (f"warning: {warning}" for warning in plan.warnings)
     yield from _titled("nodes", _node_rows(plan))
     yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan))

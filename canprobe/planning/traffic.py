@@ -44,7 +44,7 @@ _TOLERANCE = 1e-5  # of a rate written with six digits
 
 
 def plan_sync(setup: Setup) -> tuple[SyncPlan, list[str]]:
-    """The SYNC of a scene, and why its period cannot be had.
+    """The SYNC of a scene, and why its period is not possible.
 
     Source: CiA 301 object 1006h (period in µs), CiA 402 object 60C2h (interpolation period, here n·10⁻⁴ s).
     """
@@ -69,7 +69,7 @@ def plan_sync(setup: Setup) -> tuple[SyncPlan, list[str]]:
 
 
 def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
-    """How many SYNCs make one tactile frame (18xxh:02), and why the rate cannot be had."""
+    """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
     if setup.array is None:
         return 1, []
     exact = setup.rate_hz / setup.array.rate_hz
@@ -262,7 +262,7 @@ def _analyse(messages: _Messages, compute_ns: int, bitrate: int) -> tuple[BusAna
         if late_sync is None or late_feedback is None or analysis.load >= 1 or not moved:
             break
         sync_ns, feedback_ns = late_sync, late_feedback
-    else:  # the rounds do not come to an end: there is no bound
+    else:  # the rounds do not end: there is no bound
         analysis = replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
     feedback, commands = _last(analysis, messages.feedback), _last(analysis, messages.commands)
     _, start = controller_starts(messages, looks, feedback_ns)

@@ -67,12 +67,12 @@ def window_choices(setup: Setup) -> tuple[tuple[int, str], ...]:
     return (
         *((side, f"{patch}: the smallest that holds it") for side in enough[:1]),
         *((side, f"{patch}: the largest that fits, cutting its rim") for side in less),
-        *((side, f"{patch}: no smaller one can be had") for side in enough[1:]),
+        *((side, f"{patch}: no smaller one fits") for side in enough[1:]),
     )
 
 
 def measured_share(force_n: float, probe: Probe, side: int, off_taxels: float = FOLLOWING_TAXELS) -> float:
-    """Share of a force that a window feels.
+    """Share of a force that a window measures.
 
     Args:
         force_n: on a plane.
@@ -102,12 +102,12 @@ def true_force_n(force_n: float, probe: Probe, side: int, most_n: float) -> floa
 
 @dataclass(frozen=True, slots=True)
 class CutPatch:
-    """What a window does that feels too little of the force.
+    """What follows from a window that measures too little of the force.
 
     Attributes:
         text: for people, with the numbers.
         safe: the force that presses stays below `limits.force_max_n`, which only the measured force is held against.
-        ways: changes that let the window feel it.
+        ways: changes after which the window measures it.
     """
 
     text: str
@@ -116,7 +116,7 @@ class CutPatch:
 
 
 def cut_patch(setup: Setup) -> CutPatch | None:
-    """What the window of a scene misses; None where it feels nearly all of the force, or nothing is pressed."""
+    """What the window of a scene misses; None where it measures nearly all of the force, or nothing is pressed."""
     touch = setup.touch
     if touch is None or touch.array.mode != "window":
         return None

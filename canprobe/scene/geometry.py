@@ -52,7 +52,7 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     """The object that a scene describes.
 
     Raises:
-        ValueError: for a matrix that is no surface through the object's origin with z outward.
+        ValueError: for a matrix that describes no surface through the object's origin with z outward.
     """
     values: dict[str, object] = {"matrix": np.array(settings.matrix), "angle": math.radians(settings.angle_deg or 0.0)}
     params = {
@@ -173,7 +173,7 @@ def with_tool(scene: Scene, path: Path | str) -> Scene:
         path: ``tool.toml`` of a calibration.
 
     Raises:
-        SceneError: the file cannot be read or is none, or the scene has no probe.
+        SceneError: the file cannot be read or has other content, or the scene has no probe.
     """
     document, reader = read_toml(Path(path), str(path)), Reader()
     table = document.get("probe")

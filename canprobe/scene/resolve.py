@@ -54,8 +54,8 @@ def resolve(scene: Scene) -> Setup:
         scene: as `load_scene` gave it, or changed since.
 
     Raises:
-        UsageError: this is no scene.
-        PlanError: the object that the scene describes is none.
+        UsageError: the argument is not a scene.
+        PlanError: the scene describes an object without a surface.
     """
     need_scene(scene)
     arm = _arm(scene.arm) if scene.arm is not None else None

@@ -36,15 +36,15 @@ from canprobe.touch.shapes import PlacedShape
 
 Floats = NDArray[np.float64]
 Bus = BusSettings
-BringUp = BringUpSettings
+BringUpTimes = BringUpSettings
 Bridges = BridgeSettings
 ArrayMode = TactileModeName
 Fidelity = Literal["ideal", "dynamic"]
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """One joint drive.
+class Node:
+    """What every node has.
 
     Attributes:
         node_id: 1–126.
@@ -57,6 +57,11 @@ class Drive:
     eds: str
     emulated: bool
     serial: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Drive(Node):
+    """One joint drive."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,26 +89,18 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
-class Array:
+class Array(Node):
     """The tactile array.
 
     Attributes:
-        node_id: 1–126.
         channel: of its bus; None: the arm's.
-        eds: name or path of its EDS.
-        emulated: served by the emulator.
-        serial: what 1018h:04 must answer; None: anything.
         mode: what it sends.
         window: taxels along the window that follows the contact.
         rate_hz: of its frames.
         full_scale: pressure of a full count, Pa.
     """
 
-    node_id: int
     channel: str | None
-    eds: str
-    emulated: bool
-    serial: int | None
     mode: ArrayMode
     window: int | Auto
     rate_hz: float
@@ -352,7 +349,7 @@ class Setup:
         figures: whether its run is drawn.
         bus: interface, channel, bit rates and what a lockstep bus is like.
         rate_hz: of SYNC and servo.
-        realtime: SCHED_FIFO, a processor of its own, locked memory, on a real interface.
+        realtime: SCHED_FIFO, a reserved processor, locked memory, on a real interface.
         compute_ns: that the plan leaves to the controller in each cycle.
         kind: of the task, as scenes say it.
         truth: what is really there.
@@ -368,7 +365,7 @@ class Setup:
     realtime: bool
     compute_ns: int
     limits: SafetyLimits
-    bring_up: BringUp
+    bring_up: BringUpTimes
     bridge: Bridges | None
     arm: Arm | None
     array: Array | None

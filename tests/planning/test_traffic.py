@@ -80,7 +80,7 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     assert error.ways_out == (
         'sensor.mode = "window": load 87 %, peak 4345 of 5000 µs',
         'sensor.mode = "features": load 69 %, peak 3400 of 5000 µs',
-        'a bus of its own for the sensor (sensor.channel = "can1"): load 92 %, peak 4585 of 5000 µs',
+        'a separate bus for the sensor (sensor.channel = "can1"): load 92 %, peak 4585 of 5000 µs',
         'CAN FD: bus.fd = true and sensor.eds = "tactile_array_fd.eds": load 79 %, peak 3937 of 5000 µs',
         "cycle.rate_hz = 250 with sensor.rate_hz = 125: load 95 %, peak 7585 of 8000 µs",
     ), "grouping alone does not make it fit and must not be named"
