@@ -34,7 +34,7 @@ from canprobe.cell.configuration import NodeSetup, Write
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
-from canprobe.scene.setup import BringUp as Settings
+from canprobe.scene.setup import BringUpTimes as Settings
 
 ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020

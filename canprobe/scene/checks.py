@@ -1,4 +1,4 @@
-"""What a value of a scene may be: small checks that stand in the annotations of `canprobe.scene`, and `convert`.
+"""What a value of a file may be: small checks that stand in the annotations of `canprobe.scene.model`, and `convert`.
 
 `convert` turns what `tomllib` read into the annotated type, or says what was expected. Nothing is coerced silently
 except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean is never a number.
@@ -6,10 +6,12 @@ except an integer where a number is wanted (TOML's `25` for `25.0`); a boolean i
 
 from __future__ import annotations
 
+import contextlib
 import math
 import re
 import types
 import typing
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -19,79 +21,34 @@ class MismatchError(ValueError):
 
 
 @dataclass(frozen=True, slots=True)
-class Range:
-    """Numbers from `low` to `high`, both included unless `open_low` leaves the lower end out."""
+class Check:
+    """A condition on a value: what is asked for, in words, and whether a value has it."""
 
-    low: float
-    high: float
-    open_low: bool = False
-
-    def __str__(self) -> str:
-        low, high = (str(end) if isinstance(end, int) else f"{end:g}" for end in (self.low, self.high))
-        return f"above {low} up to {high}" if self.open_low else f"from {low} to {high}"
-
-    def accepts(self, value: float) -> bool:
-        return (self.low < value if self.open_low else self.low <= value) and value <= self.high
-
-
-@dataclass(frozen=True, slots=True)
-class OneOf:
-    """One of a few numbers."""
-
-    values: tuple[int, ...]
-
-    def __str__(self) -> str:
-        return f"of {', '.join(map(str, self.values))}"
-
-    def accepts(self, value: int) -> bool:
-        return value in self.values
-
-
-@dataclass(frozen=True, slots=True)
-class Pattern:
-    """Text that matches a regular expression as a whole."""
-
-    regex: str
     text: str
-
-    def __str__(self) -> str:
-        return self.text
-
-    def accepts(self, value: str) -> bool:
-        return re.fullmatch(self.regex, value) is not None
+    accepts: Callable[[Any], bool]
 
 
-@dataclass(frozen=True, slots=True)
-class Distinct:
-    """A list without repetitions."""
-
-    def __str__(self) -> str:
-        return "all different"
-
-    def accepts(self, value: tuple[object, ...]) -> bool:
-        return len(set(value)) == len(value)
+def Range(low: float, high: float, *, open_low: bool = False) -> Check:
+    """Numbers from `low` to `high`, both included unless `open_low` leaves the lower end out."""
+    first, last = (str(end) if isinstance(end, int) else f"{end:g}" for end in (low, high))
+    if open_low:
+        return Check(f"above {first} up to {last}", lambda value: low < value <= high)
+    return Check(f"from {first} to {last}", lambda value: low <= value <= high)
 
 
-@dataclass(frozen=True, slots=True)
-class Direction:
-    """A vector that has a direction."""
-
-    def __str__(self) -> str:
-        return "not all zero"
-
-    def accepts(self, value: tuple[float, ...]) -> bool:
-        return math.hypot(*value) > 1e-9
+def OneOf(values: tuple[int, ...]) -> Check:
+    """One of a few numbers."""
+    return Check(f"of {', '.join(map(str, values))}", values.__contains__)
 
 
-@dataclass(frozen=True, slots=True)
-class Symmetric:
-    """A symmetric matrix."""
+def Pattern(regex: str, text: str) -> Check:
+    """Text that matches a regular expression as a whole."""
+    return Check(text, lambda value: re.fullmatch(regex, value) is not None)
 
-    def __str__(self) -> str:
-        return "symmetric"
 
-    def accepts(self, value: tuple[tuple[float, ...], ...]) -> bool:
-        return all(value[i][j] == value[j][i] for i in range(len(value)) for j in range(i))
+DISTINCT = Check("all different", lambda value: len(set(value)) == len(value))
+DIRECTION = Check("not all zero", lambda value: math.hypot(*value) > 1e-9)
+SYMMETRIC = Check("symmetric", lambda value: tuple(zip(*value, strict=True)) == value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,12 +65,11 @@ class Only:
 
 @dataclass(frozen=True, slots=True)
 class ScenePath:
-    """A packaged file's name, or a path that is looked up beside the scene file first."""
+    """A packaged file's name, or a path that is looked up beside the file first."""
 
 
 _UNIONS = (types.UnionType, typing.Union)
-CONDITIONS = (Only, ScenePath)
-"""Annotations that say something about the key and nothing about its value."""
+_NAMES = {float: ("a number", "numbers"), int: ("an integer", "integers"), str: ("text", "texts")}
 
 
 def convert(value: object, annotation: Any) -> Any:
@@ -126,18 +82,37 @@ def convert(value: object, annotation: Any) -> Any:
     Raises:
         MismatchError: with what was expected.
     """
-    origin = typing.get_origin(annotation)
+    try:
+        return _converted(value, annotation)
+    except (ValueError, OverflowError):  # the latter for an integer that no float holds
+        raise MismatchError(expected(annotation)) from None
+
+
+def _converted(value: object, annotation: Any) -> Any:
+    """As `convert`; what does not match raises a ValueError without a text."""
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
-        return _checked(value, annotation)
-    if origin in _UNIONS:
-        return _converted_choice(value, annotation)
-    if origin is Literal:
-        if value not in typing.get_args(annotation):
-            raise MismatchError(expected(annotation))
-        return value
-    if origin is tuple:
-        return _converted_list(value, annotation)
-    return _converted_scalar(value, annotation)
+        converted = _converted(value, parts[0])
+        matches = all(check.accepts(converted) for check in conditions_of(annotation, Check))
+    elif origin in _UNIONS:
+        for part in _members(annotation):
+            with contextlib.suppress(ValueError):
+                return _converted(value, part)
+        raise ValueError
+    elif origin is Literal:
+        converted, matches = value, value in parts
+    elif origin is tuple:
+        items = value if isinstance(value, list | tuple) else ()
+        kinds = [parts[0]] * len(items) if parts[-1] is Ellipsis else list(parts)
+        matches = isinstance(value, list | tuple) and len(items) == len(kinds)
+        converted = tuple(_converted(item, kind) for item, kind in zip(items, kinds, strict=False))
+    else:
+        number = annotation is float and type(value) is int
+        converted = float(value) if number else value  # type: ignore[arg-type]  # an int here
+        matches = type(converted) is annotation and (not isinstance(converted, float) or math.isfinite(converted))
+    if not matches:
+        raise ValueError
+    return converted
 
 
 def _members(annotation: Any) -> list[Any]:
@@ -145,93 +120,33 @@ def _members(annotation: Any) -> list[Any]:
     return [part for part in typing.get_args(annotation) if part is not type(None)]
 
 
-def _converted_choice(value: object, annotation: Any) -> Any:
-    for part in _members(annotation):
-        try:
-            return convert(value, part)
-        except MismatchError:
-            continue
-    raise MismatchError(expected(annotation))
-
-
-def _checked(value: object, annotation: Any) -> Any:
-    base, *checks = typing.get_args(annotation)
-    try:
-        converted = convert(value, base)
-    except MismatchError:
-        raise MismatchError(expected(annotation)) from None
-    if not all(check.accepts(converted) for check in checks if not isinstance(check, CONDITIONS)):
-        raise MismatchError(expected(annotation))
-    return converted
-
-
-def _converted_list(value: object, annotation: Any) -> tuple[Any, ...]:
-    parts = typing.get_args(annotation)
-    if not isinstance(value, list | tuple):
-        raise MismatchError(expected(annotation))
-    types_of_items = [parts[0]] * len(value) if parts[-1] is Ellipsis else list(parts)
-    if len(types_of_items) != len(value):
-        raise MismatchError(expected(annotation))
-    try:
-        return tuple(convert(item, kind) for item, kind in zip(value, types_of_items, strict=True))
-    except MismatchError:
-        raise MismatchError(expected(annotation)) from None
-
-
-def _converted_scalar(value: object, kind: Any) -> Any:
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        try:
-            value = float(value)
-        except OverflowError:
-            raise MismatchError("a finite number") from None
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise MismatchError(expected(kind))
-    if isinstance(value, float) and not math.isfinite(value):
-        raise MismatchError("a finite number")
-    return value
-
-
-def _expected_member(annotation: Any) -> str:
-    words = typing.get_args(annotation) if typing.get_origin(annotation) is Literal else ()
-    return f'"{words[0]}"' if len(words) == 1 else expected(annotation)
-
-
-_NAMES = {float: ("a number", "numbers"), int: ("an integer", "integers"), str: ("text", "texts")}
-
-
 def expected(annotation: Any) -> str:
     """What an annotation asks for, in words."""
-    origin = typing.get_origin(annotation)
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is typing.Annotated:
-        base, *checks = typing.get_args(annotation)
-        return " ".join([expected(base), *(str(check) for check in checks if not isinstance(check, CONDITIONS))])
+        return " ".join([expected(parts[0]), *(check.text for check in conditions_of(annotation, Check))])
     if origin in _UNIONS:
-        return " or ".join(map(_expected_member, _members(annotation)))
+        words = (choices_of(part) for part in _members(annotation))
+        members = zip(_members(annotation), words, strict=True)
+        return " or ".join(f'"{word[0]}"' if len(word) == 1 else expected(part) for part, word in members)
     if origin is Literal:
-        return "one of " + ", ".join(typing.get_args(annotation))
+        return "one of " + ", ".join(parts)
     if origin is tuple:
-        return _expected_list(typing.get_args(annotation))
+        many = _NAMES[parts[0]][1] if parts[0] in _NAMES else f"items, each {expected(parts[0])}"
+        return f"a list of {many}" if parts[-1] is Ellipsis else f"a list of {len(parts)} {many}"
     return _NAMES[annotation][0] if annotation in _NAMES else "true or false"
-
-
-def _expected_list(parts: tuple[Any, ...]) -> str:
-    item = parts[0]
-    many = _NAMES[item][1] if item in _NAMES else f"items, each {expected(item)}"
-    return f"a list of {many}" if parts[-1] is Ellipsis else f"a list of {len(parts)} {many}"
 
 
 def choices_of(annotation: Any) -> tuple[str, ...]:
     """The words that an annotation allows, for "did you mean"; empty when it is not a choice."""
-    origin = typing.get_origin(annotation)
+    origin, parts = typing.get_origin(annotation), typing.get_args(annotation)
     if origin is Literal:
-        return typing.get_args(annotation)
+        return parts
     if origin in _UNIONS:
-        return tuple(word for part in _members(annotation) for word in choices_of(part))
-    if origin in (typing.Annotated, tuple):
-        return choices_of(typing.get_args(annotation)[0])
-    return ()
+        return tuple(word for part in parts for word in choices_of(part))
+    return choices_of(parts[0]) if origin in (typing.Annotated, tuple) else ()
 
 
 def conditions_of(annotation: Any, kind: type[Any]) -> list[Any]:
-    """The conditions of one kind that stand in an annotation."""
+    """What stands in an annotation of one kind: `Check`, `Only`, `ScenePath`."""
     return [part for part in getattr(annotation, "__metadata__", ()) if isinstance(part, kind)]

@@ -1,18 +1,19 @@
 """Read a scene: TOML text → checked `Scene`, all problems at once; and the way back.
 
-The reader knows no key by name: sections and keys, their types, ranges and defaults stand in `canprobe.scene`, what
-goes together in `canprobe.scene.rules`.
+`Reader` knows no key by name. A file is a dataclass whose fields are sections: `Section`, `Section | None`, or
+`tuple[Section, ...]` for a list of tables (`[[section]]`). A section is a dataclass whose fields are keys, with type,
+checks and default (`canprobe.scene.model`). What goes together across keys stands in `canprobe.scene.rules`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import difflib
 import tomllib
 import typing
 from collections.abc import Iterable, Mapping
 from importlib import resources
+from os.path import isfile  # False where the system refuses a name, as `Path.is_file` does not promise
 from pathlib import Path
 from typing import Any
 
@@ -21,17 +22,32 @@ from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, co
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
-# Write a scene as TOML: every value that was resolved, nothing that its kind does not use.
+_ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
+_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
 def dump_scene(scene: Scene) -> str:
-    """The scene as a TOML document that loads back equal.
+    """The scene as a TOML document that loads back equal, with every value that its kind uses.
 
     Args:
         scene: a scene as `load_scene` gave it.
     """
-    sections = [(field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)]
-    return "\n".join(_section(name, section) for name, section in sections if section is not None)
+    tables = []
+    for name, part in ((field.name, getattr(scene, field.name)) for field in dataclasses.fields(scene)):
+        many = isinstance(part, tuple)
+        title = f"[[{name}]]" if many else f"[{name}]"
+        tables += [f"{title}\n{_keys(section)}" for section in (part if many else (part,)) if section is not None]
+    return "\n".join(tables)
+
+
+def _keys(section: Any) -> str:
+    annotations, lines = typing.get_type_hints(type(section), include_extras=True), ""
+    for field in dataclasses.fields(section):
+        value = getattr(section, field.name)
+        only = conditions_of(annotations[field.name], Only)
+        if value is not None and all(getattr(section, one.key) in one.values for one in only):
+            lines += f"{field.name} = {toml_value(value)}\n"
+    return lines
 
 
 def toml_value(value: object) -> str:
@@ -47,32 +63,10 @@ def toml_value(value: object) -> str:
     return repr(value) if isinstance(value, int | float) else str(value)
 
 
-def _section(name: str, section: Any) -> str:
-    annotations = typing.get_type_hints(type(section), include_extras=True)
-    lines = [
-        f"{field.name} = {toml_value(value)}\n"
-        for field in dataclasses.fields(section)
-        if (value := getattr(section, field.name)) is not None and _applies(section, annotations[field.name])
-    ]
-    return f"[{name}]\n{''.join(lines)}"
-
-
-def _applies(section: Any, annotation: Any) -> bool:
-    return all(getattr(section, only.key) in only.values for only in conditions_of(annotation, Only))
-
-
-_ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
-
-
 def _escaped(character: str) -> str:
     if character in _ESCAPES:
         return _ESCAPES[character]
     return f"\\u{ord(character):04X}" if ord(character) < 0x20 or ord(character) == 0x7F else character
-
-
-# Read a scene: TOML text → checked `Scene`, all problems at once; and the way back.
-
-_ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
@@ -87,13 +81,11 @@ def load_scene(name_or_path: str | Path) -> Scene:
     name = str(name_or_path)
     packaged = _packaged_files()
     path = packaged.get(name, Path(name))
-    try:
-        text = path.read_text(encoding="utf-8-sig")  # some editors begin a file with a byte order mark
-    except OSError as error:
-        raise SceneError([_not_readable(name, error, packaged)]) from error
-    except UnicodeDecodeError as error:
-        raise SceneError([f"{name}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
-    return parse_scene(text, file=path.name if name in packaged else name, folder=path.parent)
+    if not isfile(path) and not name.endswith(".toml") and "/" not in name:
+        hint = _did_you_mean(name, packaged)
+        raise SceneError([f"{name}: no such scene or file{hint}; packaged scenes: {', '.join(packaged)}"])
+    file = path.name if name in packaged else name
+    return _scene(read_toml(path, file), file, path.parent)
 
 
 def scenes_folder() -> Path:
@@ -104,6 +96,10 @@ def scenes_folder() -> Path:
 def packaged_scenes() -> list[tuple[str, str]]:
     """Name and title of every packaged scene, by name."""
     return [(name, load_scene(name).title) for name in _packaged_files()]
+
+
+def _packaged_files() -> dict[str, Path]:
+    return {path.stem: path for path in sorted(scenes_folder().glob("*.toml"))}
 
 
 def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -> Scene:
@@ -117,133 +113,148 @@ def parse_scene(text: str, *, file: str = "scene", folder: Path | None = None) -
     Raises:
         SceneError: with every problem found.
     """
+    return _scene(parse_toml(text, file), file, folder)
+
+
+def read_toml(path: Path, file: str) -> dict[str, Any]:
+    """The document of a TOML file, whose messages call it `file`.
+
+    Raises:
+        SceneError: it cannot be read, or is not TOML.
+    """
     try:
-        document = tomllib.loads(text)
+        return parse_toml(path.read_text(encoding="utf-8-sig"), file)  # some editors begin with a byte order mark
+    except OSError as error:
+        raise SceneError([f"{file}: cannot be read: {error.strerror}"]) from error
+    except UnicodeDecodeError as error:
+        raise SceneError([f"{file}: not UTF-8 text: byte {error.start} is {error.object[error.start]:#04x}"]) from error
+
+
+def parse_toml(text: str, file: str) -> dict[str, Any]:
+    """The document in a TOML text; as `read_toml`."""
+    try:
+        return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # an integer of thousands of digits is no TOMLDecodeError
         raise SceneError([f"{file}: not valid TOML: {error}"]) from error
-    reader = _Reader(document, folder)
-    scene = reader.read()
-    if scene is None:
+
+
+def _scene(document: Mapping[str, Any], file: str, folder: Path | None) -> Scene:
+    """The scene in a document, with the sections that its task has by default, and everything checked together."""
+    task = document.get("task")
+    kind = task.get("kind") if isinstance(task, dict) else None
+    needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
+    defaults = [section for section, (need, _) in needs.items() if need == "default"]
+    reader = Reader(folder)
+    values = reader.read(Scene, document, (*_ALWAYS, *defaults))
+    for section, (need, why) in needs.items():
+        if need == "must" and section not in document:
+            reader.complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
+        elif need == "never" and section in document:
+            reader.complain(section, f'not with task.kind = "{kind}": {why}; remove the section')
+
+    def lookup(path: str) -> Any:
+        section, _, key = path.partition(".")
+        if path in reader.bad or section in reader.bad:
+            raise LookupError(path)
+        found = values.get(section)
+        return getattr(found, key, None) if key else found
+
+    for where, complaint in broken_rules(lookup):
+        reader.complain(where, complaint)
+    if reader.problems:
         raise SceneError([f"{file}: {problem}" for problem in reader.problems])
-    return scene
+    return Scene(**values)
 
 
-class _Reader:
-    """Reads one document and collects its problems."""
+class Reader:
+    """Reads tables as the dataclasses that describe them, and collects what is wrong.
 
-    def __init__(self, document: Mapping[str, Any], folder: Path | None) -> None:
+    Attributes:
+        problems: each with its key path.
+        bad: the key paths that have one.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
         self.problems: list[str] = []
-        self._document = document
+        self.bad: set[str] = set()
         self._folder = folder
-        self._bad: set[str] = set()
-        self._values: dict[str, dict[str, Any]] = {}
 
-    def read(self) -> Scene | None:
-        """The scene, or None when there are problems."""
-        sections = _sections()
-        for name in self._document:
+    def complain(self, path: str, message: str) -> None:
+        """Note a problem."""
+        self.bad.add(path)
+        self.problems.append(f"{path}: {message}")
+
+    def read(self, file: type[Any], document: Mapping[str, Any], needed: Iterable[str] = ()) -> dict[str, Any]:
+        """The sections of a file, by name.
+
+        Args:
+            file: dataclass of the sections.
+            document: as `tomllib` gives it.
+            needed: sections that are read as empty ones where they are missing.
+        """
+        sections, needed = typing.get_type_hints(file), set(needed)
+        for name in document:
             if name not in sections:
-                self._complain(name, f"unknown section{_did_you_mean(name, sections)}")
-        for name in self._present(sections):
-            self._read_section(name, sections[name])
-        self._check_needs()
-        for where, complaint in broken_rules(self._lookup):
-            self._complain(where, complaint)
-        if self.problems:
-            return None
-        return Scene(**{name: sections[name](**values) for name, values in self._values.items()})
+                self.complain(name, f"unknown section{_did_you_mean(name, sections)}")
+        return {
+            name: self._list(hint, document.get(name, []), name)
+            if typing.get_origin(hint) is tuple
+            else self.section(next(iter(typing.get_args(hint)), hint), document.get(name, {}), name)
+            for name, hint in sections.items()
+            if name in document or name in needed
+        }
 
-    def _present(self, sections: Iterable[str]) -> list[str]:
-        kind = self._document["task"].get("kind") if isinstance(self._document.get("task"), dict) else None
-        needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
-        defaults = {name for name, (need, _) in needs.items() if need == "default"}
-        return [name for name in sections if name in self._document or name in _ALWAYS or name in defaults]
+    def _list(self, hint: Any, tables: Any, name: str) -> tuple[Any, ...]:
+        if not isinstance(tables, list):
+            self.complain(name, f"expected a list of sections [[{name}]], got {toml_value(tables)}")
+            return ()
+        cls = typing.get_args(hint)[0]
+        return tuple(self.section(cls, table, f"{name}[{at}]") for at, table in enumerate(tables, start=1))
 
-    def _read_section(self, section: str, cls: type[Any]) -> None:
-        table = self._document.get(section, {})
+    def section(self, cls: type[Any], table: Any, name: str) -> Any:
+        """One section; a key that has a problem or is missing is None in it."""
         if not isinstance(table, dict):
-            return self._complain(section, f"expected a section [{section}], got {toml_value(table)}")
-        annotations = _annotations(cls)
+            return self.complain(name, f"expected a section [{name}], got {toml_value(table)}")
+        annotations = typing.get_type_hints(cls, include_extras=True)
         for key in table:
             if key not in annotations:
-                self._complain(f"{section}.{key}", f"unknown key{_did_you_mean(key, annotations)}")
-        values = self._values[section] = {}
+                self.complain(f"{name}.{key}", f"unknown key{_did_you_mean(key, annotations)}")
+        values: dict[str, Any] = {}
         for field in dataclasses.fields(cls):
+            path, annotation = f"{name}.{field.name}", annotations[field.name]
             if field.name in table:
-                self._read_key(section, field.name, annotations[field.name], table[field.name])
+                values[field.name] = self._value(table[field.name], annotation, path)
             elif field.default is not dataclasses.MISSING:
                 values[field.name] = field.default
             else:
-                self._complain(f"{section}.{field.name}", f"missing{_choices(annotations[field.name])}")
-        self._check_conditions(section, annotations, table)
+                words = choices_of(annotation)
+                self.complain(path, f"missing: one of {', '.join(words)}" if words else "missing")
+                values[field.name] = None
+        for key, annotation in annotations.items():
+            for only in conditions_of(annotation, Only):
+                self._check_condition(f"{name}.{key}", key in table, only, values[only.key])
+        return cls(**values)
 
-    def _read_key(self, section: str, key: str, annotation: Any, raw: object) -> None:
+    def _value(self, raw: object, annotation: Any, path: str) -> Any:
         try:
             value = convert(raw, annotation)
         except MismatchError as mismatch:
             hint = _did_you_mean(raw, choices_of(annotation)) if isinstance(raw, str) else ""
-            return self._complain(f"{section}.{key}", f"expected {mismatch}, got {toml_value(raw)}{hint}")
-        if conditions_of(annotation, ScenePath) and self._folder:
-            with contextlib.suppress(OSError):  # a name that no file can have: said where the file is read
-                value = str((self._folder / value).resolve()) if (self._folder / value).is_file() else value
-        self._values[section][key] = value
+            return self.complain(path, f"expected {mismatch}, got {toml_value(raw)}{hint}")
+        if conditions_of(annotation, ScenePath) and self._folder and isfile(self._folder / value):
+            return str((self._folder / value).resolve())
+        return value
 
-    def _check_conditions(self, section: str, annotations: Mapping[str, Any], table: Mapping[str, Any]) -> None:
-        for key, annotation in annotations.items():
-            for only in conditions_of(annotation, Only):
-                actual = self._values[section].get(only.key)
-                applies = actual is None or actual in only.values
-                if key in table and not applies:
-                    needed = " or ".join(f'"{value}"' for value in only.values)
-                    self._complain(f"{section}.{key}", f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
-                elif key not in table and applies and only.required and actual is not None:
-                    self._complain(f"{section}.{key}", f'missing: {only.key} = "{actual}" needs it')
-
-    def _check_needs(self) -> None:
-        kind = self._values.get("task", {}).get("kind")
-        for section, (need, why) in SECTIONS_OF_TASK.get(kind or "", {}).items():
-            if need == "must" and section not in self._document:
-                self._complain(section, f'missing: task.kind = "{kind}" needs a section [{section}]: {why}')
-            elif need == "never" and section in self._document:
-                self._complain(section, f'not with task.kind = "{kind}": {why}; remove the section')
-
-    def _lookup(self, path: str) -> Any:
-        section, _, key = path.partition(".")
-        if path in self._bad or section in self._bad:
-            raise LookupError(path)
-        values = self._values.get(section)
-        return values if not key or values is None else values.get(key)
-
-    def _complain(self, path: str, message: str) -> None:
-        self._bad.add(path)
-        self.problems.append(f"{path}: {message}")
-
-
-def _annotations(cls: type[Any]) -> Mapping[str, Any]:
-    return typing.get_type_hints(cls, include_extras=True)
-
-
-def _sections() -> Mapping[str, type[Any]]:
-    hints = typing.get_type_hints(Scene)
-    return {name: next(part for part in typing.get_args(hint) or (hint,)) for name, hint in hints.items()}
-
-
-def _packaged_files() -> dict[str, Path]:
-    return {path.stem: path for path in sorted(scenes_folder().glob("*.toml"))}
-
-
-def _not_readable(name: str, error: OSError, packaged: Mapping[str, Path]) -> str:
-    if name.endswith(".toml") or "/" in name:
-        return f"{name}: cannot be read: {error.strerror}"
-    return f"{name}: no such scene or file{_did_you_mean(name, packaged)}; packaged scenes: {', '.join(packaged)}"
+    def _check_condition(self, path: str, given: bool, only: Only, actual: Any) -> None:
+        """A key stands where it belongs, and nowhere else."""
+        if given and actual is not None and actual not in only.values:
+            needed = " or ".join(f'"{value}"' for value in only.values)
+            self.complain(path, f'only with {only.key} = {needed}, got {only.key} = "{actual}"')
+        elif not given and only.required and actual in only.values:
+            self.complain(path, f'missing: {only.key} = "{actual}" needs it')
 
 
 def _did_you_mean(got: str, known: Iterable[str]) -> str:
     folded = {word.lower(): word for word in known}
     close = difflib.get_close_matches(got.lower(), folded, n=1, cutoff=0.5)
     return f"; did you mean {folded[close[0]]}?" if close else ""
-
-
-def _choices(annotation: Any) -> str:
-    words = choices_of(annotation)
-    return f": one of {', '.join(words)}" if words else ""

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from canprobe.protocol.tactile import WINDOWS
-from canprobe.scene.checks import Direction, Distinct, OneOf, Only, Pattern, Range, ScenePath, Symmetric
+from canprobe.scene.checks import DIRECTION, DISTINCT, SYMMETRIC, OneOf, Only, Pattern, Range, ScenePath
 
 TaskKind = Literal["scan", "press", "calibrate", "listen", "free"]
 Strategy = Literal["weave", "straight", "circle"]
@@ -103,7 +103,7 @@ class ArmSettings:
 
     model: ArmModel = "upenn"
     """Published geometry of the PUMA 260 that the controller uses."""
-    node_ids: Annotated[NodeIds, Distinct()] = (1, 2, 3, 4, 5, 6)
+    node_ids: Annotated[NodeIds, DISTINCT] = (1, 2, 3, 4, 5, 6)
     """Node ids of the drives, from the base to the wrist."""
     eds: Annotated[str, ScenePath()] = "puma260_joint.eds"
     """EDS of the drives: a packaged name, or a path relative to the scene."""
@@ -116,7 +116,7 @@ class ArmSettings:
     """SYNC periods of silence after which master and drives treat each other as lost."""
     grouped_rpdo: bool | Auto = False
     """Put two targets into one RPDO by dummy mapping."""
-    serial_numbers: Annotated[SerialNumbers | None, Distinct()] = None
+    serial_numbers: Annotated[SerialNumbers | None, DISTINCT] = None
     """Serial number (1018h:04) that each drive must have. Left out: any."""
 
 
@@ -195,9 +195,7 @@ class ObjectSettings:
     """Distance from crest to crest."""
     angle_deg: Annotated[float | None, Range(1, 179), Only("kind", ("fillet",), required=True)] = None
     """Angle between the two normals."""
-    matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, Symmetric(), Only("kind", ("quadric",), required=True)] = (
-        None
-    )
+    matrix: Annotated[tuple[Row4, Row4, Row4, Row4] | None, SYMMETRIC, Only("kind", ("quadric",), required=True)] = None
     """Matrix S of the quadric XᵀSX = 0, with lengths in metres."""
     position_mm: Vec3 = (-120.0, -122.5, 374.0)
     """Origin of the object frame in the base frame: a point of the surface."""
@@ -225,7 +223,7 @@ class TaskSettings:
     """Speed of the approach."""
     start_mm: Annotated[Vec3, TOUCHING] = (-120.0, -122.5, 374.0)
     """Expected contact point, in the base frame."""
-    approach_normal: Annotated[Vec3, Direction(), TOUCHING] = (0.0, 0.0, 1.0)
+    approach_normal: Annotated[Vec3, DIRECTION, TOUCHING] = (0.0, 0.0, 1.0)
     """Expected outward normal at `start_mm`, of any length. The probe approaches against it."""
     clearance_mm: Annotated[float, Range(0, 50, open_low=True), TOUCHING] = 3.0
     """Distance from `start_mm` at which the approach begins."""
@@ -271,7 +269,7 @@ class ShapeSettings:
     """Estimator in the control loop."""
     memory_mm: Annotated[float, Range(0, 1000, open_low=True)] = 20.0
     """Length of path on which an estimate rests, at any speed."""
-    also: Annotated[tuple[ShapeMethod, ...], Distinct()] = ("ml", "chen1996")
+    also: Annotated[tuple[ShapeMethod, ...], DISTINCT] = ("ml", "chen1996")
     """Other estimators that compute on the same contacts after the run, for the report."""
     patch: bool = True
     """Use the second moments of the tactile images where the path leaves a curvature open."""
@@ -388,7 +386,7 @@ class PlantSettings:
 class BridgeSettings:
     """`[bridge]`: other tools that receive the data of this cell, each from a separate process."""
 
-    use: Annotated[tuple[BridgeName, ...], Distinct()] = ()
+    use: Annotated[tuple[BridgeName, ...], DISTINCT] = ()
     """Bridges to start."""
     foxglove_port: Annotated[int, Range(0, 65_535)] = 8765
     """Port of the Foxglove server. 0: the system chooses."""

@@ -3,17 +3,19 @@
 import dataclasses
 import math
 import tomllib
+import typing
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from canprobe.errors import SceneError
-from canprobe.scene.load import dump_scene, load_scene, packaged_scenes, parse_scene
+from canprobe.scene.load import Reader, dump_scene, load_scene, packaged_scenes, parse_scene
 from canprobe.scene.model import (
     ArmSettings,
     BringUpSettings,
     LimitSettings,
+    NodeId,
     ProbeSettings,
     Scene,
     SceneInfo,
@@ -114,12 +116,12 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
         ("arm", "node_ids = [1, 2, 3, 4, 5, 5]", "arm.node_ids", ("all different",)),
         ("arm", "node_ids = [1, 2, 3, 4, 5, 127]", "arm.node_ids", ("from 1 to 126",)),
         ("arm", "node_ids = [1, 2, 3, 4, 5]", "arm.node_ids", ("a list of 6",)),
-        ("arm", "node_ids = [1, 2, 3, 4, 5, 16]", "sensor.node_id", ("of its own", "16")),
+        ("arm", "node_ids = [1, 2, 3, 4, 5, 16]", "sensor.node_id", ("arm.node_ids does not have", "16")),
         ("sensor", "node_id = 127", "sensor.node_id", ("from 1 to 126", "got 127")),
         ("sensor", "node_id = 0", "sensor.node_id", ("from 1 to 126", "got 0")),
         ("sensor", "mode = 'windw'", "sensor.mode", ("window, image, features", "did you mean window?")),
         ("sensor", "rate_hz = 500", "sensor.rate_hz", ("at most cycle.rate_hz = 400", "got 500")),
-        ("sensor", "emulated = false", "sensor.emulated", ("a real sensor cannot feel",)),
+        ("sensor", "emulated = false", "sensor.emulated", ("a real sensor cannot measure",)),
         ("shape", "method = 'rekursive'", "shape.method", ("did you mean recursive?",)),
         ("shape", "also = ['recursive']", "shape.also", ("besides the main one",)),
         ("shape", "also = ['ml', 'ml']", "shape.also", ("all different",)),
@@ -138,7 +140,7 @@ def test_one_wrong_line_is_one_problem(section, line, path, words):
 @pytest.mark.parametrize(
     ("text", "path", "word"),
     [
-        (SCAN.replace("[sensor]\n", ""), "sensor", "a scan follows what it feels"),
+        (SCAN.replace("[sensor]\n", ""), "sensor", "a scan follows the contact"),
         (SCAN.replace("[arm]\n", ""), "arm", "a scan moves the probe"),
         (SCAN.replace('[object]\nkind = "plane"\n', ""), "object", "touches nothing without an [object]"),
         (SCAN.replace('name = "test"\n', ""), "scene.name", "missing"),
@@ -246,19 +248,12 @@ def test_any_values_survive_the_way_back(title, seed, force, x):
 
 def test_every_field_can_be_left_out_or_says_that_it_cannot():
     required = {
-        (section.name, field.name)
-        for section in dataclasses.fields(Scene)
-        for cls in [_section_class(section.name)]
-        for field in dataclasses.fields(cls)
+        (section, field.name)
+        for section, hint in typing.get_type_hints(Scene).items()
+        for field in dataclasses.fields(next(iter(typing.get_args(hint)), hint))
         if field.default is dataclasses.MISSING
     }
     assert required == {("scene", "name"), ("task", "kind"), ("object", "kind")}
-
-
-def _section_class(name):
-    from canprobe.scene.load import _sections
-
-    return _sections()[name]
 
 
 def test_defaults_pass_their_own_checks():
@@ -296,3 +291,30 @@ def test_lists_nested_beyond_the_parser():
 def test_rates_and_shares_of_nearly_nothing(section, line, told):
     (problem,) = problems_of(with_line(section, line))
     assert problem == f"file.toml: {section}.{line.split()[0]}: expected {told}, got 1e-09"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Part:
+    node_id: NodeId
+    eds: str = "some.eds"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Parts:
+    drive: tuple[_Part, ...] = ()
+
+
+def test_a_file_may_have_a_list_of_sections():
+    """As `[[drive]]`: no packaged scene has one, but the reader and the writer know them."""
+    text = '[[drive]]\nnode_id = 3\n\n[[drive]]\nnode_id = 4\neds = "other.eds"\n'
+    reader = Reader()
+    parts = _Parts(**reader.read(_Parts, tomllib.loads(text)))
+    assert parts == _Parts((_Part(3), _Part(4, "other.eds"))) and not reader.problems
+    assert tomllib.loads(dump_scene(parts))["drive"] == [dataclasses.asdict(part) for part in parts.drive]
+    reader.read(_Parts, tomllib.loads("[[drive]]\nnode_id = 3\n[[drive]]\nnode_id = 0\nedz = 1"))
+    reader.read(_Parts, tomllib.loads("[drive]\nnode_id = 3"))
+    assert reader.problems == [
+        "drive[2].edz: unknown key; did you mean eds?",
+        "drive[2].node_id: expected an integer from 1 to 126, got 0",
+        "drive: expected a list of sections [[drive]], got {node_id = 3}",
+    ]
