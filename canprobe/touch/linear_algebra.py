@@ -75,6 +75,13 @@ def eigen(A: Array) -> tuple[Array, Array]:
     return values, vectors
 
 
+def principal(A: Array) -> tuple[float, float, float]:
+    """Mean and half difference of the eigenvalues of a symmetric (2, 2), and the angle (rad) of the larger one."""
+    (a, b), (_, d) = A.tolist()
+    half = 0.5 * (a - d)
+    return 0.5 * (a + d), math.hypot(half, b), 0.5 * math.atan2(b, half)
+
+
 def lower_root(A: Array) -> Array:
     """The lower triangular L of a Cholesky decomposition, L Lᵀ = A.
 

@@ -15,18 +15,8 @@ import numpy as np
 
 from canprobe.touch.estimate.answer import foot
 from canprobe.touch.estimate.noise import Correlation, Noise, Prior, mixed
-from canprobe.touch.estimate.nonlinear import (
-    CHI2_999,
-    DIFFUSE,
-    averaged,
-    basis,
-    monomials,
-    scales,
-    sharpest,
-    shifted,
-    size_of,
-)
-from canprobe.touch.estimate.quadric import Design, design, sample_rows, transport
+from canprobe.touch.estimate.nonlinear import DIFFUSE, averaged, scales
+from canprobe.touch.estimate.quadric import Design, design, linearise, sharpest, shifted, size_of, transport
 from canprobe.touch.linear_algebra import (
     Array,
     eigen,
@@ -37,8 +27,6 @@ from canprobe.touch.linear_algebra import (
     transported_rotation,
     upper_root,
 )
-
-# Whitened equations of single contacts in a filter's frame, and how well they agree with what it says.
 
 
 class Touch(NamedTuple):
@@ -54,69 +42,13 @@ class Touch(NamedTuple):
     coupling: float = 0.0
 
 
-class Equations(NamedTuple):
-    """Of n contacts in a filter's frame.
-
-    Attributes:
-        rows: (n, 3, 18) whitened: of the parameters and of the terms that a quadric leaves out.
-        residuals: (n, 3) their signs turned.
-    """
-
-    rows: Array
-    residuals: Array
-
-
-def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Touch]) -> Equations:
-    """The rows of contacts at parameters (9,).
-
-    Args:
-        c: parameters in the working frame, in units of `length`.
-        T_base_work: (4, 4), m.
-        length: m.
-        touches: the contacts.
-    """
-    points, normals = _in_frame(T_base_work, length, touches)
-    at, square = c.tolist(), 1.0 / length**2
-    found = [
-        sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
-        for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
-    ]
-    table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
-    return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
-
-
-def squared_innovations(rows: Array, residuals: Array, inverse: Array) -> list[float]:
-    """Squared innovation of contacts with rows (n, 3, 18) and residuals (n, 3), χ² of 3.
-
-    Args:
-        rows, residuals: as of `Equations`.
-        inverse: (9, 9) of the root of the information.
-    """
-    predicted = rows[:, :, :9] @ inverse
-    variance = 1.0 + np.square(predicted).sum(axis=2)
-    found: list[float] = (np.square(residuals) / variance).sum(axis=1).tolist()
-    return found
-
-
-def weight_of(square: float) -> float:
-    """Weight of a contact with a squared innovation: 1 up to the 99.9 % point of χ², then as in `nonlinear.robust`."""
-    ratio = CHI2_999 / max(square, CHI2_999)
-    return ratio * ratio
-
-
 def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
-    """The constant parts of many contacts at once (`quadric.design`)."""
-    points, normals = _in_frame(T_base_work, length, touches)
-    sigma_point = np.array([t.sigma_point for t in touches]) / length
-    sigma_normal = np.array([t.sigma_normal for t in touches])
-    return design(points, normals, Noise(sigma_point, sigma_normal, touches[0].coupling * length))
-
-
-def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tuple[Array, Array]:
-    """Places, dimensionless, and normals (n, 3) in the working frame."""
+    """Contacts (`quadric.design`) in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]) @ R / length
-    return points, np.array([t.normal for t in touches]) @ R
+    sigma_point = np.array([t.sigma_point for t in touches]) / length
+    noise = Noise(sigma_point, np.array([t.sigma_normal for t in touches]), touches[0].coupling * length)
+    return design(points, np.array([t.normal for t in touches]) @ R, noise)
 
 
 # What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
@@ -239,9 +171,6 @@ class Expected(NamedTuple):
     sigma_point: float = 0.0
 
 
-AS_STATED = Expected()
-
-
 class _Along(NamedTuple):
     """The terms along directions in which what the samples say about them is independent.
 
@@ -265,14 +194,10 @@ class _Along(NamedTuple):
 
 
 class LeftOut:
-    """Sums over the rows of parameters and terms.
+    """Sums over the rows of parameters and terms; `score` is that of both.
 
     Args:
-        prior: (9, 9) information of what is always known about the parameters.
-        correlation: of the rows along the path; None for independent samples.
-
-    Attributes:
-        score: (`Score`) covariance of the score of parameters and terms.
+        prior, correlation: as of `Score`, for the nine parameters.
     """
 
     def __init__(self, prior: Array, correlation: Correlation | None) -> None:
@@ -312,14 +237,9 @@ class LeftOut:
         self._information = wide.T @ self._information @ wide
         self._slope = away.T @ self._slope
 
-    def amend(self, c: Array, H: Array, place: Array, expected: Expected = AS_STATED) -> Amended:
-        """Average an answer over the terms.
-
-        Args:
-            c: (9,) parameters of the filter.
-            H: (9, 9) inverse of their information.
-            place: (3,) where the answer is wanted, in the filter's frame.
-            expected: of the samples.
+    def amend(self, c: Array, H: Array, place: Array, expected: Expected) -> Amended:
+        """Average an answer at a place (3,) over the terms; c (9,) of the filter, H (9, 9) the inverse of its
+        information.
         """
         a = self._along(c, H, expected)
         off = a.off.copy()
@@ -328,7 +248,7 @@ class LeftOut:
         both = H @ a.shared[:9] @ (a.weighted * found.share) @ off.T
         return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
 
-    def explanation(self, c: Array, H: Array, expected: Expected = AS_STATED) -> Array:
+    def explanation(self, c: Array, H: Array, expected: Expected) -> Array:
         """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
         a = self._along(c, H, expected)
         found = averaged(a.information, a.score, -a.off, a.curvature, a.blur)
@@ -443,6 +363,17 @@ class InformationFilter:
         step = self.inverse @ full[:9, 9]
         self.c = self.c + step
         self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
+
+    def equations(self, touches: Sequence[Touch]) -> tuple[Array, Array]:
+        """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""
+        at = linearise(self.c, batch_design(self.T, self.length, touches))
+        return at.jacobian(18), -at.r
+
+    def squared_innovations(self, rows: Array, residuals: Array) -> Array:
+        """(n,) squared innovations of such contacts, χ² of 3."""
+        variance = 1.0 + np.square(rows[:, :, :9] @ self.inverse).sum(axis=2)
+        result: Array = (np.square(residuals) / variance).sum(axis=1)
+        return result
 
     def place(self, point: Array) -> Array:
         """A point (3,) of base in the working frame, dimensionless."""

@@ -10,12 +10,13 @@ from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
 from canprobe.touch.estimate.answer import (
+    Solution,
     SurfaceEstimate,
     anchor,
     build_estimate,
     curvature_covariance,
     evidence_of,
-    solution,
+    partial_covariance,
 )
 from canprobe.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed, path_extent
 from canprobe.touch.estimate.nonlinear import CERTAIN, DIFFUSE, correct, fit, misfit_notes
@@ -24,12 +25,13 @@ from canprobe.touch.estimate.quadric import (
     curvature_jacobian,
     decide,
     design,
+    linearise,
     nothing_observed,
     parameters_of,
-    rows,
     spread_of,
+    turned,
 )
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, solved, tangent_rotation, upper_root
+from canprobe.touch.linear_algebra import Array, checked, homogeneous, inverted, solved, tangent_rotation, upper_root
 from canprobe.touch.surface import SurfaceMatrix
 
 # Batch estimates from points and normals: the checked arrays and the `ml` method.
@@ -132,13 +134,18 @@ def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> S
             result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, np.zeros(3), length)
+    decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
+    if decision.rank == 3 or has_prior:
+        covariance = curvature_covariance(a.c, a.M @ inverted(result.root))
+    else:
+        covariance = np.full((3, 3), math.nan)
     free = anchor(result.free, T, np.zeros(3), length)
     spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
     deviation = solved(result.free_root.T, free.M.T).T
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
-        solution(a, result.root, result.decision, has_prior),
+        Solution(a.c, covariance, decision, has_prior, root=solved(a.M.T, result.root.T).T),
         length=length,
         T_frame_contact=a.T_frame_contact,
         problem_root=problem_root,
@@ -207,7 +214,7 @@ def cramer_rao(
     in_contact[:3, :3] *= length
     c = parameters_of(in_contact)
     d = design((p - origin) @ R / length, n @ R, touches.noise.scaled(length, R))
-    J = rows(c, d).J
+    J = linearise(c, d).jacobian()
     independent = touches.whitener()
     J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
     stated = Prior.weak(length) if prior is None else prior
@@ -216,17 +223,9 @@ def cramer_rao(
     decision = decide(root[6:, 6:] * UNIT, wide, math.inf)
     known = decision.passed & (decision.information > 0.0)  # points in one place know nothing
     if not known.all():
-        return _open_covariance(decision.vectors[:, known], decision.information[known], length)
+        V = decision.vectors[:, known]
+        hidden = 1.0 - np.einsum("ij,ij->i", V, V) > 1e-9
+        return partial_covariance(V, decision.information[known], hidden) / length**2
     X = np.linalg.solve(root.T, curvature_jacobian(c).T)
     result: Array = X.T @ X / length**2
     return result
-
-
-def _open_covariance(V: Array, information: Array, length: float) -> Array:
-    """Covariance where some combinations of K are not observed at all: infinite and NaN in what they touch."""
-    to_q = np.array([1.0, math.sqrt(2.0), 1.0])
-    C: Array = (V / information) @ V.T / np.outer(to_q, to_q) / length**2
-    for i in np.flatnonzero(1.0 - np.einsum("ij,ij->i", V, V) > 1e-9):
-        C[i, :] = C[:, i] = math.nan
-        C[i, i] = math.inf
-    return C

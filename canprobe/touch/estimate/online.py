@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -12,10 +11,11 @@ import numpy as np
 
 from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample, Doubt
-from canprobe.touch.estimate.answer import TO_Q, SurfaceEstimate, is_umbilic
+from canprobe.touch.estimate.answer import SurfaceEstimate, is_umbilic
 from canprobe.touch.estimate.likelihood import Touches, make_touches
 from canprobe.touch.estimate.noise import make_noise
 from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.quadric import TO_Q
 from canprobe.touch.linear_algebra import Array, positive
 
 # What an online estimator is, and the gate that every sample passes.
@@ -247,7 +247,7 @@ class ChangeTest:
             self._of_best += LONG_TERM * (best - self._of_best)
         return False
 
-    def usual_again(self, squares: Sequence[float]) -> bool:
+    def usual_again(self, squares: Array) -> bool:
         """Whether such squared innovations alone would set off no alarm, once something is taken into account."""
         return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM * self.usual
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,19 +25,11 @@ from canprobe.touch.estimate.answer import (
     curvature_covariance,
     evidence_of,
 )
-from canprobe.touch.estimate.information import (
-    Equations,
-    Expected,
-    InformationFilter,
-    Touch,
-    equations,
-    squared_innovations,
-    weight_of,
-)
+from canprobe.touch.estimate.information import Expected, InformationFilter, Touch
 from canprobe.touch.estimate.noise import Correlation, Prior
-from canprobe.touch.estimate.nonlinear import DIFFUSE, misfit_notes, size_of
+from canprobe.touch.estimate.nonlinear import CHI2_999, DIFFUSE, misfit_notes
 from canprobe.touch.estimate.online import ChangeTest, Dropped, Gate
-from canprobe.touch.estimate.quadric import UNIT, Decision, decide, nothing_observed
+from canprobe.touch.estimate.quadric import UNIT, Decision, decide, nothing_observed, size_of
 from canprobe.touch.estimate.start import Start
 from canprobe.touch.linear_algebra import (
     Array,
@@ -258,11 +249,12 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """Contacts against what the filter says: their equations, squared innovations and weights."""
+    """Contacts against what the filter says: their equations, squared innovations (n,) and weights (n,)."""
 
-    equations: Equations
-    squares: list[float]
-    weights: list[float]
+    rows: Array
+    residuals: Array
+    squares: Array
+    weights: Array
 
 
 class RecursiveEstimator:
@@ -362,8 +354,8 @@ class RecursiveEstimator:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
-        if compared and any([self._change.take(square, caution) for square in compared.squares]):
-            explained = self._explained(compared.equations)
+        if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
+            explained = self._explained(compared)
             if explained is None:
                 self._change.alarm()
                 self._drop_agreeing(compared.squares)
@@ -379,28 +371,28 @@ class RecursiveEstimator:
                 self._filter.follow(self._last.point)
 
     def _compared(self) -> _Compared:
-        found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
-        return self._judged(found, found.residuals)
+        rows, residuals = self._filter.equations([p.touch for p in self._pending])
+        return self._judged(rows, residuals, residuals)
 
-    def _explained(self, found: Equations) -> _Compared | None:
+    def _explained(self, found: _Compared) -> _Compared | None:
         """As `_compared`, where the contacts are as the terms that a quadric leaves out had them expected."""
         if self._quadric:
             return None
         f = self._filter
         terms = f.left_out.explanation(f.c, f.inverse @ f.inverse.T, self._expected())
-        left = self._judged(found, found.residuals - found.rows @ terms)
+        left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
         return left if self._change.usual_again(left.squares) else None
 
-    def _judged(self, found: Equations, residuals: Array) -> _Compared:
-        squares = squared_innovations(found.rows, residuals, self._filter.inverse)
-        return _Compared(found, squares, [p.weight * weight_of(s) for p, s in zip(self._pending, squares, strict=True)])
+    def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
+        """Weighted by their places, and from the 99.9 % point of χ² on by the square of `CHI2_999 / d²`."""
+        squares = self._filter.squared_innovations(rows, unexplained)
+        weights = np.array([p.weight for p in self._pending]) * np.square(CHI2_999 / np.maximum(squares, CHI2_999))
+        return _Compared(rows, residuals, squares, weights)
 
     def _absorb(self, compared: _Compared, moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array(compared.weights)
-        root = np.sqrt(self._weigh(moved, weight) * weight)[:, None]
-        rows, residuals = compared.equations
-        self._filter.take(rows * root[:, :, None], residuals * root, moved)
+        root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
+        self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
 
     def _beginning(self, start: Start, moved: float) -> None:
         """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
@@ -416,7 +408,7 @@ class RecursiveEstimator:
             self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
             return
         c = found.target if start.settled else found.c
-        self._filter.adopt(start.T, c, found.root, start.rows, found.residuals_at(c), start.travelled)
+        self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
         if start.over:
             self._start, self._settled = None, True
@@ -430,9 +422,8 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self, squares: Sequence[float]) -> None:
+    def _drop_agreeing(self, squares: Array) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
-        limit = AGREEING * self._change.usual
-        agree = [i for i, square in enumerate(squares[:-1]) if square <= limit]
-        for _ in range(agree[-1] + 1 if agree else 0):
+        agree = np.flatnonzero(squares[:-1] <= AGREEING * self._change.usual)
+        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
             self._pending.popleft()

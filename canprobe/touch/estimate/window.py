@@ -20,7 +20,7 @@ from canprobe.touch.estimate.answer import Solution, SurfaceEstimate, build_esti
 from canprobe.touch.estimate.likelihood import Touches, fit_ml, working_frame
 from canprobe.touch.estimate.noise import Prior
 from canprobe.touch.estimate.online import AGREES, LAST_FEW, WindowEstimator, looks_changed
-from canprobe.touch.estimate.quadric import decide
+from canprobe.touch.estimate.quadric import TO_Q, decide
 from canprobe.touch.linear_algebra import Array, cross, rotation_vector, upper_root
 
 # Six-unknown linear estimates from differences of points and normals: `chord` and the core of `chen1996`.
@@ -31,7 +31,6 @@ _COLUMNS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 _FROM_SIX = (2, 4, 5, 0, 1, 3)
 """c13 c23 c33 c11 c12 c22 of the nine-parameter order, as places among the six."""
 _NUMERIC = 1e-10
-_K_TO_Q = np.outer([1.0, math.sqrt(2.0), 1.0], [1.0, math.sqrt(2.0), 1.0])
 
 
 class Pairs(NamedTuple):
@@ -107,7 +106,7 @@ def estimate_from(touches: Touches, data: Pairs, inverse: Array, method: str) ->
     variance = float(touches.noise.normal_variance.mean()) + size**2 * vp
     k = variance * _propagated(data, inverse)[np.ix_([0, 1, 3], [0, 1, 3])]  # of 2 c11, 2 c12, 2 c22: of K itself
     flat = data.points[:, :2]
-    decision = decide(_root_of(k * _K_TO_Q), flat.T @ flat / (len(flat) * 2.0 * vp), size)
+    decision = decide(_root_of(k * np.outer(TO_Q, TO_Q)), flat.T @ flat / (len(flat) * 2.0 * vp), size)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),
         length=length,

@@ -78,13 +78,13 @@ class TestWork:
     @pytest.fixture
     def evaluations(self, monkeypatch):
         sizes = []
-        rows = one_step.rows
+        linearise = one_step.linearise
 
         def counted(c, d):
             sizes.append(len(d.X))
-            return rows(c, d)
+            return linearise(c, d)
 
-        monkeypatch.setattr(one_step, "rows", counted)
+        monkeypatch.setattr(one_step, "linearise", counted)
         return sizes
 
     @pytest.mark.parametrize("pace", [0.125e-3, 0.02e-3], ids=["nominal", "slow"])
