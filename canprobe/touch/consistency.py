@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch.estimate.quadric import curvature_jacobian, transport, turned
+from canprobe.touch.estimate.quadric import TO_Q, curvature_jacobian, transport, turned
 from canprobe.touch.linear_algebra import Array, homogeneous, inverse_transform, positive, tangent_rotation
 from canprobe.touch.surface import SurfaceMatrix
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap
@@ -37,7 +37,6 @@ from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 # proof of two surfaces, but of a difference that the stated noise does not explain; `Crossing.angle` tells which passes
 # ran alike.
 
-_TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 _UNSEEN = 0.05
 """Largest part of a unit combination that either pass may have left unobserved."""
 _HEIGHT, _SLOPE, _K = slice(0, 1), slice(1, 3), slice(3, 6)
@@ -159,7 +158,7 @@ def _seen_by_both(hidden_a: Array, hidden_b: Array) -> Array:
     _, size, Vt = np.linalg.svd(np.concatenate([hidden_a, hidden_b]))
     seen = Vt[size < _UNSEEN]
     rows = np.zeros((len(seen), 6))
-    rows[:, _K] = seen * _TO_Q
+    rows[:, _K] = seen * TO_Q
     return rows
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
 from canprobe.touch.estimate.answer import SurfaceEstimate
-from canprobe.touch.estimate.quadric import UNIT, parameters_of, value_rows
+from canprobe.touch.estimate.quadric import TO_Q, UNIT, parameters_of, terms
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
 from canprobe.touch.surface import SurfaceMatrix
 
@@ -162,8 +162,7 @@ def _covariance(estimate: SurfaceEstimate) -> Array:
 def _curvature_covariance(estimate: SurfaceEstimate, V: Array, weak: float) -> Array:
     """(3, 3) covariance of q = (K11, √2 K12, K22), what was not observed held wide, 1/m²."""
     if estimate.rank == 3:
-        to_q = np.array([1.0, math.sqrt(2.0), 1.0])
-        return estimate.covariance * np.outer(to_q, to_q)
+        return estimate.covariance * np.outer(TO_Q, TO_Q)
     seen = V @ np.linalg.inv(V.T @ estimate.information @ V) @ V.T
     result: Array = seen + weak**2 * (np.eye(3) - V @ V.T)
     return result
@@ -222,14 +221,6 @@ class SurfaceMap:
     def memory(self) -> float:
         """Longest path that a patch rests on, m; 0 without patches."""
         return max((patch.distance_m for patch in self.patches), default=0.0)
-
-    def thinned(self, spacing: float) -> SurfaceMap:
-        """The patches at every `spacing` (m) of path; see `spaced`.
-
-        Raises:
-            UsageError: when the spacing is not above 0.
-        """
-        return replace(self, patches=tuple(spaced(self.patches, spacing)))
 
     def equals(self, other: SurfaceMap) -> bool:
         """The same patches, path and method, bit by bit."""
@@ -318,24 +309,11 @@ class MapPoint:
     patches: int
 
 
-class _Stack(NamedTuple):
-    """Patches as arrays: frames, gradient `B x + h` of f, covariance of S (zeros where the pose is not known)."""
-
-    R: Array
-    origin: Array
-    B: Array
-    h: Array
-    covariance: Array
-
-    @classmethod
-    def of(cls, patches: Sequence[LocalPatch]) -> _Stack:
-        T, S = np.array([p.T_base_contact for p in patches]), np.array([p.S for p in patches])
-        covariance = np.array([p.S_covariance * p.pose_known for p in patches])
-        return cls(T[:, :3, :3], T[:, :3, 3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3], covariance)
-
-
 class _Heights(NamedTuple):
-    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met."""
+    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met.
+
+    Variances are 0 where the pose is not known.
+    """
 
     height: Array
     normal: Array
@@ -356,17 +334,18 @@ def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -
     """
     p, limit = checked("point", point, (3,)), positive("reach", reach)
     chosen = _candidates(surface_map, p, limit)
+    nowhere = MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
     if not len(chosen):
-        return _nowhere()
-    stack = _Stack.of([surface_map.patches[i] for i in chosen])
+        return nowhere
+    patches, contacts = [surface_map.patches[i] for i in chosen], surface_map.points[chosen]
     normal = surface_map.normals[chosen[0]]
-    foot = p - normal * float(normal @ (p - surface_map.points[chosen[0]]))
+    foot = p - normal * float(normal @ (p - contacts[0]))
     for _ in range(_ITERATIONS):
-        said = _heights(stack, p, normal)
-        weight = _weights(said, np.linalg.norm(stack.origin - foot, axis=1), limit)
+        said = _heights(patches, p, normal)
+        weight = _weights(said, np.linalg.norm(contacts - foot, axis=1), limit)
         total = float(weight.sum())
         if not total > 0.0:
-            return _nowhere()
+            return nowhere
         weight = weight / total
         height = float(weight @ said.height)
         foot = p + height * normal
@@ -394,10 +373,6 @@ def _candidates(surface_map: SurfaceMap, p: Array, reach: float) -> NDArray[np.i
     return chosen[np.argsort(distance[chosen], kind="stable")]
 
 
-def _nowhere() -> MapPoint:
-    return MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
-
-
 def _weights(said: _Heights, distance: Array, reach: float) -> Array:
     """(n,) weights, not yet of sum 1; variances count only where every patch in reach has one."""
     fade: Array = np.maximum(0.0, 1.0 - (distance / reach) ** 2) ** 2
@@ -409,21 +384,23 @@ def _weights(said: _Heights, distance: Array, reach: float) -> Array:
     return fade
 
 
-def _heights(stack: _Stack, p: Array, normal: Array) -> _Heights:
+def _heights(patches: Sequence[LocalPatch], p: Array, normal: Array) -> _Heights:
     """Where the line p + t·normal meets each patch."""
-    x, d = (p - stack.origin)[:, None] @ stack.R, normal @ stack.R
-    x = x[:, 0]
-    gx, gd = (x[:, None] @ stack.B)[:, 0] + stack.h, (d[:, None] @ stack.B)[:, 0]
+    T, S = np.array([patch.T_base_contact for patch in patches]), np.array([patch.S for patch in patches])
+    R, B, h = T[:, :3, :3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3]
+    x, d = ((p - T[:, :3, 3])[:, None] @ R)[:, 0], normal @ R
+    gx, gd = (x[:, None] @ B)[:, 0] + h, (d[:, None] @ B)[:, 0]
     # f(x + t d) = ½ a t² + b t + c
     a, b = np.einsum("ij,ij->i", d, gd), np.einsum("ij,ij->i", d, gx)
-    c = 0.5 * np.einsum("ij,ij->i", x, gx + stack.h)
+    c = 0.5 * np.einsum("ij,ij->i", x, gx + h)
     square = b * b - 2.0 * a * c
     root = b + np.sqrt(np.maximum(square, 0.0))
     met = (square >= 0.0) & (root > 0.0)
     t = np.where(met, -2.0 * c / np.where(met, root, 1.0), 0.0)
     g = gx + t[:, None] * gd
-    F = value_rows(x + t[:, None] * d)
+    F = terms(x + t[:, None] * d, 9)[:, 0]  # df/dc
     slope = np.where(met, np.einsum("ij,ij->i", g, d), 1.0)
-    variance = np.einsum("ij,ijk,ik->i", F, stack.covariance, F) / slope**2
-    outward = (stack.R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
+    covariance = np.array([patch.S_covariance * patch.pose_known for patch in patches])
+    variance = np.einsum("ij,ijk,ik->i", F, covariance, F) / slope**2
+    outward = (R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
     return _Heights(t, outward, variance, met)
