@@ -73,7 +73,6 @@ class Setting:
             self.method,
             sigma_point=sigma_point,
             sigma_normal=sigma_normal,
-            probe_radius=PROBE_M,
             memory_m=self.window * STEP_M,
             window=self.window,
             lag=self.lag or 10,

@@ -107,7 +107,7 @@ def working_frame(touches: Touches) -> Array:
     return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
 
 
-def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> SurfaceEstimate:
+def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
     """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point.
 
     Args:

@@ -9,11 +9,8 @@ from typing import Protocol
 
 import numpy as np
 
-from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample, Doubt
 from canprobe.touch.estimate.answer import SurfaceEstimate, is_umbilic
-from canprobe.touch.estimate.likelihood import Touches, make_touches
-from canprobe.touch.estimate.noise import make_noise
 from canprobe.touch.estimate.nonlinear import CHI2_999
 from canprobe.touch.estimate.quadric import TO_Q
 from canprobe.touch.linear_algebra import Array, positive
@@ -131,58 +128,6 @@ class Gate:
 
 def _usable(sigma: float | None) -> bool:
     return sigma is None or (math.isfinite(sigma) and sigma > 0.0)
-
-
-class WindowEstimator:
-    """Base of the estimators that keep their last samples and solve them as a batch when asked.
-
-    Args:
-        sigma_point, sigma_normal: see `Gate`.
-        window: samples that are kept.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
-    """
-
-    least = 2
-    """Fewer samples give no answer."""
-
-    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, coupling: float = 0.0) -> None:
-        if window < self.least:
-            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
-        self.dropped = Dropped()
-        self._gate = Gate(sigma_point, sigma_normal)
-        self._coupling = coupling
-        self._samples: deque[ContactSample] = deque(maxlen=window)
-        self._answer: SurfaceEstimate | None = None
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        if self._gate.passes(sample, self.dropped):
-            self._samples.append(sample)
-            self._answer = None
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
-        if self._answer is None and len(self._samples) >= self.least:
-            touches = self._touches()
-            if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
-                answer = self._solve(touches)
-                self._answer = replace(answer, notes=answer.notes + self._gate.notes())
-        return self._answer
-
-    def reset(self) -> None:
-        """Forget all samples."""
-        self._samples.clear()
-        self._gate.reset()
-        self._answer = None
-
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
-        raise NotImplementedError
-
-    def _touches(self) -> Touches:
-        points: Array = np.array([s.p_base for s in self._samples])
-        normals: Array = np.array([s.n_base for s in self._samples])
-        sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
-        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling))
 
 
 # Whether the surface has changed under a filter: an innovation test that wrong single samples do not set off.

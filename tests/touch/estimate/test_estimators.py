@@ -20,7 +20,7 @@ WEIGHT = np.array([1.0, 2.0, 1.0])
 
 
 def make(method="recursive", **kw):
-    return make_estimator(method, **{**NOISE, "probe_radius": 0.04, **kw})
+    return make_estimator(method, **{**NOISE, **kw})
 
 
 def fed(estimator, samples):
@@ -232,7 +232,6 @@ def test_reset_forgets(method, truth):
         ({"method": "kalman"}, "method"),
         ({"sigma_point": 0.0}, "sigma_point"),
         ({"sigma_normal": math.nan}, "sigma_normal"),
-        ({"probe_radius": -0.04}, "probe_radius"),
         ({"memory_m": 0.0}, "memory_m"),
         ({"prior": Prior.flat(0.02, 30.0)}, "prior"),
         ({"method": "ml", "window": 1}, "window"),
