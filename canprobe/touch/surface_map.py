@@ -21,8 +21,6 @@ from canprobe.touch.estimate.quadric import TO_Q, UNIT, parameters_of, terms
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
 from canprobe.touch.surface import SurfaceMatrix
 
-# One local patch of a surface: its contact frame, its matrix, and how well every entry of it is known.
-
 WIDE = 10.0
 """Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
 ±500 1/m for 20 mm, a radius of 2 mm. It only ever widens what is said of heights and normals beside the contact."""
@@ -81,13 +79,7 @@ class LocalPatch:
 
     @classmethod
     def of(cls, estimate: SurfaceEstimate, *, t_s: float, travelled_m: float) -> LocalPatch:
-        """The patch of one estimate.
-
-        Args:
-            estimate: in the base frame, lengths in m.
-            t_s: instant of its last sample, s.
-            travelled_m: path of the contact until then, m.
-        """
+        """The patch of one estimate in the base frame; instant (s) of its last sample and path (m) until then."""
         return cls(
             T_base_contact=estimate.T_frame_contact,
             S=estimate.S,
@@ -168,8 +160,6 @@ def _curvature_covariance(estimate: SurfaceEstimate, V: Array, weak: float) -> A
     return result
 
 
-# A whole scan as one surface description: local patches along the contact's path.
-
 SPACING_M = 2e-3
 """Path from one patch to the next, m: well below the radius of what can be felt, so that neighbours overlap."""
 LEAST_RANK = 1
@@ -229,14 +219,7 @@ class SurfaceMap:
 
 
 def spaced(patches: Iterable[LocalPatch], spacing: float) -> list[LocalPatch]:
-    """The first patch at or after every multiple of a spacing along the path, from the first patch on.
-
-    A contact that stands still adds none.
-
-    Args:
-        patches: by increasing `travelled_m`.
-        spacing: m, above 0.
-    """
+    """The first patch at or after every multiple of a spacing (m) along the path; a contact at rest adds none."""
     step = positive("spacing", spacing)
     kept: list[LocalPatch] = []
     last = -1
@@ -285,7 +268,7 @@ REACH_M = 4e-3
 _ITERATIONS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
 _SETTLED = 1e-10
-_FACING = 0.5
+FACING = 0.5
 """Least cosine between a patch's normal and that of the nearest one: others are another side of a thin body."""
 
 
@@ -367,7 +350,7 @@ def _candidates(surface_map: SurfaceMap, p: Array, reach: float) -> NDArray[np.i
     distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
     first = int(np.argmin(distance))
     lifted = abs(float(surface_map.normals[first] @ offset[first]))
-    facing = surface_map.normals @ surface_map.normals[first] > _FACING
+    facing = surface_map.normals @ surface_map.normals[first] > FACING
     # by the triangle inequality, with room for a foot that is not below the point as seen from the nearest patch
     chosen = np.flatnonzero(facing & (distance <= 1.5 * reach + lifted))
     return chosen[np.argsort(distance[chosen], kind="stable")]

@@ -376,33 +376,19 @@ class Anchor(NamedTuple):
 
 def foot(c: Array, start: Array) -> tuple[Array, Array]:
     """Foot of a nearby point (3,) on the model's surface and the inward unit normal there, dimensionless."""
-    c14, c24, c44, c13, c23, c33, c11, c12, c22 = c.tolist()
-    sx, sy, sz = x, y, z = start.tolist()
-    for last in (False, False, False, False, True):
-        gx = 2.0 * (c11 * x + c12 * y + c13 * z + c14)
-        gy = 2.0 * (c12 * x + c22 * y + c23 * z + c24)
-        gz = 2.0 * (c13 * x + c23 * y + c33 * z) - 1.0
-        square = gx * gx + gy * gy + gz * gz
-        if last:
-            break
-        f = 0.5 * (x * (gx + 2.0 * c14) + y * (gy + 2.0 * c24) + z * (gz - 1.0)) + c44
+    S = matrix_of(c)
+    B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
+    x, g = start, B @ start + h
+    for _ in range(4):
         # along the gradient to the surface, and back over the start along the tangent plane
-        ox, oy, oz = x - sx, y - sy, z - sz
-        k = (ox * gx + oy * gy + oz * gz - f) / square
-        x, y, z = sx + k * gx, sy + k * gy, sz + k * gz
-    size = -1.0 / math.sqrt(square)
-    return np.array([x, y, z]), np.array([gx * size, gy * size, gz * size])
+        f = 0.5 * float(x @ (g + h)) + float(S[3, 3])
+        x = start + g * ((float((x - start) @ g) - f) / float(g @ g))
+        g = B @ x + h
+    return x, -g / math.sqrt(float(g @ g))
 
 
 def anchor(c: Array, T_frame_work: Array, point: Array, length: float) -> Anchor:
-    """Re-express a model at the foot of a point.
-
-    Args:
-        c: (9,) in the working frame, in units of `length`.
-        T_frame_work: (4, 4), m.
-        point: (3,) in the working frame, in units of `length`.
-        length: m.
-    """
+    """A model at the foot of a point; c (9,) and the point (3,) in the working frame, in units of `length` (m)."""
     x, z = foot(c, point)
     R_work = T_frame_work[:3, :3]
     R = tangent_rotation(R_work @ z)

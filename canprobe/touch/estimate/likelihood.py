@@ -18,7 +18,7 @@ from canprobe.touch.estimate.answer import (
     evidence_of,
     partial_covariance,
 )
-from canprobe.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed, path_extent
+from canprobe.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed
 from canprobe.touch.estimate.nonlinear import CERTAIN, DIFFUSE, correct, fit, misfit_notes
 from canprobe.touch.estimate.quadric import (
     UNIT,
@@ -34,8 +34,6 @@ from canprobe.touch.estimate.quadric import (
 from canprobe.touch.linear_algebra import Array, checked, homogeneous, inverted, solved, tangent_rotation, upper_root
 from canprobe.touch.surface import SurfaceMatrix
 
-# Batch estimates from points and normals: the checked arrays and the `ml` method.
-
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
 
@@ -48,7 +46,7 @@ class Touches(NamedTuple):
     Attributes:
         points, normals: (n, 3); the last row is now.
         noise: of the n samples.
-        extent: length of the path (`path_extent`), m.
+        extent: largest distance from the last point, never below noise, m: the unit of length.
         distance: length along the path, m.
         correlation: of the noise along the path; None for independent samples.
     """
@@ -70,10 +68,12 @@ class Touches(NamedTuple):
 def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
     """Extent and length of arrays that are already checked."""
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
-    return Touches(points, normals, noise, path_extent(points, floor), travelled(points), correlation)
+    offset = points - points[-1]
+    extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
+    return Touches(points, normals, noise, extent, _travelled(points), correlation)
 
 
-def travelled(points: Array) -> float:
+def _travelled(points: Array) -> float:
     """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
     each = min(_MEAN_OF, max(1, len(points) // 20))
     means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
@@ -83,11 +83,7 @@ def travelled(points: Array) -> float:
 
 
 def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
-    """Points and unit normals (n, 3), n ≥ least.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
-    """
+    """Points and unit normals (n, 3), n ≥ least; else a UsageError that names the field."""
     p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
     if len(p) < least:
         raise UsageError(f"points: expected at least {least} samples, got {len(p)}")
@@ -108,12 +104,8 @@ def working_frame(touches: Touches) -> Array:
 
 
 def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
-    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point.
-
-    Args:
-        touches: checked input.
-        prior: None for `Prior.weak` over the extent of the path.
-        quadric: the surface is one exactly; else its cubic and quartic terms are allowed for (`nonlinear`).
+    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point; prior, quadric: as for
+    `fit_surface`.
     """
     length = touches.extent
     stated = Prior.weak(length) if prior is None else prior
@@ -167,9 +159,6 @@ def _turned_spread(spread: Array, angle: float) -> Array:
     return result
 
 
-# The Cramér–Rao bound on local curvature.
-
-
 def cramer_rao(
     points: ArrayLike,
     normals: ArrayLike,
@@ -190,10 +179,7 @@ def cramer_rao(
         points: (n, 3) m, on the true surface (or measured); the last row is now.
         normals: (n, 3) outward unit normals.
         S: (4, 4) the true surface in the frame of the points.
-        sigma_point, sigma_normal: noise as for `fit_surface`.
-        prior: the same prior as the estimator's; None for the same default.
-        correlation: of the noise along the path; None for independent samples.
-        coupling: of the errors of point and normal, as for `fit_surface`.
+        sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
 
     Returns:
         (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,

@@ -11,8 +11,6 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, checked, positive
 
-# Standard deviations of measured points and normals: scalar, per sample, or covariances.
-
 
 @dataclass(frozen=True, slots=True)
 class Correlation:
@@ -90,7 +88,7 @@ class Noise:
 
     @property
     def normal_variance(self) -> Array:
-        """(n,) variance per axis, the mean one where axes differ, rad²."""
+        """The same of the normals, rad²."""
         return _mean_variance(self.normal)
 
     def scaled(self, length: float, R: Array) -> Noise:
@@ -207,14 +205,3 @@ class Prior:
             A[row, 3 + row] = factor * inverse
         b[3] = b[5] = self.curvature * length * inverse
         return A, b
-
-
-def path_extent(points: Array, noise_floor: float) -> float:
-    """Length of a path for scaling and for `Prior.weak`: the largest distance from its last point, never below noise.
-
-    Args:
-        points: (n, 3) m.
-        noise_floor: m, above 0: what to fall back to when nothing moved.
-    """
-    offset = points - points[-1]
-    return max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), noise_floor)

@@ -68,12 +68,9 @@ class Fit(NamedTuple):
 
 
 def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None) -> Fit:
-    """Fit the model to a design.
+    """Fit the model to a design with a prior (`Prior.rows`).
 
-    Args:
-        d: constant parts (`quadric.design`).
-        prior: rows (6, 9) and right-hand side (6,) (`Prior.rows`).
-        independent: (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
+    `independent` (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
     """
     spread = spread_of(d.X, d.point_variance)
     c, root, decision = linear_start(d, prior, spread)
@@ -256,14 +253,9 @@ _CAUTIOUS = np.repeat([0.0, (NONE + USUAL) / len(CHANGES), TAIL / len(EVIDENCE)]
 
 
 class Corrected(NamedTuple):
-    """A fit with what it leaves out.
+    """A fit with what it leaves out: parameters (9,) and the upper triangular root (9, 9) of their information.
 
-    Attributes:
-        c: (9,) parameters.
-        root: (9, 9) upper triangular information root.
-        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals cannot
-            tell.
-        trusted: the change of K is small enough for a linear step.
+    misfit, trusted: as of `Averaged`.
     """
 
     c: Array
@@ -280,7 +272,9 @@ class Averaged(NamedTuple):
         spread: (9, 9) covariance that the terms add to theirs.
         share: (9,) how much of each direction of the terms the data settle: mean variance left.
         terms: (9,) the terms in these directions.
-        misfit, trusted: as of `Corrected`.
+        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals do not
+            show it.
+        trusted: the change of K is small enough for a linear step.
     """
 
     shift: Array

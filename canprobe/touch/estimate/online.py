@@ -15,26 +15,21 @@ from canprobe.touch.estimate.nonlinear import CHI2_999
 from canprobe.touch.estimate.quadric import TO_Q
 from canprobe.touch.linear_algebra import Array, positive
 
-# What an online estimator is, and the gate that every sample passes.
-
 
 @dataclass(slots=True)
 class Dropped:
-    """Samples that were not used, by reason.
-
-    Attributes:
-        not_finite: a NaN or infinite time, place or normal.
-        repeated: the time of the sample before.
-        backwards: a time before that of the sample before.
-        zero_sigma: a standard deviation of 0 or less, or not finite.
-        not_unit: a normal that is not a unit vector.
-    """
+    """Samples that were not used, by reason."""
 
     not_finite: int = 0
+    """A NaN or infinite time, place or normal."""
     repeated: int = 0
+    """The time of the sample before."""
     backwards: int = 0
+    """A time before that of the sample before."""
     zero_sigma: int = 0
+    """A standard deviation of 0 or less, or not finite."""
     not_unit: int = 0
+    """A normal that is not a unit vector."""
 
     @property
     def total(self) -> int:
@@ -45,7 +40,7 @@ class Dropped:
 WIDER = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
 """Factor of both standard deviations of a contact whose image is in doubt."""
 DOUBTS_OF = 160
-"""Last contacts whose doubts an estimate tells."""
+"""Last contacts whose doubts an estimate reports."""
 
 
 class Estimator(Protocol):
@@ -66,15 +61,7 @@ class Estimator(Protocol):
 
 
 class Gate:
-    """Lets through what an estimator can use and counts the rest.
-
-    Args:
-        sigma_point: effective standard deviation of a point per axis, m.
-        sigma_normal: of a normal per tangent axis, rad.
-
-    Raises:
-        UsageError: when either is not above 0.
-    """
+    """Lets through what an estimator can use and counts the rest; sigmas: of points (m) and normals (rad), above 0."""
 
     def __init__(self, sigma_point: float, sigma_normal: float) -> None:
         self.sigma_point = positive("sigma_point", sigma_point)
@@ -174,11 +161,9 @@ class ChangeTest:
         return _bounded(self._all)
 
     def take(self, square: float, caution: float = 1.0) -> bool:
-        """Take the squared innovation, χ² of 3, of a sample; whether the surface now looks changed.
+        """Take a sample's squared innovation, χ² of 3; whether the surface now looks changed.
 
-        Args:
-            square: of the sample.
-            caution: factor of both thresholds.
+        `caution` multiplies both thresholds.
         """
         now = min(square, CHI2_999) / 3.0
         self._last.append(now)
@@ -208,10 +193,8 @@ def _bounded(usual: float) -> float:
 
 
 def looks_changed(squares: Array) -> bool:
-    """The same test on a batch: whether its last few samples disagree with the fit of all of them.
-
-    Args:
-        squares: (n,) squared residuals, χ² of 3, in the order of time.
+    """The same test on a batch's squared residuals (n,), in the order of time: whether the last few disagree with the
+    fit of all.
     """
     usual = _bounded(float(np.median(squares)) / _MEDIAN)
     last = np.sort(np.minimum(squares[-LAST_FEW:], CHI2_999)) / 3.0
@@ -291,12 +274,7 @@ class FollowingEstimator:
 
 
 def less_certain(answer: SurfaceEstimate, late: Array) -> SurfaceEstimate:
-    """An answer whose curvature is also off by a share of a tensor, of either sign, with standard deviation 1.
-
-    Args:
-        answer: everything observed.
-        late: (3, 3) of the frame of the points, 1/m.
-    """
+    """An answer, everything observed, whose curvature is also off by a tensor (3, 3, 1/m) times a normal variate."""
     P = answer.T_frame_contact[:3, :2]
     (k11, k12), (_, k22) = (P.T @ late @ P).tolist()
     entries = np.array([k11, k12, k22])

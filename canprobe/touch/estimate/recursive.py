@@ -17,7 +17,6 @@ import numpy as np
 from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import (
-    Anchor,
     Solution,
     SurfaceEstimate,
     anchor,
@@ -29,7 +28,7 @@ from canprobe.touch.estimate.information import Expected, InformationFilter, Tou
 from canprobe.touch.estimate.noise import Correlation, Prior
 from canprobe.touch.estimate.nonlinear import CHI2_999, DIFFUSE, misfit_notes
 from canprobe.touch.estimate.online import ChangeTest, Dropped, Gate
-from canprobe.touch.estimate.quadric import UNIT, Decision, decide, nothing_observed, size_of
+from canprobe.touch.estimate.quadric import UNIT, decide, nothing_observed, size_of
 from canprobe.touch.estimate.start import Start
 from canprobe.touch.linear_algebra import (
     Array,
@@ -42,7 +41,7 @@ from canprobe.touch.linear_algebra import (
     upper_root,
 )
 
-# How far a contact has moved, told apart from its noise, and how its places spread.
+# How far a contact has moved, beyond its noise, and how its places spread.
 
 _MEDIAN_OF, _MEAN_OF = 5, 8
 _FAR2, _SLOWLY = 16.0, 0.05
@@ -139,94 +138,6 @@ class Spread:
         self._moments += (X.T * weights) @ X
 
 
-# From the state of the online filter to an estimate at a contact.
-
-
-class _Answer(NamedTuple):
-    """Where an answer is given and how sure it is.
-
-    Attributes:
-        anchor: at the contact.
-        decision: on the data.
-        spread: (2, 2) of the points in the tangent plane over the variance of their noise.
-        deviation: (9, 9) root of the covariance of the filter's parameters.
-        notes: what a reader should know.
-    """
-
-    anchor: Anchor
-    decision: Decision
-    spread: Array
-    deviation: Array
-    notes: tuple[str, ...]
-
-
-def filter_answer(
-    state: InformationFilter,
-    point: Array,
-    spread: Array,
-    *,
-    innovation: float,
-    distance: float,
-    samples: float,
-    prior: str,
-    notes: tuple[str, ...],
-    expected: Expected | None,
-) -> SurfaceEstimate:
-    """The answer at the foot of a point.
-
-    Args:
-        state: of the filter.
-        point: (3,) in base, m.
-        spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
-        innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
-        expected: of the samples, to allow for what a quadric leaves out (`LeftOut`); None: the surface is one exactly.
-    """
-    found = _answered(state, point, spread, expected)
-    a, decision = found.anchor, found.decision
-    deviation = a.M @ found.deviation
-    covariance = curvature_covariance(a.c, deviation)
-    evidence = evidence_of(a.c, covariance, found.spread, state.length)
-    if decision.rank < 3:
-        known = decision.vectors[:, decision.passed]
-        a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-        covariance = np.full((3, 3), math.nan)
-    return build_estimate(
-        Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
-        length=state.length,
-        T_frame_contact=a.T_frame_contact,
-        problem_root=state.root,
-        innovation=innovation,
-        distance=distance,
-        samples=samples,
-        method="recursive",
-        prior=prior,
-        notes=notes + found.notes,
-        evidence=evidence,
-    )
-
-
-def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
-    """With the sandwich covariance, amended where all is observed."""
-    place = state.place(point)
-    a = anchor(state.c, state.T, place, state.length)
-    tangent = a.T_frame_contact[:3, :2]
-    flat = tangent.T @ spread @ tangent
-    q = a.M[6:] @ state.inverse / UNIT[:, None]
-    decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
-    noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
-    notes: tuple[str, ...] = ()
-    if decision.rank == 3 and expected is not None:
-        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, expected)
-        notes = misfit_notes(amended.misfit, trusted=amended.trusted)
-        if not amended.trusted:
-            return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
-        a = anchor(amended.c, state.T, place, state.length)
-        noise += state.root @ amended.covariance @ state.root.T
-    return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)
-
-
-# `recursive`: the nine-parameter model as a square-root information filter; what runs in the 200 Hz loop.
-
 STEP = 0.025
 """Travel between two updates over the memory."""
 CROWD = 2.0
@@ -321,21 +232,48 @@ class RecursiveEstimator:
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact that is no outlier; None before the contact has moved."""
+        """The answer at the foot of the last contact that is no outlier; None before the contact has moved."""
         if self._last is None or self._spread.weight == 0.0:
             return None
+        state, notes = self._filter, self._notes()
+        place = state.place(self._last.point)
+        a = anchor(state.c, state.T, place, state.length)
         # what has not settled is not called observed
         certain = float(self._settled) / self._gate.sigma_point**2
-        return filter_answer(
-            self._filter,
-            self._last.point,
-            self._spread.covariance * certain,
+        P = a.T_frame_contact[:3, :2]
+        flat = P.T @ (self._spread.covariance * certain) @ P
+        q = a.M[6:] @ state.inverse / UNIT[:, None]
+        decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
+        # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
+        noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
+        deviation = None
+        if decision.rank == 3 and not self._quadric:
+            amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, self._expected())
+            notes += misfit_notes(amended.misfit, trusted=amended.trusted)
+            if amended.trusted:
+                a = anchor(amended.c, state.T, place, state.length)
+                noise += state.root @ amended.covariance @ state.root.T
+            else:
+                decision, deviation = nothing_observed(), np.eye(9) / DIFFUSE
+        deviation = a.M @ (state.inverse @ lower_root(noise) if deviation is None else deviation)
+        covariance = curvature_covariance(a.c, deviation)
+        evidence = evidence_of(a.c, covariance, flat, state.length)
+        if decision.rank < 3:
+            known = decision.vectors[:, decision.passed]
+            a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+            covariance = np.full((3, 3), math.nan)
+        return build_estimate(
+            Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
+            length=state.length,
+            T_frame_contact=a.T_frame_contact,
+            problem_root=state.root,
             innovation=self._change.innovation,
             distance=min(self._travel.total, self._memory),
             samples=self._spread.weight,
+            method="recursive",
             prior=self._prior.name,
-            notes=self._notes(),
-            expected=None if self._quadric else self._expected(),
+            notes=notes,
+            evidence=evidence,
         )
 
     def _expected(self) -> Expected:

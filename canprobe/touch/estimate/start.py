@@ -108,11 +108,7 @@ _FRAME_OF = 5
 
 
 class Start:
-    """Contacts of the first stretch and their solution so far.
-
-    Args:
-        length: the memory of the filter, m.
-        prior: on the parameters.
+    """Contacts of the first stretch and their solution so far, for a filter with a memory of `length` (m).
 
     Attributes:
         T: (4, 4) working frame of the solution to base, m.
@@ -156,17 +152,14 @@ class Start:
         """From the better of the last solution and, until that has settled, a linear one."""
         now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
         if now is None or not self.settled:
-            plain = self._linear(d)
+            spread = spread_of(d.X, d.point_variance)
+            plain = linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
             fresh = solved_once(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
         better = gauss_newton(now, d, self._prior)
         self.solution = better
         known = self.settled or better.decision.rank == 3 or stretch_over
         self.settled = known and better.step < SETTLED
-
-    def _linear(self, d: Design) -> Array:
-        spread = spread_of(d.X, d.point_variance)
-        return linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
 
 
 def isolation(points: Array, variance: Array) -> Array:
