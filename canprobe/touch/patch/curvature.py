@@ -10,9 +10,7 @@ do: outside the calibrated range it counts less and less, and so it does the fur
 knows, by the weight of an outlier.
 
 Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
-tells: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
-
-The layer's model is stated in `moments`.
+shows it: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
 """
 
 from __future__ import annotations
@@ -26,7 +24,7 @@ from canprobe.touch.contact import ContactSample, direction_to_pad
 from canprobe.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
 from canprobe.touch.estimate.nonlinear import CHI2_999
 from canprobe.touch.estimate.online import Dropped, Estimator
-from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, parameters_of, turned
+from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, matrix_of, parameters_of, turned
 from canprobe.touch.linear_algebra import Array, eigen, homogeneous, inverted, positive, solved, tangent_rotation
 from canprobe.touch.patch.moments import MomentModel, Moments, PadMemory
 
@@ -46,7 +44,6 @@ MOST_ROUNDS = 6
 """Gauss–Newton steps; from the last answer one or two do."""
 SETTLED, UNSETTLED = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
-_ROOT2 = math.sqrt(2.0)
 
 
 class Fused(NamedTuple):
@@ -71,41 +68,32 @@ class _Seen(NamedTuple):
 
 
 class _Mean:
-    """Running mean of moments over so many frames at most, and how old it is; `gross`: as `GROSS`."""
+    """Running mean of moments over so many frames at most, for how many it stands, and its age; `gross`: as `GROSS`."""
 
     def __init__(self, most: int, gross: float) -> None:
         self.moments: Moments = (0.0, 0.0, 0.0)
         self.age = 0.0
         self._most, self._gross = most, gross
-        self._frames = 0
+        self.frames = 0
         self._apart = 0
-
-    @property
-    def frames(self) -> int:
-        """How many the mean stands for."""
-        return self._frames
 
     def add(self, xx: float, xy: float, yy: float) -> float:
         """Take the moments of a frame; its share in the mean, small where it is far from it."""
-        self._frames = min(self._frames + 1, self._most)
-        share = 1.0 / self._frames
+        self.frames = min(self.frames + 1, self._most)
+        share = 1.0 / self.frames
         mxx, mxy, myy = self.moments
         dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
-        if self._frames >= LEAST_FRAMES:
+        if self.frames >= LEAST_FRAMES:
             nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
             self._apart = self._apart + 1 if nearness < 1.0 else 0
             if self._apart == LEAST_FRAMES:
-                return self._restart(xx, xy, yy)
+                # so many in a row are no outliers: what was before them is not what is felt now
+                self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
+                return 1.0
             share *= min(1.0, nearness)
         self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
         self.age = (1.0 - share) * (self.age + 1.0)
         return share
-
-    def _restart(self, *moments: float) -> float:
-        """So many in a row are no outliers: what was before them is not what is felt now."""
-        xx, xy, yy = moments
-        self.moments, self.age, self._frames, self._apart = (xx, xy, yy), 0.0, 1, 0
-        return 1.0
 
     def drift_from(self, younger: _Mean) -> Moments:
         """How far this is off by what changed since, if it went on as a younger mean says."""
@@ -180,9 +168,7 @@ class PatchCurvature:
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
         ux, uy, uz = 1.0 - bend * x, -bend * y, -x
         (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
-        return self._in_axes(
-            [a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz],
-        )
+        return self._in_axes([a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz])
 
     def _in_axes(self, u: list[float]) -> tuple[float, float]:
         """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
@@ -192,15 +178,7 @@ class PatchCurvature:
         return cx * size, cy * size
 
     def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
-        """Patch and motion together in a contact frame.
-
-        Args:
-            T_base_contact: (4, 4) contact frame, z inward.
-            motion: what else is known about q there.
-
-        Returns:
-            None from too few frames, and where the patch has nothing to say.
-        """
+        """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
         if self.frames < LEAST_FRAMES:
             return None
         c, s = self._in_axes(T_base_contact[:3, 0].tolist())
@@ -249,7 +227,7 @@ class PatchCurvature:
                 pull = motion.information @ off
                 way = solved(patch + motion.information, JW @ r + pull)
                 cost = float(r @ W @ r + off @ pull)
-                k = _entries(q + way)
+                k = tuple(((q + way) / TO_Q).tolist())
                 step = max(map(abs, way.tolist()))
                 if step < SETTLED / self.model.radius:
                     break
@@ -276,11 +254,6 @@ def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float,
     return cc * xx - 2.0 * cs * xy + ss * yy, cs * (xx - yy) + (cc - ss) * xy, ss * xx + 2.0 * cs * xy + cc * yy
 
 
-def _entries(q: Array) -> tuple[float, float, float]:
-    q1, q2, q3 = q.tolist()
-    return q1, q2 / _ROOT2, q3
-
-
 # The answer of patch and motion together, and of the patch alone.
 
 NAMED = 0.1
@@ -291,17 +264,10 @@ _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
 def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
-    """A motion estimate with what was found with the patch.
+    """A motion estimate with its `evidence`, and what was found of that and the patch.
 
-    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them.
-
-    Args:
-        motion: with its `evidence`.
-        found: of the patch and that evidence.
-        length: m, `quadric` takes curvatures below 1/length for flat; the memory of the estimator.
-
-    Returns:
-        The estimate; its `method` ends in "+patch" where the patch gave at least `NAMED`, and a note says how much.
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
+    memory, m) count as flat. The `method` ends in "+patch" where the patch gave at least `NAMED`; a note says how much.
     """
     assert motion.evidence is not None
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
@@ -326,21 +292,13 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
 
 
 def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
-    """Shape from the patch alone, as of a touch that stands still; None where it says nothing.
-
-    Args:
-        contact: the last one; place and normal are its.
-        patch: the images.
-        length: m, see `with_patch`.
-    """
+    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
     T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
     found = patch.fuse(T)
     if found is None:
         return None
-    plane = np.zeros((4, 4))
-    plane[2, 3] = plane[3, 2] = -0.5
     return build_estimate(
-        _solution(plane, found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
         length=1.0,
         T_frame_contact=T,
         problem_root=_root(found.patch),
