@@ -244,18 +244,10 @@ class Consistency:
 
 
 def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> list[Crossing]:
-    """Places where two passes come close, one pair of patches for each.
+    """Places where two passes come close, one pair of patches for each; radius, gap: as of `check_consistency`.
 
     Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
     contacts along the path are the same crossing. A path that follows itself gives one every two radii.
-
-    Args:
-        surface_map: the map.
-        radius: largest distance between the contacts, m.
-        gap: least path between them, m; None for `MEMORIES` times the longest memory of a patch.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
     """
     limit = positive("radius", radius)
     least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
@@ -279,14 +271,10 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
 
 def _headings(surface_map: SurfaceMap) -> Array:
     """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
-    if len(surface_map) < 2:
-        return np.full((len(surface_map), 3), math.nan)
     steps = np.diff(surface_map.points, axis=0)
     sizes = np.linalg.norm(steps, axis=1, keepdims=True)
-    headings = np.full((len(surface_map), 3), math.nan)
-    headings[1:] = steps / np.where(sizes > 0.0, sizes, math.nan)
-    headings[0] = headings[1]
-    return headings
+    headings: Array = steps / np.where(sizes > 0.0, sizes, math.nan)
+    return np.concatenate([headings[:1], headings])
 
 
 def _angle(a: Array, b: Array) -> float:
@@ -297,8 +285,10 @@ def check_consistency(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap:
     """Test every crossing of a map and pool the independent ones; see `compare` for what the test rests on.
 
     Args:
-        surface_map, radius, gap: as in `find_crossings`; two crossings are independent where all four patches are at
-            least the gap apart along the path.
+        surface_map: the map.
+        radius: largest distance between the contacts of a crossing, m.
+        gap: least path between them, and between the patches of independent crossings, m; None for `MEMORIES` times
+            the longest memory of a patch.
     """
     least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
     found = find_crossings(surface_map, radius=radius, gap=gap)

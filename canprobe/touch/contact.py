@@ -109,18 +109,15 @@ def contact_sample(
 
 
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:
-    """Indentation of the elastic layer under a force.
+    """Indentation δ (m) of the elastic layer under a force.
 
     Winkler layer, `p = k (δ − A x² − B y²)₊`, hence `F = π k δ² / (2 √(AB))` with `A, B = ½ (1/R_p + κ1,2)`.
 
     Args:
-        force: N; 0 or less gives 0.
+        force: F, N; 0 or less gives 0.
         stiffness_n_m3: k = K/h, N/m³.
         radius: R_p, m.
         kappa: (2,) principal curvatures of the object, 1/m; a NaN (not observed) counts as flat.
-
-    Returns:
-        δ in m.
 
     Raises:
         UsageError: where the object is concave and as tight as the probe or tighter: there is no patch.

@@ -216,15 +216,9 @@ class LocalSurface:
         )
 
     def correct(self, point: Vector, normal: Vector, dt: float) -> float:
-        """Move the model to a measured contact and towards it.
+        """Move the model to a measured point (3,), m, and towards it and its outward normal (3,), `dt` (s) later.
 
-        Args:
-            point: measured surface point (3,), m.
-            normal: measured outward unit normal (3,).
-            dt: time since the previous sample, s; not negative.
-
-        Returns:
-            The height error before correction (m), positive where the surface was found higher than modelled.
+        Returns the height error before, m, positive where the surface was found higher than modelled.
         """
         if dt < 0:
             raise UsageError(f"dt: expected a time that has passed, got {dt:g} s")
@@ -301,15 +295,12 @@ class TactileServo:
         self._reference = tuple(point.tolist())
 
     def step(self, speed: float, depth: float, dt: float) -> ProbePose:
-        """One servo cycle.
+        """The pose that the probe must have when this cycle's command takes effect.
 
         Args:
-            speed: contact speed over the surface, m/s.
+            speed: of the contact over the surface, m/s.
             depth: wanted indentation, m.
             dt: servo period, s.
-
-        Returns:
-            The pose the probe must have when this cycle's command takes effect.
         """
         foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:

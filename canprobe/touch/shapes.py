@@ -22,7 +22,7 @@ Vec = tuple[float, float, float]
 
 
 class Nearest(NamedTuple):
-    """What ``ClosestPoint`` holds, in plain floats for those who ask in every cycle."""
+    """What ``ClosestPoint`` holds, in plain floats for what asks in every cycle."""
 
     point: Vec
     normal: Vec
@@ -98,24 +98,13 @@ class PlacedShape:
         return self._pose
 
     def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
-        """Closest surface point, its normal and curvatures.
-
-        Args:
-            point_base: (3,) query point in the base frame, m.
-
-        Returns:
-            Everything in the base frame.
-        """
+        """Closest surface point to a (3,) point of the base frame (m), its normal and curvatures."""
         bx, by, bz = np.asarray(point_base, dtype=float).tolist()
         point, normal, distance, kappa, directions = self.nearest((bx, by, bz))
         return ClosestPoint(np.array(point), np.array(normal), distance, np.array(kappa), np.array(directions))
 
     def nearest(self, point_base: Vec) -> Nearest:
-        """As ``closest``, in plain floats.
-
-        Args:
-            point_base: query point in the base frame, m.
-        """
+        """As ``closest``, in plain floats."""
         bx, by, bz = point_base
         ox, oy, oz = self._origin
         x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
@@ -138,26 +127,11 @@ class PlacedShape:
         )
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Where a ball touches the surface if that is not its closest point alone.
-
-        Args:
-            point_base: (3,) centre of the ball, base frame, m.
-            reach: its radius, m.
-
-        Returns:
-            Every place nearer than the reach; None where ``closest`` is all there is.
-        """
+        """Every place where a ball (centre (3,) in base, radius, m) touches; None where ``closest`` is all there is."""
         return None
 
     def gaps(self, points_base: Array) -> Array:
-        """Signed distances of many points, positive outside.
-
-        Args:
-            points_base: (n, 3) m.
-
-        Returns:
-            (n,) m.
-        """
+        """Signed distances (n,) of points (n, 3) of the base frame, m, positive outside."""
         return np.array([self.closest(p).distance for p in points_base])
 
     def _to_object(self, points_base: Array) -> Array:
@@ -268,7 +242,7 @@ class Bowl(RoundShape):
         )
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Pieces of the lip under a ball whose centre is above it; see ``PlacedShape``."""
+        """Pieces of the lip under a ball whose centre is above it."""
         p = self._to_object(np.asarray(point_base, dtype=float)[None])[0]
         if p[2] <= self.radius or hypot(p[0], p[1]) >= self.radius + LIP_M:
             return None
@@ -364,7 +338,7 @@ class Wave(PlacedShape):
         return x, v, h, 0.0, ny, nz, distance, 0.0, across, 1.0, 0.0, 0.0
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Both walls where a trough is too tight for the ball; see ``PlacedShape``."""
+        """Both walls where a trough is too tight for the ball."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [v for square, v in self._minima(y, z) if square < reach * reach]
         if len(near) < 2:

@@ -236,16 +236,9 @@ def spaced(patches: Iterable[LocalPatch], spacing: float) -> list[LocalPatch]:
 def merge_patches(
     patches: Sequence[LocalPatch], path: ArrayLike, *, spacing: float = SPACING_M, method: str = ""
 ) -> SurfaceMap:
-    """One map of a scan from its estimates, a patch every `spacing`, without those that observed no curvature.
+    """One map of a scan from its estimates' patches, in the order of the path (n, 3), m, in base.
 
-    Args:
-        patches: of all estimates, in the order of the path.
-        path: (n, 3) contact points, base frame, m.
-        spacing: m.
-        method: name of the estimator.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
+    A patch every `spacing` (m) is kept, of those that observed some curvature.
     """
     usable = [patch for patch in patches if patch.rank >= LEAST_RANK]
     return SurfaceMap(patches=tuple(spaced(usable, spacing)), path=np.asarray(path, np.float64), method=method)
@@ -305,15 +298,9 @@ class _Heights(NamedTuple):
 
 
 def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -> MapPoint:
-    """Closest point of a map's surface to a point nearby.
+    """Closest point of a map's surface to a point (3,) nearby, base frame, m.
 
-    Args:
-        surface_map: the map.
-        point: (3,) base frame, m.
-        reach: distance from a contact at which its patch no longer counts, m.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
+    `reach` (m) is the distance from a contact at which its patch no longer counts.
     """
     p, limit = checked("point", point, (3,)), positive("reach", reach)
     chosen = _candidates(surface_map, p, limit)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.touch.estimate.noise import CHI2_99
 from canprobe.touch.estimate.quadric import (
     TO_Q,
     UNIT,
@@ -301,9 +302,6 @@ def _observed_direction(decision: Decision) -> Array:
 
 # What a source says about curvature: value and information, before any decision on what is observed.
 
-REFUTED = 11.34
-"""χ² of 3 from which a surface is no plane: its 99 % point."""
-
 
 class CurvatureInformation(NamedTuple):
     """What a source says about q = (K11, √2 K12, K22) in some contact frame.
@@ -351,7 +349,7 @@ def curvature_covariance(c: Array, deviation: Array) -> Array:
     by_others = cross @ solved(others @ others.T, cross.T)
     own = D @ D.T - by_others
     chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
-    refuted = 1.0 - (REFUTED / max(chi2, REFUTED)) ** 2
+    refuted = 1.0 - (CHI2_99 / max(chi2, CHI2_99)) ** 2
     return np.asarray(own + refuted * by_others, dtype=np.float64)
 
 

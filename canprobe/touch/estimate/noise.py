@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, checked, positive
 
+CHI2_MEDIAN, CHI2_99, CHI2_999 = 2.366, 11.34, 16.27
+"""Median, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
+
 
 @dataclass(frozen=True, slots=True)
 class Correlation:
@@ -103,13 +106,7 @@ class Noise:
 
 
 def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling: float = 0.0) -> Noise:
-    """Checked noise of n samples.
-
-    Args:
-        n: samples.
-        sigma_point: m; a number, (n,), or covariances (3, 3) or (n, 3, 3) in m².
-        sigma_normal: rad; in the same forms.
-        coupling: 1/m, see `Noise`.
+    """Checked noise of n samples, each sigma a number, (n,), or covariances (3, 3) or (n, 3, 3).
 
     Raises:
         UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch.estimate.noise import mixed
+from canprobe.touch.estimate.noise import CHI2_999, CHI2_MEDIAN, mixed
 from canprobe.touch.estimate.quadric import (
     DEGREE,
     UNIT,
@@ -27,10 +27,8 @@ from canprobe.touch.estimate.quadric import (
 )
 from canprobe.touch.linear_algebra import Array, inverted, solved, upper_root
 
-CHI2_999 = 16.27
 DIFFUSE = 1e-2
 """Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
-_MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
 _START_ROUNDS = 8
@@ -135,7 +133,7 @@ def linear_start(
     answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)
     for _ in range(_START_ROUNDS):
         square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)
-        scale = _median(square) / _MEDIAN_CHI2
+        scale = _median(square) / CHI2_MEDIAN
         if float(square.max()) < _GROSS * scale:
             break
         w = np.sqrt(1.0 / (1.0 + square / (9.0 * max(scale, 1e-300)))).repeat(3)
@@ -151,7 +149,7 @@ def _median(values: Array) -> float:
 def robust(square: Array) -> tuple[Array, float]:
     """Weights (n,) and robust cost of squared whitened residuals (n,); far off, a sample costs no more and pulls by
     the inverse cube of its distance: at the end of a long lever even a little would be too much."""
-    limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
+    limit = CHI2_999 * max(1.0, _median(square) / CHI2_MEDIAN)
     ratio = limit / np.maximum(square, limit)
     # d² inside, k (2 − k/d²) outside
     return ratio * ratio, float(np.sum(np.where(ratio < 1.0, limit * (2.0 - ratio), square)))
@@ -160,17 +158,10 @@ def robust(square: Array) -> tuple[Array, float]:
 def solve_rows(
     A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float, *, known: Decision | None = None
 ) -> tuple[Array, Array, Decision]:
-    """Least squares by QR; combinations of K that were not observed are held at the value nearest to flat.
+    """Least squares `A c = b` by QR; combinations of K that were not observed are held at the value nearest to flat.
 
-    Args:
-        A, b: (m, 9) and (m,) whitened equations.
-        prior: rows (6, 9) and right-hand side (6,).
-        spread: of the points (`spread_of`).
-        size: ‖K‖.
-        known: a decision that found everything observed is not taken again.
-
-    Returns:
-        Parameters (9,), root (9, 9) of their information, and the rank decision.
+    A `known` decision that found everything observed is not taken again; `spread`: of the points, `size`: ‖K‖. Returns
+    the parameters (9,), the root (9, 9) of their information, and the decision.
     """
     P, p = prior
     stacked = np.empty((len(A) + 6, 10))

@@ -11,7 +11,7 @@ import numpy as np
 
 from canprobe.touch.contact import ContactSample, Doubt
 from canprobe.touch.estimate.answer import SurfaceEstimate, is_umbilic
-from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.noise import CHI2_999, CHI2_MEDIAN
 from canprobe.touch.estimate.quadric import TO_Q
 from canprobe.touch.linear_algebra import Array, positive
 
@@ -135,8 +135,6 @@ USUAL = (0.3, 2.0)
 the upper bound no innovation, capped as it is, could ever set off an alarm."""
 AGREES = 4.8
 """Squared residual over the median one up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
-_MEDIAN = 2.366
-"""Median of χ² of 3."""
 RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
@@ -196,7 +194,7 @@ def looks_changed(squares: Array) -> bool:
     """The same test on a batch's squared residuals (n,), in the order of time: whether the last few disagree with the
     fit of all.
     """
-    usual = _bounded(float(np.median(squares)) / _MEDIAN)
+    usual = _bounded(float(np.median(squares)) / CHI2_MEDIAN)
     last = np.sort(np.minimum(squares[-LAST_FEW:], CHI2_999)) / 3.0
     return bool(last.mean() >= ALARM * usual and last[:BEST].mean() >= ALARM_OF_BEST * BEST_SHARE * usual)
 

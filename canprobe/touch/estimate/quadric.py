@@ -278,14 +278,9 @@ def _likely_places(d: Design, foot: Array, score: Array, K: Array, ghat: Array) 
 
 
 def transport(c: Array, T: Array) -> tuple[Array, Array]:
-    """The same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc.
+    """c' (9,) of the same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc (9, 9).
 
-    Args:
-        c: (9,).
-        T: (4, 4) takes new coordinates to old, lengths in the problem's unit.
-
-    Returns:
-        c' (9,) and M (9, 9).
+    T (4, 4) takes new coordinates to old, lengths in the problem's unit.
     """
     moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(-1).take(_ENTRIES)
     entries = moved[:, :9] @ c + moved[:, 9]
@@ -364,9 +359,6 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
         curvature: ‖K‖, dimensionless.
     """
     small, large, axes = _axes(spread)
-    if small >= SPREAD:  # spread for everything, the usual case
-        values, vectors = eigen(root_q.T @ root_q)
-        return Decision(np.maximum(values, 0.0), vectors, values >= _least(curvature, float(values[-1])))
     wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
     seen = axes[:, wide]
     root = root_q @ seen
@@ -395,13 +387,7 @@ def spread_share(spread: Array) -> Array:
 
     The noise of the points spreads them as well, and what it says about curvature is false. Where a share s of the
     spread is noise the information counts (1 − s)²: nothing at s = 1, 0.81 at the threshold of the rank decision. A
-    fusion needs that without a jump.
-
-    Args:
-        spread: as for `decide`.
-
-    Returns:
-        (3, 3) symmetric F; information I becomes F I F.
+    fusion needs that without a jump. The result is a symmetric F (3, 3): information I becomes F I F.
     """
     small, large, axes = _axes(spread)
     true = [max(0.0, 1.0 - 1.0 / max(s, 1e-300)) for s in (large, 0.5 * (small + large), small)]

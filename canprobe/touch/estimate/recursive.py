@@ -25,8 +25,8 @@ from canprobe.touch.estimate.answer import (
     evidence_of,
 )
 from canprobe.touch.estimate.information import Expected, InformationFilter, Touch
-from canprobe.touch.estimate.noise import Correlation, Prior
-from canprobe.touch.estimate.nonlinear import CHI2_999, DIFFUSE, misfit_notes
+from canprobe.touch.estimate.noise import CHI2_99, CHI2_999, Correlation, Prior
+from canprobe.touch.estimate.nonlinear import DIFFUSE, misfit_notes
 from canprobe.touch.estimate.online import ChangeTest, Dropped, Gate
 from canprobe.touch.estimate.quadric import UNIT, decide, nothing_observed, size_of
 from canprobe.touch.estimate.start import Start
@@ -148,8 +148,6 @@ STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
 GENEROUS = 0.5
 """Usual innovation below which the stated noise is not believed where a misfit is looked for."""
-AGREEING = 11.34
-"""Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
 
 class _Pending(NamedTuple):
@@ -362,6 +360,6 @@ class RecursiveEstimator:
 
     def _drop_agreeing(self, squares: Array) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
-        agree = np.flatnonzero(squares[:-1] <= AGREEING * self._change.usual)
+        agree = np.flatnonzero(squares[:-1] <= CHI2_99 * self._change.usual)
         for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
             self._pending.popleft()

@@ -140,18 +140,27 @@ class WindowEstimator:
     Args:
         sigma_point, sigma_normal: effective noise, m and rad; with differences they only enter covariance and flags.
         window: samples that are kept.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
+        prior: of `ml`; None for `Prior.weak` over the extent of the window.
+        coupling: of the errors of point and normal (`Noise`), 1/m; of `ml`.
     """
 
     least = 2
     """Fewer samples give no answer."""
 
-    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, coupling: float = 0.0) -> None:
+    def __init__(
+        self,
+        *,
+        sigma_point: float,
+        sigma_normal: float,
+        window: int,
+        prior: Prior | None = None,
+        coupling: float = 0.0,
+    ) -> None:
         if window < self.least:
             raise UsageError(f"window: expected at least {self.least} samples, got {window}")
         self.dropped = Dropped()
         self._gate = Gate(sigma_point, sigma_normal)
-        self._coupling = coupling
+        self._prior, self._coupling = prior, coupling
         self._samples: deque[ContactSample] = deque(maxlen=window)
         self._answer: SurfaceEstimate | None = None
 
@@ -191,23 +200,7 @@ class MlEstimator(WindowEstimator):
 
     A window over a change of the surface has no quadric, and its last samples would be taken for wrong ones. So they
     are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
-
-    Args:
-        sigma_point, sigma_normal, window, coupling: as of `WindowEstimator`.
-        prior: None for `Prior.weak` over the extent of the window.
     """
-
-    def __init__(
-        self,
-        *,
-        sigma_point: float,
-        sigma_normal: float,
-        window: int,
-        prior: Prior | None = None,
-        coupling: float = 0.0,
-    ) -> None:
-        super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, coupling=coupling)
-        self._prior = prior
 
     def _solve(self, touches: Touches) -> SurfaceEstimate:
         answer = fit_ml(touches, self._prior)

@@ -22,7 +22,7 @@ import numpy as np
 
 from canprobe.touch.contact import ContactSample, direction_to_pad
 from canprobe.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
-from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.noise import CHI2_999
 from canprobe.touch.estimate.online import Dropped, Estimator
 from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, matrix_of, parameters_of, turned
 from canprobe.touch.linear_algebra import Array, eigen, homogeneous, inverted, positive, solved, tangent_rotation

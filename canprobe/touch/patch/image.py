@@ -39,11 +39,7 @@ Image = NDArray[np.uint8]
 def mended(taxels: Image) -> tuple[Image, int]:
     """The image with its dead taxels bridged, and how many there were.
 
-    Args:
-        taxels: (16, 16) counts.
-
-    Returns:
-        The same array where none is dead; else a copy in which each has the mean of its four neighbours.
+    The same array (16, 16) where none is dead; else a copy in which each has the mean of its four neighbours.
     """
     if _GAP not in taxels.tobytes().translate(_LEVELS):  # the usual case, in a fraction of the whole search
         return taxels, 0
