@@ -244,16 +244,17 @@ class RecursiveEstimator:
         decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
         # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
         noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
-        deviation = None
+        believed = True
         if decision.rank == 3 and not self._quadric:
             amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, self._expected())
             notes += misfit_notes(amended.misfit, trusted=amended.trusted)
-            if amended.trusted:
+            believed = amended.trusted
+            if believed:
                 a = anchor(amended.c, state.T, place, state.length)
                 noise += state.root @ amended.covariance @ state.root.T
             else:
-                decision, deviation = nothing_observed(), np.eye(9) / DIFFUSE
-        deviation = a.M @ (state.inverse @ lower_root(noise) if deviation is None else deviation)
+                decision = nothing_observed()
+        deviation = a.M @ (state.inverse @ lower_root(noise) if believed else np.eye(9) / DIFFUSE)
         covariance = curvature_covariance(a.c, deviation)
         evidence = evidence_of(a.c, covariance, flat, state.length)
         if decision.rank < 3:

@@ -25,7 +25,17 @@ from canprobe.touch.estimate.answer import CurvatureInformation, Solution, Surfa
 from canprobe.touch.estimate.noise import CHI2_999
 from canprobe.touch.estimate.online import Dropped, Estimator
 from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, matrix_of, parameters_of, turned
-from canprobe.touch.linear_algebra import Array, eigen, homogeneous, inverted, positive, solved, tangent_rotation
+from canprobe.touch.linear_algebra import (
+    Array,
+    eigen,
+    homogeneous,
+    inverted,
+    positive,
+    principal,
+    solved,
+    tangent_rotation,
+    transported_rotation,
+)
 from canprobe.touch.patch.moments import MomentModel, Moments, PadMemory
 
 LEAST_FRAMES = 8
@@ -128,7 +138,7 @@ class PatchCurvature:
         self.frames = 0
         self.force = 0.0
         self._memory = PadMemory()
-        self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+        self._axes = np.eye(3)
         self._last: tuple[float, float, float] | None = None
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
 
@@ -141,7 +151,8 @@ class PatchCurvature:
         if sample.moments is None:
             self.refused += 1
             return
-        self._carry(*(-sample.n_base).tolist())
+        inward = -sample.n_base
+        self._axes = transported_rotation(self._axes, inward) if self.frames else tangent_rotation(inward)
         (uu, uv, vv), memory = sample.moments, self.model.fit.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
@@ -150,42 +161,26 @@ class PatchCurvature:
         self.frames = self._mean.frames
         self.force += share * (sample.force_n - self.force)
 
-    def _carry(self, zx: float, zy: float, zz: float) -> None:
-        """Turn the axes the shortest way so that z is the inward normal."""
-        if not self.frames:
-            self._x, self._y, _ = tangent_rotation(np.array([zx, zy, zz])).T.tolist()
-            return
-        x, y, z = self._x
-        along = x * zx + y * zy + z * zz
-        x, y, z = x - along * zx, y - along * zy, z - along * zz
-        size = 1.0 / math.sqrt(x * x + y * y + z * z)
-        x, y, z = size * x, size * y, size * z
-        self._x, self._y = [x, y, z], [zy * z - zz * y, zz * x - zx * z, zx * y - zy * x]
-
     def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
         x, y, z = direction
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
-        ux, uy, uz = 1.0 - bend * x, -bend * y, -x
-        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
-        return self._in_axes([a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz])
+        return self._in_axes(T_base_probe[:3, :3] @ [1.0 - bend * x, -bend * y, -x])
 
-    def _in_axes(self, u: list[float]) -> tuple[float, float]:
+    def _in_axes(self, u: Array) -> tuple[float, float]:
         """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
-        (x0, x1, x2), (y0, y1, y2), (u0, u1, u2) = self._x, self._y, u
-        cx, cy = x0 * u0 + x1 * u1 + x2 * u2, y0 * u0 + y1 * u1 + y2 * u2
-        size = 1.0 / math.hypot(cx, cy)
-        return cx * size, cy * size
+        x, y, _ = (u @ self._axes).tolist()
+        size = 1.0 / math.hypot(x, y)
+        return x * size, y * size
 
     def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
         """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
         if self.frames < LEAST_FRAMES:
             return None
-        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
+        c, s = self._in_axes(T_base_contact[:3, 0])
         xx, xy, yy = _turned(*self._mean.moments, c, -s)
-        angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        mean, half, angle = principal(np.array([[xx, xy], [xy, yy]]))
         drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
-        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
