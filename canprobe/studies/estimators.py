@@ -79,9 +79,13 @@ class Setting:
     def make(self, sigma_point: float, sigma_normal: float) -> Estimator:
         """The estimator."""
         return make_estimator(
-            self.method, sigma_point=sigma_point, sigma_normal=sigma_normal, probe_radius=PROBE_M,
-            memory_m=self.window * STEP_M, window=self.window, lag=self.lag or 10,
-        )  # fmt: skip
+            self.method,
+            sigma_point=sigma_point,
+            sigma_normal=sigma_normal,
+            memory_m=self.window * STEP_M,
+            window=self.window,
+            lag=self.lag or 10,
+        )
 
 
 def settings(quick: bool = False) -> list[Setting]:

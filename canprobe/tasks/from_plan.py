@@ -73,7 +73,6 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         method,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
-        probe_radius=task.probe.radius,
         memory_m=memory,
         window=window,
         correlation=Correlation(*CORRELATION),
