@@ -98,7 +98,7 @@ def soak(seconds: float) -> list[Row]:
     """Hold the cell; a sample every sixtieth of the time."""
     scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
-    with served(CHANNEL, child):
+    with served(child):
         session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)
         with session:
