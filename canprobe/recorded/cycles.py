@@ -230,11 +230,6 @@ class LoggedWayBack:
         self._flange_probe = plan.setup.probe.T_flange_probe
         self._period_s = plan.sync.period_ns * 1e-9
 
-    @property
-    def begun_s(self) -> float | None:
-        """When it began; None without a lift-off."""
-        return self.steps[0][0].measurement.t_ns * 1e-9 if self.steps else None
-
     def cycles_before(self, cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
         """The cycles of the controller; those of a lift-off at their end are `steps` afterwards."""
         last: deque[LogCycle] = deque()
@@ -340,7 +335,16 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     else:
         for cycle, q in way_back.steps:
             comparison.add(cycle, q)
-    return comparison.result(task, way_back.begun_s)
+    differences = comparison.differences
+    return TaskReplay(
+        task,
+        compared=len(differences),
+        differing=sum(d > TARGET_TOLERANCE for d in differences),
+        median_counts=float(np.median(differences)) if differences else math.inf,
+        worst_counts=max(differences, default=0),
+        lifted_s=way_back.steps[0][0].measurement.t_ns * 1e-9 if way_back.steps else None,
+        parted_s=comparison.parted_s,
+    )
 
 
 class _Comparison:
@@ -351,30 +355,17 @@ class _Comparison:
         self.parted_s: float | None = None
         self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
-        self._differences: list[int] = []
+        self.differences: list[int] = []
         self._away = 0
 
     def add(self, cycle: LogCycle, q: Vector | None) -> None:
         """One cycle, and the joint targets (6,), rad, of the replay."""
         if cycle.targets is None or q is None:
             return
-        self._differences.append(worst_count(self._model, q, cycle.targets))
-        self._away = self._away + 1 if self._differences[-1] > PARTED_COUNTS else 0
+        self.differences.append(worst_count(self._model, q, cycle.targets))
+        self._away = self._away + 1 if self.differences[-1] > PARTED_COUNTS else 0
         if self._away > self._patience:
             self.parted_s = cycle.measurement.t_ns * 1e-9
-
-    def result(self, task: TouchTask, lifted_s: float | None) -> TaskReplay:
-        """The figures of all cycles."""
-        differences = self._differences
-        return TaskReplay(
-            task,
-            compared=len(differences),
-            differing=sum(d > TARGET_TOLERANCE for d in differences),
-            median_counts=float(np.median(differences)) if differences else math.inf,
-            worst_counts=max(differences, default=0),
-            lifted_s=lifted_s,
-            parted_s=self.parted_s,
-        )
 
 
 def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:

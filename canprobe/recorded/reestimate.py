@@ -64,7 +64,13 @@ def summarise_replay(
         "log": str(recording.path),
         "channel": recording.channel,
         "driven_by": "task" if task.drove else "other",
-        "targets": _targets(task, start_s),
+        "targets": {
+            "compared": task.compared,
+            "differing": task.differing,
+            "worst_counts": task.worst_counts,
+            "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
+            "parted_s": None if task.parted_s is None else start_s + task.parted_s,
+        },
         "cycle": _cycle(cycles, recording, unplaced),
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, start_s) for name, records in estimates.items()},
@@ -75,13 +81,9 @@ def summarise_replay(
     }
 
 
-def _arrays(path: Path) -> dict[str, Array]:
-    return read_npz(path) if path.is_file() else {}
-
-
 def _truth(path: Path) -> dict[str, Array]:
     """The plant's truth, one row per SYNC; empty without the file."""
-    columns = _arrays(path)
+    columns = read_npz(path) if path.is_file() else {}
     for name in _SCORED if columns else ():
         column = columns.get(name, np.zeros(0))
         if column.dtype.kind != "f" or column.ndim != 2:
@@ -89,16 +91,6 @@ def _truth(path: Path) -> dict[str, Array]:
                 f"{path}: {name}: expected a row of numbers for each SYNC, got {column.dtype} of shape {column.shape}"
             )
     return columns
-
-
-def _targets(task: TaskReplay, start_s: float) -> dict[str, float | None]:
-    return {
-        "compared": task.compared,
-        "differing": task.differing,
-        "worst_counts": task.worst_counts,
-        "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
-        "parted_s": None if task.parted_s is None else start_s + task.parted_s,
-    }
 
 
 def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, int]:
@@ -133,7 +125,8 @@ def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
 
 def _online(folder: Path, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
     """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
-    logged = _arrays(folder / "log.npz").get("K_per_m")
+    path = folder / "log.npz"
+    logged = read_npz(path).get("K_per_m") if path.is_file() else None
     if logged is None:
         return None
     online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])

@@ -12,7 +12,7 @@ from __future__ import annotations
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -217,23 +217,6 @@ class FaultCase:
     files: bool = True
 
 
-def draw_case_within(seed: int, windows_of: Callable[[str, bool], Windows]) -> FaultCase:
-    """The case of a seed; `windows_of` gives the windows of a scenario, timed or not."""
-    rng = Random(f"fault campaign {seed}")
-    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
-    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
-    known = tuple(windows_of(scenario, True))
-    phases = [rng.choice(known) for _ in range(number)]
-    kinds = [rng.choice(_KINDS) for _ in range(number)]
-    # an untimed bus configures all nodes at one instant: no fault could begin within it
-    timed = "bring-up" in phases or any(kind in _NEED_TIME for kind in kinds) or rng.random() < 0.1
-    windows = windows_of(scenario, timed)
-    nodes = scenario_plan(scenario, timed).node_ids
-    drawn = zip(kinds, phases, strict=True)
-    faults = tuple(_draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
-    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
-
-
 def _draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tuple[int, int]) -> Fault:
     amount = rng.uniform(2e5, 2e6) if kind is FaultKind.BABBLE else 10 ** rng.uniform(5.0, 7.5)
     return Fault(
@@ -288,7 +271,19 @@ def peak(scenario: str) -> Peak | None:
 
 def draw_case(seed: int) -> FaultCase:
     """The case of a seed."""
-    return draw_case_within(seed, phase_windows)
+    rng = Random(f"fault campaign {seed}")
+    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
+    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
+    known = tuple(phase_windows(scenario, True))
+    phases = [rng.choice(known) for _ in range(number)]
+    kinds = [rng.choice(_KINDS) for _ in range(number)]
+    # an untimed bus configures all nodes at one instant: no fault could begin within it
+    timed = "bring-up" in phases or any(kind in _NEED_TIME for kind in kinds) or rng.random() < 0.1
+    windows = phase_windows(scenario, timed)
+    nodes = scenario_plan(scenario, timed).node_ids
+    drawn = zip(kinds, phases, strict=True)
+    faults = tuple(_draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
+    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
 
 
 def run_seed(seed: int) -> dict[str, Any]:

@@ -136,6 +136,7 @@ def processor_share(used_before_s: float, passed_s: float) -> float | None:
 
 # The cases, one run each.
 
+RATE_HZ = 400.0
 MISSED_SYNCS, LATE_PERCENT = 250, 100
 PATIENCE = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
 """Of the cases' scenes: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
@@ -160,27 +161,26 @@ def measure_scan(seconds: float) -> Measured:
     return _measured("whole controller", scene, lambda session: make_task(session.plan))
 
 
-def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
+def measure_plain(seconds: float) -> Measured:
     """The cycle of `run_plain` with the same nodes."""
-    scene = holding_scene("window", rate_hz)
-    with served(CHANNEL, in_realtime=True), realtime(MASTER_PRIORITY, _unheard):
-        times = run_plain(make_plan(resolve(scene)), CHANNEL, seconds)
-    return Measured("plain canopen", "window", rate_hz, times)
+    plan = make_plan(resolve(holding_scene("window", RATE_HZ)))
+    with served(), realtime(MASTER_PRIORITY, _unheard):
+        return Measured("plain canopen", "window", RATE_HZ, run_plain(plan, seconds))
 
 
-def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
+def measure_bare(seconds: float) -> Measured:
     """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
-    period_ns, lateness = round(1e9 / rate_hz), list[int]()
+    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
     with realtime(MASTER_PRIORITY, _unheard):
-        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * rate_hz), lateness))
+        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
     times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
-    return Measured("bare clock", "none", rate_hz, times)
+    return Measured("bare clock", "none", RATE_HZ, times)
 
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
     """The joints hold their position, at any rate."""
     scene = holding_scene(mode, rate_hz)
-    with served(CHANNEL, in_realtime=True):
+    with served():
         return _measured("hold", scene, lambda _: Hold(int(seconds * rate_hz)))
 
 
@@ -199,11 +199,11 @@ def with_real_nodes(scene: Scene) -> Scene:
     return replace(scene, arm=arm, sensor=sensor)
 
 
-def _scene(seconds: float | None = None, channel: str = CHANNEL, *, in_realtime: bool = True) -> Scene:
+def _scene(seconds: float | None = None) -> Scene:
     """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
     scene = load_scene("cylinder")
-    scene = resolve_scene(scene, Target.over(scene, "socketcan", channel), duration_s=seconds)
-    return replace(patient(scene), cycle=replace(scene.cycle, realtime=in_realtime))
+    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=seconds)
+    return replace(patient(scene), cycle=replace(scene.cycle, realtime=True))
 
 
 def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
@@ -233,11 +233,11 @@ class Hold(Controller):
 
 
 @contextmanager
-def served(channel: str, child: EmulatorChild | None = None, *, in_realtime: bool = False) -> Iterator[None]:
+def served(child: EmulatorChild | None = None) -> Iterator[None]:
     """The nodes of `cylinder` in a child process; they take rates and mappings from the master."""
-    scene = _scene(channel=channel, in_realtime=in_realtime)
-    child = child or EmulatorChild(scene, None, channel)
-    port = open_port("socketcan", channel, scene.bus.bitrate, MonotonicClock())
+    scene = _scene()
+    child = child or EmulatorChild(scene, None, CHANNEL)
+    port = open_port("socketcan", CHANNEL, scene.bus.bitrate, MonotonicClock())
     try:
         child.start()
         child.await_boot_ups(port)
@@ -292,16 +292,10 @@ _WAIT_SHARE = 0.6
 """Longest wait for TPDOs over the period, as in canprobe's cycle."""
 
 
-def run_plain(plan: Plan, channel: str, seconds: float) -> CycleTimes:
-    """Bring the nodes of a plan up, run the cycle, stop them.
-
-    Args:
-        plan: with drives 1–6; its nodes are served on `channel`.
-        channel: a SocketCAN interface.
-        seconds: length of the timed part.
-    """
+def run_plain(plan: Plan, seconds: float) -> CycleTimes:
+    """Bring the nodes of a plan with drives 1–6 up, run the cycle for some time, stop them."""
     network = canopen.Network()
-    network.connect(interface="socketcan", channel=channel)
+    network.connect(interface="socketcan", channel=CHANNEL)
     try:
         nodes = [_configured(network, setup) for setup in make_setups(plan)]
         with _operational(network):
