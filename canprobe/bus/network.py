@@ -263,7 +263,7 @@ def hold_dialogues(
 
     Args:
         network: pumped meanwhile.
-        dialogues: by node id; each must catch what it can live with, an exception of it ends them all.
+        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
         timeout_s: for an answer.
         retries: how often a request without an answer is sent again.
 
@@ -289,7 +289,7 @@ def hold_dialogues(
 # LSS: finds nodes without an id, one after another, and gives them one.
 
 SETTLE_S = 0.005
-"""Several nodes may give the same answer to one question, one after another: so long the later ones are waited for."""
+"""Wait after the first answer: several nodes may give the same answer to one question, one after another."""
 ANSWER_S = 0.5
 SEARCH_S = 0.05
 """Time without an answer after which a question of fastscan counts as answered with no."""
@@ -300,7 +300,7 @@ class LssAnswerError(BusError):
 
 
 class Lss:
-    """The LSS master on a network. There is one on a bus, and slaves answer without an identifier of their own."""
+    """The LSS master on a network. All slaves answer with one identifier, so it asks one question at a time."""
 
     def __init__(self, network: PumpedNetwork) -> None:
         self._network = network

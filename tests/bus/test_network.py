@@ -11,9 +11,18 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.network import PumpedNetwork, SdoTimeoutError, download, hold_dialogues, read_value, upload
+from canprobe.bus.network import (
+    Lss,
+    LssAnswerError,
+    PumpedNetwork,
+    SdoTimeoutError,
+    download,
+    hold_dialogues,
+    read_value,
+    upload,
+)
 from canprobe.bus.port import VirtualClock
-from canprobe.protocol.frames import RTR_FLAG, Frame
+from canprobe.protocol.frames import RTR_FLAG, Frame, LssAddress
 
 MS = 1_000_000
 LONG = bytes(range(256)) * 3 + b"end"
@@ -160,3 +169,40 @@ def test_feed_gives_frames_that_the_cycle_drained_to_all_subscribers(cell: Cell)
     network.unsubscribe(0x705, take)
     network.feed([(0x705, b"\x04", 8)])
     assert taken == [5, 5, 7]
+
+
+class Scripted(LocalServer):
+    """An LSS slave that answers a request with given bytes, or not at all."""
+
+    def __init__(self, **answers: str) -> None:
+        super().__init__(5)
+        self.heard: list[str] = []
+        self.answers = answers
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        assert can_id == 0x7E5 and len(data) == 8
+        self.heard.append(data.hex().rstrip("0"))
+        answer = self.answers.get(f"_{data[0]:02x}")
+        return [(0x7E4, bytes.fromhex(answer).ljust(8, b"\0"))] if answer else ()
+
+
+def test_lss_messages_are_those_of_cia_305() -> None:
+    """CiA 305, LSS protocol specification: command specifiers, numbers little-endian, unused bytes 0."""
+    bus, slave = LockstepBus(VirtualClock()), Scripted(_43="44", _11="1100", _17="1701", _5e="5e09")
+    bus.attach(slave)
+    lss = Lss(PumpedNetwork(bus.port()))
+    lss.release()
+    assert lss.select(LssAddress(0xCA5E, 0x260, 0x10000, 7))
+    lss.configure_node_id(9)
+    assert lss.store() is False, "error 1: storing is not supported"
+    assert lss.inquire_node_ids() == [9]
+    assert slave.heard == ["04", "405eca", "416002", "42000001", "4307", "1109", "17", "5e"]
+    slave.answers = {"_11": "1101", "_17": "1702", "_43": "51"}
+    assert not lss.select(LssAddress(0xCA5E, 0x260, 0x10000, 8)), "an answer to something else"
+    with pytest.raises(LssAnswerError, match="LSS error 1"):
+        lss.configure_node_id(200)
+    with pytest.raises(LssAnswerError, match="could not store it: LSS error 2"):
+        lss.store()
+    slave.answers = {}
+    with pytest.raises(LssAnswerError, match="no answer to configure node id"):
+        lss.configure_node_id(9)
