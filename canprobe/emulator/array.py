@@ -179,11 +179,9 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
-        for index in (MODE, THRESHOLD, GAIN, FULL_SCALE_PA):
-            node.dictionary.on_write(index, lambda _sub, _value: self._read_settings())
+        node.dictionary.on_change(self._read_settings, MODE, THRESHOLD, GAIN, FULL_SCALE_PA)
         self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
-        entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
-        self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
+        self._sized = node.dictionary.has_named(WINDOW_SIZE, WINDOW_SIZE_NAME)
         if self._sized:
             node.dictionary.on_check(WINDOW_SIZE, self._check_window)
             node.dictionary.on_write(WINDOW_SIZE, self._begin_window)

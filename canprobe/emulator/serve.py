@@ -87,7 +87,8 @@ class Exchange(LockstepBus):
             for node in self._served:
                 if node.hears_every_sync:
                     node.receive(SYNC_ID, data, heard_ns)
-        self.next_deadline_ns()  # as the nodes see it now
+        for one in self._nodes:
+            one.due = one.owner.next_deadline_ns
         self._advance_due(t_ns)
         if rest := self._carry(t_ns):
             yield rest

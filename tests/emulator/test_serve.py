@@ -62,6 +62,22 @@ def test_due_nodes_are_advanced_after_the_frames():
     assert exchange.next_deadline_ns() is None
 
 
+class Alarm(Scripted):
+    """Listens to SYNC alone, which gives it a deadline 1 ns later."""
+
+    listens = (0x80,)
+
+    def receive(self, can_id, data, t_ns):
+        self.next_deadline_ns = t_ns + 1 if can_id == 0x80 else self.next_deadline_ns
+        return super().receive(can_id, data, t_ns)
+
+
+def test_a_deadline_that_a_sync_sets_is_kept_where_others_answer_behind_it():
+    exchange = Exchange([Alarm([]), Scripted([], {0x201: [(0x181, b"")]})])
+    assert exchange.start(0) == []
+    assert exchange.step([(0x80, b"", 5), (0x201, b"", 6)], 9) == [(0x3, b""), (0x181, b"")]
+
+
 def test_of_several_syncs_the_last_is_answered_and_witnesses_hear_all():
     late, witness = Scripted([], {0x80: [(0x181, b"")]}), Scripted([])
     witness.hears_every_sync = True

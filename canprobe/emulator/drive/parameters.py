@@ -9,7 +9,7 @@ from functools import partial
 from math import inf
 
 from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME
-from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value
 
 # Factor group: the master's position units ↔ motor counts, polarity, and where the zero is.
 #
@@ -98,12 +98,10 @@ class DriveParameters:
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        missed_syncs = dictionary.entries.get(key_of(MISSED_SYNCS))
-        self._has_misses = missed_syncs is not None and missed_syncs.name == MISSED_SYNCS_NAME
+        self._has_misses = dictionary.has_named(MISSED_SYNCS, MISSED_SYNCS_NAME)
         self.units = Units()
         self.read()
-        for index in _INDICES:
-            dictionary.on_write(index, lambda _sub, _value: self.read())
+        dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _OPTIONS.items():
             dictionary.on_check(index, partial(_check_among, allowed))
         dictionary.on_check(0x60C2, _check_interpolation)

@@ -240,6 +240,11 @@ class Dictionary:
         """Whether any entry of that index exists."""
         return index in self._indices
 
+    def has_named(self, index: int, name: str) -> bool:
+        """Whether the EDS has an object with this name there; of another maker a manufacturer's index is another's."""
+        entry = self.entries.get(key_of(index))
+        return entry is not None and entry.name == name
+
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """An integer value, or `default` where the EDS has no such entry."""
         value = self.values.get(key_of(index, subindex), default)
@@ -258,6 +263,11 @@ class Dictionary:
     def on_write(self, index: int, hook: Hook) -> None:
         """`hook(subindex, value)` after a value of `index` was stored over SDO or RPDO."""
         self._hooks.setdefault(index, []).append(hook)
+
+    def on_change(self, act: Callable[[], None], *indices: int) -> None:
+        """`act()` after a value of one of the indices was stored over SDO or RPDO."""
+        for index in indices:
+            self.on_write(index, lambda _subindex, _value: act())
 
     def on_read(self, index: int, refresh: Callable[[int], None]) -> None:
         """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""

@@ -199,7 +199,7 @@ class HeartbeatConsumer(Service):
         self._core, self._emcy, self._on_loss = core, emcy, on_loss
         self._watched: dict[int, tuple[Timer, int]] = {}  # by node id: its timer, its period in ns
         core.dictionary.on_check(0x1016, self._check)
-        core.dictionary.on_write(0x1016, lambda _sub, _value: self._configure())
+        core.dictionary.on_change(self._configure, 0x1016)
 
     def reset(self, t_ns: int) -> None:
         """Read 1016h; nobody has been heard."""
@@ -267,8 +267,7 @@ class NodeGuarding(Service):
         self._timer = core.timers.new(self._timed_out)
         self._toggle = self._life_ns = 0
         self._heartbeat = False
-        for index in (0x100C, 0x100D, 0x1017):
-            core.dictionary.on_write(index, lambda _sub, _value: self._configure())
+        core.dictionary.on_change(self._configure, 0x100C, 0x100D, 0x1017)
 
     def reset(self, t_ns: int) -> None:
         """The first answer after a boot-up has the toggle bit 0."""

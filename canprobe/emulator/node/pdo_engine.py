@@ -60,7 +60,7 @@ class PdoEngine(Service):
             self._tpdos.append(tpdo := Tpdo(core, rules))
             self._watch(rules, tpdo)
         core.dictionary.written = self._written
-        core.dictionary.on_write(0x1007, lambda _sub, _value: self._rebuild())
+        core.dictionary.on_change(self._rebuild, 0x1007)
 
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
         def reconfigure(subindex: int, value: Value) -> None:
@@ -241,8 +241,7 @@ class SyncConsumer(Service):
         dictionary.on_check(0x1005, self._check_cob_id)
         dictionary.on_check(0x1019, self._check_overflow)
         dictionary.on_write(0x1005, lambda _sub, _value: core.reroute())
-        dictionary.on_write(0x1006, lambda _sub, _value: self._configure())
-        dictionary.on_write(0x1019, lambda _sub, _value: self._configure())
+        dictionary.on_change(self._configure, 0x1006, 0x1019)
 
     def reset(self, t_ns: int) -> None:
         """Read the parameters."""

@@ -47,8 +47,8 @@ class PdoRules:
     @property
     def long(self) -> bool:
         """Whether PDOs of up to 64 bytes were switched on, in a device that has them."""
-        entry = self.dictionary.entries.get(key_of(LONG_PDOS, 0)) if self.transmits else None
-        return entry is not None and entry.name == LONG_PDOS_NAME and bool(self.dictionary.number(LONG_PDOS))
+        dictionary = self.dictionary
+        return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
         """Raises SdoAbort for a value that the standard forbids now."""
