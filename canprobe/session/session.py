@@ -48,18 +48,16 @@ if TYPE_CHECKING:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
+    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
 
     Args:
-        write: of the log.
         speed_up: data bit rate of CAN FD over the nominal one.
 
     Attributes:
         error_frames: bus errors, to be counted by who hears of them.
     """
 
-    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
-        self._write = write
+    def __init__(self, speed_up: float) -> None:
         self._by_length = [0] * 65
         self._speed_up = speed_up
         self.error_frames = 0
@@ -77,9 +75,8 @@ class TrafficCounter:
         return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Count one frame and pass it on."""
+        """Count one frame."""
         self._by_length[len(data)] += 1
-        self._write(can_id, data, t_ns)
 
 
 @contextmanager
@@ -338,7 +335,8 @@ class Session:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
     def _writer(self, channel: str) -> Write:
-        write: Write = lambda _id, _data, _t: None  # noqa: E731
+        """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
+        write: Write | None = None
         if self.out is not None:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
@@ -350,18 +348,15 @@ class Session:
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns
-            write = self.observers.tap(write)
-        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
-            return self._metered(channel, write if self.out is not None or self.observers is not None else None)
-        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        self.traffic[channel] = counter
-        return counter.write
-
-    def _metered(self, channel: str, write: Write | None) -> Write:
-        meter = self.traffic[channel] = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
-        if write is None:
-            return meter.write
-        count, pass_on = meter.write, write
+            write = self.observers.tap(write or (lambda _id, _data, _t: None))
+        if self.scene.bus.interface == LOCKSTEP:
+            self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+            self.traffic[channel] = self.meters[channel]
+        else:  # set beside the plan afterwards, from the log
+            self.traffic[channel] = TrafficCounter(self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        count, pass_on = self.traffic[channel].write, write
+        if pass_on is None:
+            return count
 
         def both(can_id: int, data: bytes, t_ns: int) -> None:
             count(can_id, data, t_ns)
