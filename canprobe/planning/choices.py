@@ -287,7 +287,7 @@ def _not_shown(setup: Setup) -> Iterator[tuple[str, str]]:
             yield PAGE, 'task.kind = "listen": nothing moves'
         elif importlib.util.find_spec("viser") is None:
             yield PAGE, "the view extra is not installed: pip install 'canprobe[view]'"
-    if setup.bridge is None or not setup.bridge.use:
+    if not setup.bridge.use:
         yield "bridges to other tools", "no [bridge]: no other tool is fed"
 
 

@@ -78,7 +78,7 @@ class Abilities:
     def mapping_problem(self, direction: Direction, number: int, words: tuple[int, ...]) -> str | None:
         """Why this PDO cannot carry this mapping, None where it can."""
         index = _MAPPING[direction] + number - 1
-        if number not in self.pdo_numbers(direction) or not self.has(index):
+        if _COMMUNICATION[direction] + number - 1 not in self.od or not self.has(index):
             return f"has no {direction.upper()}{number}"
         if self._variable(index, 0).access_type == "rw":
             capacity = self._highest(index)

@@ -297,7 +297,7 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
     if setup.emulated_node_ids:
         emulated = f"nodes {', '.join(map(str, setup.emulated_node_ids))}"
         yield ["emulator", f"{emulated}; arm {setup.truth.fidelity}" if setup.arm is not None else emulated]
-    for name in setup.bridge.use if setup.bridge is not None else ():
+    for name in setup.bridge.use:
         yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
 
@@ -346,7 +346,7 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
         "offline_estimators": list(shape.also) if shape is not None else [],
         "strategy": setup.scan.name if setup.scan is not None else None,
         "fidelity": setup.truth.fidelity if setup.emulated_node_ids else None,
-        "bridges": list(setup.bridge.use) if setup.bridge is not None else [],
+        "bridges": list(setup.bridge.use),
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],

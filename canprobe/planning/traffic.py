@@ -125,7 +125,8 @@ FIRST_LOOK, LAST_LOOK = 0.25, 0.6
 """Shares of the period at which the cell looks for TPDOs besides the planned time; after the last they are late."""
 SYNCHRONOUS = 240
 """The highest transmission type that SYNC triggers (CiA 301)."""
-_ROUNDS = 20
+ROUNDS = 20
+"""Of the analysis; where it still moves after them there is no bound."""
 _SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
 SYNC_BITS = worst_case_bits(_SYNC_BYTES)
 SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
@@ -242,7 +243,7 @@ def _analyse(messages: _Messages, compute_ns: int, bitrate: int) -> tuple[BusAna
     """Response times behind SYNC (of a stranger behind its own event), and the budget of one cycle."""
     period, answered = messages.sync.period_ns, messages.best_sync_ns
     sync_ns, feedback_ns = answered, max(answered, messages.best_feedback_ns)
-    for _ in range(_ROUNDS):
+    for _ in range(ROUNDS):
         looks = look_times(period, feedback_ns)
         earliest, start = controller_starts(messages, looks, feedback_ns)
         answers = (*messages.feedback, *messages.other)

@@ -13,6 +13,7 @@ from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (
     ArmSettings,
+    BridgeSettings,
     LimitSettings,
     PlantSettings,
     ProbeSettings,
@@ -74,7 +75,7 @@ def resolve(scene: Scene) -> Setup:
         compute_ns=round(scene.cycle.compute_us * 1000),
         limits=_limits(scene.limits),
         bring_up=scene.bring_up,
-        bridge=scene.bridge,
+        bridge=scene.bridge or BridgeSettings(),
         arm=arm,
         array=array,
         probe=probe,

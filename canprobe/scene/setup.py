@@ -366,7 +366,7 @@ class Setup:
     compute_ns: int
     limits: SafetyLimits
     bring_up: BringUpTimes
-    bridge: Bridges | None
+    bridge: Bridges
     arm: Arm | None
     array: Array | None
     probe: Probe
