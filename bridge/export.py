@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import operator
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from canprobe.bridge.database import need
+from canprobe.bridge.database import need, write_database
 from canprobe.bus.disk import whole_file, write_text
-from canprobe.cell.bringup import NodeSetup, Write
-from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, make_setups
+from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, NodeSetup, Write, make_setups
 from canprobe.eds.packaged import eds_file
 from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
 from canprobe.errors import UsageError
@@ -25,8 +25,6 @@ from canprobe.planning.model import (
     PlannedPdo,
 )
 from canprobe.planning.traffic import CLASSIC_BYTES
-
-# A plan as files of other tools, by format.
 
 
 def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
@@ -46,17 +44,15 @@ def export_plan(plan: Plan, folder: Path, formats: Iterable[str]) -> list[Path]:
         OSError: the folder cannot be made.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    return [path for form in dict.fromkeys(formats) for path in _export(plan, folder, form)]
-
-
-def _export(plan: Plan, folder: Path, form: str) -> list[Path]:
-    if form == "dcf":
-        return write_dcfs(plan, folder)
-    if form == "bus.yml":
-        return write_bus_yml(plan, folder)
-    from canprobe.bridge.database import write_database
-
-    return [write_database(plan, folder, form)]
+    files = []
+    for form in dict.fromkeys(formats):
+        if form == "dcf":
+            files += write_dcfs(plan, folder)
+        elif form == "bus.yml":
+            files += write_bus_yml(plan, folder)
+        else:
+            files.append(write_database(plan, folder, form))
+    return files
 
 
 # Device configuration files: the EDS of each node with the values that bring-up writes into it.
@@ -191,21 +187,6 @@ class BusNode:
     eds: Path
 
 
-@dataclass(frozen=True, slots=True)
-class BusFile:
-    """What a bus.yml says of a bus.
-
-    Attributes:
-        nodes: ascending node ids.
-        master_id: node id of the master, None where it is not given.
-        sync_period_us: 0 or None without SYNC.
-    """
-
-    nodes: tuple[BusNode, ...]
-    master_id: int | None
-    sync_period_us: int | None
-
-
 def write_bus_yml(plan: Plan, folder: Path) -> list[Path]:
     """Write ``bus.yml`` and the EDS files that it names.
 
@@ -265,13 +246,13 @@ def _master(plan: Plan) -> dict[str, Any]:
 
 def _slave(plan: Plan, node: PlannedNode, setup: NodeSetup, eds: str) -> dict[str, Any]:
     driver, package = _DRIVERS[node.kind]
-    identity = node.identity
+    revision = node.identity.revision_number
     return {
         "node_id": node.node_id,
         "dcf": eds,
         "driver": driver,
         "package": package,
-        **({"revision_number": identity.revision_number} if identity.revision_number is not None else {}),
+        **({"revision_number": revision} if revision is not None else {}),
         "heartbeat_producer": HEARTBEAT_PRODUCED_MS,
         "heartbeat_consumer": True,
         "rpdo": _pdos(plan, node, setup, "rpdo"),
@@ -285,7 +266,7 @@ def _slave(plan: Plan, node: PlannedNode, setup: NodeSetup, eds: str) -> dict[st
 
 
 def _by_sdo(plan: Plan, node: PlannedNode, write: Write) -> bool:
-    """Whether dcfgen has no key of its own for this write."""
+    """Whether dcfgen has no key that makes this write."""
     if write.index not in _PDO_OBJECTS:
         return write.index not in _OWN_KEYS
     direction: Direction = "rpdo" if write.index < 0x1800 else "tpdo"
@@ -315,12 +296,15 @@ def _pdo(pdo: PlannedPdo, written: set[int]) -> dict[str, Any]:
     return found
 
 
-def read_bus_yml(path: Path | str) -> BusFile:
-    """Read the nodes and the SYNC of a bus.yml.
+def read_bus_yml(path: Path | str) -> list[BusNode]:
+    """Read the nodes of a bus.yml.
 
     Args:
         path: of the file; `dcf` paths are looked up beside it, and beside it by their last part where they begin with
             a variable such as ``@BUS_CONFIG_PATH@``.
+
+    Returns:
+        The slaves by rising node id.
 
     Raises:
         UsageError: PyYAML is missing, or the file is no bus.yml; with the node and the key.
@@ -335,17 +319,16 @@ def read_bus_yml(path: Path | str) -> BusFile:
         raise UsageError(f"{path}: no YAML: {' '.join(str(error).split())}") from error
     if not isinstance(document, Mapping):
         raise UsageError(f"{path}: expected the nodes of a bus by name, got {type(document).__name__}")
-    options, master, defaults = (_mapping(path, document, key) for key in _NOT_SLAVES)
+    options, defaults = (_mapping(path, document, key) for key in ("options", "defaults"))
     names = [str(name) for name in document if name not in _NOT_SLAVES]
     nodes = [_read_node(path, name, {**defaults, **_mapping(path, document, name)}, options) for name in names]
     if not nodes:
         raise UsageError(f"{path}: no node besides {', '.join(_NOT_SLAVES)}")
-    _check_distinct(path, nodes)
-    return BusFile(
-        nodes=tuple(sorted(nodes, key=lambda node: node.node_id)),
-        master_id=_integer(path, "master", master, "node_id"),
-        sync_period_us=_integer(path, "master", master, "sync_period"),
-    )
+    nodes.sort(key=lambda node: node.node_id)  # of two with the same node id the first stays first
+    for node, following in itertools.pairwise(nodes):
+        if node.node_id == following.node_id:
+            raise UsageError(f"{path}: {following.name}: node_id: {node.node_id} is that of {node.name} too")
+    return nodes
 
 
 def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str, Any]:
@@ -358,8 +341,8 @@ def _mapping(path: Path, document: Mapping[Any, Any], name: str) -> Mapping[str,
 
 
 def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[str, Any]) -> BusNode:
-    node_id = _integer(path, name, keys, "node_id")
-    if node_id is None or not 1 <= node_id <= 127:
+    node_id = _integer(path, name, keys.get("node_id"))
+    if not 1 <= node_id <= 127:
         raise UsageError(f"{path}: {name}: node_id: expected 1 to 127, got {node_id}")
     dcf = keys.get("dcf")
     if not isinstance(dcf, str) or not dcf:
@@ -372,17 +355,8 @@ def _read_node(path: Path, name: str, keys: Mapping[str, Any], options: Mapping[
     return BusNode(name, node_id, eds)
 
 
-def _integer(path: Path, name: str, keys: Mapping[str, Any], key: str) -> int | None:
-    value = keys.get(key)
+def _integer(path: Path, name: str, value: Any) -> int:
     try:
-        return None if value is None else int(value, 0) if isinstance(value, str) else operator.index(value)
+        return int(value, 0) if isinstance(value, str) else operator.index(value)
     except (TypeError, ValueError):
-        raise UsageError(f"{path}: {name}: {key}: expected an integer, got {value!r}") from None
-
-
-def _check_distinct(path: Path, nodes: list[BusNode]) -> None:
-    owners: dict[int, str] = {}
-    for node in nodes:
-        other = owners.setdefault(node.node_id, node.name)
-        if other != node.name:
-            raise UsageError(f"{path}: {node.name}: node_id: {node.node_id} is that of {other} too")
+        raise UsageError(f"{path}: {name}: node_id: expected an integer, got {value!r}") from None

@@ -1,7 +1,7 @@
 """A live view in Foxglove: its WebSocket server, with the same channels as the MCAP file.
 
-Whoever is not subscribed to costs nothing: no message is made for a channel that nobody looks at. A viewer that cannot
-follow loses its oldest messages in the server; neither the cell nor another viewer waits for it.
+A channel without a subscriber costs nothing: no message is made for it. A viewer that cannot follow loses its oldest
+messages in the server; neither the cell nor another viewer waits for it.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from canprobe.errors import UsageError
 
 LAYOUT = "foxglove_layout.json"
 STATIC_EVERY_NS = 1_000_000_000
-"""The protocol keeps no last message for viewers that come later, so that the fixed frames are told again."""
+"""The protocol keeps no last message for viewers that come later, so that the fixed frames are sent again."""
 
 
 class FoxgloveSink:
@@ -26,7 +26,7 @@ class FoxgloveSink:
         context: of the run.
 
     Raises:
-        UsageError: the address is taken, or is none of this machine's.
+        UsageError: the address is taken, or does not belong to this machine.
     """
 
     def __init__(self, context: Context) -> None:
@@ -68,9 +68,7 @@ class FoxgloveSink:
         return self._channels[topic.name].has_sinks()
 
 
-def open_sink(context: Context) -> FoxgloveSink:
-    """Start the server."""
-    return FoxgloveSink(context)
+open_sink = FoxgloveSink
 
 
 def _channel(topic: Topic, encoder: Encoder, room: foxglove.Context) -> foxglove.Channel:

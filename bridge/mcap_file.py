@@ -7,58 +7,23 @@ metadata as rosbag2_storage_mcap writes it.
 from __future__ import annotations
 
 import contextlib
-import importlib
+import importlib.util
 import os
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
 from mcap.writer import Writer
 
 from canprobe import __version__
+from canprobe.bridge.database import plan_database
 from canprobe.bridge.messages import TOPICS, Encoder, Messages, Topic
 from canprobe.bridge.sample import Context, Sample
-from canprobe.eds.packaged import eds_path
+from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, UsageError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.model import Plan
 from canprobe.scene.load import dump_scene
-
-# What a recording is kept with: the scene as resolved, the EDS of every node, the bus as DBC, the summary.
-
-Attachment = tuple[str, str, bytes]
-"""Name, media type, content."""
-_DATABASE = "canprobe.bridge.database"
-
-
-def attachments_of(plan: Plan, out: Path | None, summary: str | None) -> Iterator[Attachment]:
-    """The files of a run that a recording carries.
-
-    Args:
-        plan: of the run.
-        out: its folder, where a summary may lie already.
-        summary: content of `summary.json`; None takes the one in the folder, if there is one.
-    """
-    yield "scene.toml", "application/toml", dump_scene(plan.scene).encode()
-    for eds in dict.fromkeys(node.eds for node in plan.nodes):
-        path = Path(eds) if Path(eds).is_file() else eds_path(eds)
-        yield path.name, "text/plain", path.read_bytes()
-    if (dbc := dbc_of(plan)) is not None:
-        yield f"{plan.scene.name}.dbc", "text/plain", dbc.encode("cp1252")
-    if summary is not None:
-        yield "summary.json", "application/json", summary.encode()
-    elif out is not None and (out / "summary.json").is_file():
-        yield "summary.json", "application/json", (out / "summary.json").read_bytes()
-
-
-def dbc_of(plan: Plan) -> str | None:
-    """Every PDO of the plan as DBC; None where `cantools` is not installed."""
-    if importlib.util.find_spec("cantools") is None or importlib.util.find_spec(_DATABASE) is None:
-        return None
-    text: str = importlib.import_module(_DATABASE).plan_database(plan).as_dbc_string()
-    return text
-
-
-# One MCAP file a run: ROS 2 messages with their definitions, and scene, EDS, DBC and summary as attachments.
 
 
 class McapSink:
@@ -82,7 +47,7 @@ class McapSink:
         self._writer.start(profile="ros2", library=f"canprobe {__version__}")
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
-        self._counts: dict[str, int] = {}
+        self._counts = Counter[str]()
         self._last_ns = 0
 
     @property
@@ -100,13 +65,13 @@ class McapSink:
         """Write the messages of a sample."""
         with self._or_none():
             for topic, t_ns, data in self._messages.of(sample):
-                count = self._counts[topic.name] = self._counts.get(topic.name, 0) + 1
-                self._writer.add_message(self._channels[topic.name], t_ns, data, t_ns, count)
+                self._counts[topic.name] += 1
+                self._writer.add_message(self._channels[topic.name], t_ns, data, t_ns, self._counts[topic.name])
                 self._last_ns = max(self._last_ns, t_ns)
 
     def close(self, summary: str | None) -> None:
         """Attach what the run was, write the index, and give the file its name."""
-        attachments = attachments_of(self._context.plan, self._context.out, summary)
+        attachments = _attachments(self._context.plan, self._path.parent, summary)
         with self._or_none():
             for name, media_type, content in attachments:
                 self._writer.add_attachment(self._last_ns, self._last_ns, name, media_type, content)
@@ -137,9 +102,7 @@ class McapSink:
         return self._writer.register_channel(topic.name, "cdr", schema, metadata)
 
 
-def open_sink(context: Context) -> McapSink:
-    """Begin the file."""
-    return McapSink(context)
+open_sink = McapSink
 
 
 def _qos_yaml(topic: Topic) -> str:
@@ -155,3 +118,17 @@ def _qos_yaml(topic: Topic) -> str:
         "  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
         "  avoid_ros_namespace_conventions: false\n"
     )
+
+
+def _attachments(plan: Plan, folder: Path, summary: str | None) -> Iterator[tuple[str, str, bytes]]:
+    """Name, media type and content of what a recording carries; without a summary the one in the folder, if any."""
+    yield "scene.toml", "application/toml", dump_scene(plan.scene).encode()
+    for eds in dict.fromkeys(node.eds for node in plan.nodes):
+        path = eds_file(eds)
+        yield path.name, "text/plain", path.read_bytes()
+    if importlib.util.find_spec("cantools") is not None:
+        yield f"{plan.scene.name}.dbc", "text/plain", plan_database(plan).as_dbc_string().encode("cp1252")
+    if summary is not None:
+        yield "summary.json", "application/json", summary.encode()
+    elif (folder / "summary.json").is_file():
+        yield "summary.json", "application/json", (folder / "summary.json").read_bytes()

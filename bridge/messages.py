@@ -1,9 +1,13 @@
-"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR."""
+"""One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
+
+The encoder is `rosbags`. Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
+ros2_socketcan_msgs, which it does not carry.
+"""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,25 +21,19 @@ from canprobe.bridge.sample import (
     FLANGE,
     JOINT_NAMES,
     PROBE,
-    CanFrame,
-    ContactFrame,
-    Joints,
     Sample,
     SurfacePatch,
-    TaxelImage,
-    Wrench,
+    TouchFrame,
     flange_transform,
     link_transforms,
     quaternion_of,
 )
+from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
+from canprobe.planning.traffic import CLASSIC_BYTES
+from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 from canprobe.robot.kinematics import MODELS
 from canprobe.scene.geometry import T_flange_probe
-
-# The one encoder of all sinks: ROS 2 messages → CDR, their definitions, and their RIHS01 hashes, by `rosbags`.
-#
-# Source: ROS 2 Jazzy's message definitions as rosbags carries them; can_msgs of ros_canopen and
-# ros2_socketcan_msgs, which it does not.
 
 CAN_FRAME = "can_msgs/msg/Frame"
 CAN_FD_FRAME = "ros2_socketcan_msgs/msg/FdFrame"
@@ -62,22 +60,28 @@ _CAN_FRAME_CDR = struct.Struct("<4siIIB3xI???B8s")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 
-def encode_can_frame(t_ns: int, frame: CanFrame) -> bytes:
+def encode_can_frame(t_ns: int, can_id: int, data: bytes) -> bytes:
     """A `can_msgs/msg/Frame` as the encoder makes it, for a fiftieth of its time.
 
     Args:
         t_ns: since the epoch.
-        frame: the frame.
+        can_id: with `EFF_FLAG` and `RTR_FLAG`.
+        data: up to 8 bytes.
     """
     seconds, ns = divmod(t_ns, 1_000_000_000)
-    data = frame.data
-    return _CAN_FRAME_CDR.pack(
-        _LITTLE_ENDIAN, seconds, ns, 1, 0, frame.can_id, frame.remote, frame.extended, False, len(data), data
-    )
+    identifier, extended = _identifier(can_id)
+    remote = bool(can_id & RTR_FLAG)
+    return _CAN_FRAME_CDR.pack(_LITTLE_ENDIAN, seconds, ns, 1, 0, identifier, remote, extended, False, len(data), data)
+
+
+def _identifier(can_id: int) -> tuple[int, bool]:
+    """The identifier without flags, and whether it has 29 bits."""
+    extended = bool(can_id & EFF_FLAG)
+    return can_id & (0x1FFFFFFF if extended else 0x7FF), extended
 
 
 class Encoder:
-    """Messages of one type store.
+    """ROS 2 messages → CDR, their definitions, and their RIHS01 hashes; one for each sink.
 
     Attributes:
         store: of rosbags; `types[name]` are the message classes.
@@ -106,12 +110,12 @@ class Encoder:
         return str(self.store.hash_rihs01(type_name))
 
 
-# The topics that every ROS sink has in common: names, types, and the quality of service that ROS expects of them.
+# The topics that every ROS sink has.
 
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One topic.
+    """One topic, with the quality of service that ROS expects of it.
 
     Attributes:
         name: as ROS writes it.
@@ -142,8 +146,6 @@ DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
 TOPICS = (JOINT_STATES, WRENCH, TF, TF_STATIC, TAXELS, PATCH, CURVATURE, CAN_FRAMES, CAN_FD_FRAMES, DIAGNOSTICS)
 
 
-# One sample → the ROS 2 messages that it makes, each for its topic and instant, as CDR.
-
 Array = NDArray[np.float64]
 Message = tuple[Topic, int, bytes]
 """Topic, time in ns since the epoch, CDR."""
@@ -157,7 +159,7 @@ class Messages:
         plan: of the run.
         encoder: the one encoder.
         wanted: whether anybody takes a topic; nothing is made of the others.
-        static_every_ns: when the fixed frames are told again; by default once is enough.
+        static_every_ns: when the fixed frames are sent again; by default once is enough.
     """
 
     def __init__(
@@ -188,42 +190,42 @@ class Messages:
             if self._wanted(topic):
                 yield topic, self._epoch_time(t_ns), self.encoder.encode(topic.type_name, make())
 
-    def _can_frames(self, frames: tuple[CanFrame, ...]) -> Iterator[Message]:
+    def _can_frames(self, frames: Sequence[TimedFrame]) -> Iterator[Message]:
         """A message a frame: those of up to 8 bytes, and those that only CAN FD can carry."""
         classic, fd = self._wanted(CAN_FRAMES), self._wanted(CAN_FD_FRAMES)
-        for frame in frames:
-            t_ns = self._epoch_time(frame.t_ns)
-            if len(frame.data) <= 8:
+        for can_id, data, at_ns in frames:
+            t_ns = self._epoch_time(at_ns)
+            if len(data) <= CLASSIC_BYTES:
                 if classic:
-                    yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, frame)
+                    yield CAN_FRAMES, t_ns, encode_can_frame(t_ns, can_id, data)
             elif fd:
+                identifier, extended = _identifier(can_id)
                 message = self._make(
                     CAN_FD_FRAMES.type_name,
-                    header=self._header(frame.t_ns, ""),
-                    id=frame.can_id,
-                    is_extended=frame.extended,
+                    header=self._header(at_ns, ""),
+                    id=identifier,
+                    is_extended=extended,
                     is_error=False,
-                    len=len(frame.data),
-                    data=np.frombuffer(frame.data, np.uint8),
+                    len=len(data),
+                    data=np.frombuffer(data, np.uint8),
                 )
                 yield CAN_FD_FRAMES, t_ns, self.encoder.encode(CAN_FD_FRAMES.type_name, message)
 
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
         """What there is in a sample: topic, time, and how to make the message."""
-        t_ns, joints, patch = sample.t_ns, sample.joints, sample.patch
-        taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
+        t_ns, q, touch, patch = sample.t_ns, sample.q, sample.touch, sample.patch
         if self._model is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
             yield TF_STATIC, t_ns, lambda: self._static(t_ns)
-        if joints is not None and self._model is not None:
-            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
-            yield TF, t_ns, lambda: self._links(t_ns, joints)
-        if taxels is not None:
-            yield TAXELS, taxels.t_ns, lambda: self._image(taxels)
-        if wrench is not None:
-            yield WRENCH, wrench.t_ns, lambda: self._wrench(wrench)
-        if contact is not None:
-            yield TF, contact.t_ns, lambda: self._contact(contact)
+        if q is not None and (model := self._model) is not None:
+            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, q)
+            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(model, q))
+        if touch is not None:
+            if (counts := touch.counts) is not None:
+                yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
+            yield WRENCH, touch.t_ns, lambda: self._wrench(touch)
+            if (contact := touch.contact) is not None:
+                yield TF, touch.t_ns, lambda: self._tf(touch.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
         if patch is not None:
             yield PATCH, patch.t_ns, lambda: self._cloud(patch)
             yield CURVATURE, patch.t_ns, lambda: self._curvature(patch)
@@ -232,20 +234,12 @@ class Messages:
 
     # one function a message
 
-    def _joint_state(self, t_ns: int, joints: Joints) -> Any:
-        nothing = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
+    def _joint_state(self, t_ns: int, q: Array) -> Any:
+        unknown = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
+        header, names = self._header(t_ns, BASE), list(JOINT_NAMES)
         return self._make(
-            "sensor_msgs/msg/JointState",
-            header=self._header(t_ns, BASE),
-            name=list(JOINT_NAMES),
-            position=np.asarray(joints.position, np.float64),
-            velocity=nothing,
-            effort=nothing,
+            "sensor_msgs/msg/JointState", header=header, name=names, position=q, velocity=unknown, effort=unknown
         )
-
-    def _links(self, t_ns: int, joints: Joints) -> Any:
-        assert self._model is not None
-        return self._tf(t_ns, link_transforms(self._model, joints.position))
 
     def _static(self, t_ns: int) -> Any:
         fixed = [flange_transform()]
@@ -253,26 +247,22 @@ class Messages:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
         return self._tf(t_ns, fixed)
 
-    def _contact(self, contact: ContactFrame) -> Any:
-        return self._tf(contact.t_ns, [(BASE, CONTACT, contact.T_base_contact)])
+    def _wrench(self, touch: TouchFrame) -> Any:
+        force, torque = self._vector(touch.force), self._vector(np.zeros(3))
+        body = self._make("geometry_msgs/msg/Wrench", force=force, torque=torque)
+        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(touch.t_ns, PROBE), wrench=body)
 
-    def _wrench(self, wrench: Wrench) -> Any:
-        body = self._make(
-            "geometry_msgs/msg/Wrench", force=self._vector(wrench.force), torque=self._vector(wrench.torque)
-        )
-        return self._make("geometry_msgs/msg/WrenchStamped", header=self._header(wrench.t_ns, PROBE), wrench=body)
-
-    def _image(self, image: TaxelImage) -> Any:
-        rows, columns = image.counts.shape
+    def _image(self, t_ns: int, counts: NDArray[np.uint8]) -> Any:
+        rows, columns = counts.shape
         return self._make(
             "sensor_msgs/msg/Image",
-            header=self._header(image.t_ns, PROBE),
+            header=self._header(t_ns, PROBE),
             height=rows,
             width=columns,
             encoding="mono8",
             is_bigendian=0,
             step=columns,
-            data=image.counts.ravel(),
+            data=counts.ravel(),
         )
 
     def _cloud(self, patch: SurfacePatch) -> Any:
@@ -299,17 +289,11 @@ class Messages:
         return self._make("geometry_msgs/msg/Vector3Stamped", header=self._header(patch.t_ns, CONTACT), vector=vector)
 
     def _diagnostics(self, sample: Sample) -> Any:
-        status = [
-            self._make(
-                "diagnostic_msgs/msg/DiagnosticStatus",
-                level=d.level,
-                name=d.name,
-                message=d.message,
-                hardware_id="canprobe",
-                values=[self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values],
-            )
-            for d in sample.diagnostics
-        ]
+        status = []
+        for d in sample.diagnostics:
+            values = [self._make("diagnostic_msgs/msg/KeyValue", key=key, value=value) for key, value in d.values]
+            words = {"name": d.name, "message": d.message, "hardware_id": "canprobe"}
+            status.append(self._make("diagnostic_msgs/msg/DiagnosticStatus", level=d.level, values=values, **words))
         return self._make("diagnostic_msgs/msg/DiagnosticArray", header=self._header(sample.t_ns, ""), status=status)
 
     # parts of messages
@@ -330,23 +314,15 @@ class Messages:
         return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
 
     def _tf(self, t_ns: int, transforms: list[tuple[str, str, Array]]) -> Any:
-        return self._make(
-            "tf2_msgs/msg/TFMessage",
-            transforms=[
+        stamped = []
+        for parent, child, T in transforms:
+            x, y, z, w = quaternion_of(T[:3, :3])
+            rotation = self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+            transform = self._make("geometry_msgs/msg/Transform", translation=self._vector(T[:3, 3]), rotation=rotation)
+            header = self._header(t_ns, parent)
+            stamped.append(
                 self._make(
-                    "geometry_msgs/msg/TransformStamped",
-                    header=self._header(t_ns, parent),
-                    child_frame_id=child,
-                    transform=self._transform(T),
+                    "geometry_msgs/msg/TransformStamped", header=header, child_frame_id=child, transform=transform
                 )
-                for parent, child, T in transforms
-            ],
-        )
-
-    def _transform(self, T: Array) -> Any:
-        x, y, z, w = quaternion_of(T[:3, :3])
-        return self._make(
-            "geometry_msgs/msg/Transform",
-            translation=self._vector(T[:3, 3]),
-            rotation=self._make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w),
-        )
+            )
+        return self._make("tf2_msgs/msg/TFMessage", transforms=stamped)

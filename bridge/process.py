@@ -1,4 +1,4 @@
-"""A bridge as the cell sees it: an observer that hands everything to a process of its own and never waits for it.
+"""A bridge as the cell sees it: an observer that hands everything to another process and never waits for it.
 
 A crash, a hang or a full queue over there costs samples, which are counted, and nothing else.
 """
@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
+from canprobe.bridge.sample import SurfacePatch
 from canprobe.bus.port import TimedFrame, elapsed_ns, epoch_now_ns
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.cell.cycle import Observation
@@ -40,18 +40,6 @@ if TYPE_CHECKING:
 #
 # Only what a sample is made of is carried. Both ends are the same program, so that `marshal` will do.
 
-Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EstimateParts:
-    """What a bridge needs of a surface estimate; see `SurfaceEstimate`."""
-
-    T_frame_contact: Array
-    K: Array
-    covariance: Array
-    observed: tuple[bool, bool]
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Received:
@@ -61,7 +49,7 @@ class Received:
         t_ns, measurement, frames: as in `Observation`.
         phase: column `phase` of the command, None without one.
         depth: column `depth_at_1n_mm`: indentation at 1 N with which its contact was placed, None without one.
-        estimate: of the command.
+        patch: the estimate of the command.
         dropped: observations that were lost before this one.
     """
 
@@ -69,7 +57,7 @@ class Received:
     measurement: Measurement | None
     phase: float | None
     depth: float | None
-    estimate: EstimateParts | None
+    patch: SurfacePatch | None
     frames: list[TimedFrame]
     dropped: int
 
@@ -81,18 +69,20 @@ def pack_observation(observation: Observation, dropped: int = 0) -> bytes:
         observation: as the cell hands it out.
         dropped: how many were lost before it.
     """
-    command = observation.command
-    phase: float | None = None
-    depth: float | None = None
-    estimate = None
-    if command is not None:
-        phase = _number(command.columns.get("phase"))
-        depth = _number(command.columns.get("depth_at_1n_mm"))
-        if command.estimate is not None:
-            estimate = _pack_estimate(command.estimate)
-    measurement = observation.measurement
-    parts: Any = _pack_measurement(measurement) if measurement is not None else None
-    return marshal.dumps((observation.t_ns, parts, phase, depth, estimate, observation.frames, dropped))
+    measurement, command = observation.measurement, observation.command
+    columns = command.columns if command is not None else {}
+    estimate = command.estimate if command is not None else None
+    return marshal.dumps(
+        (
+            observation.t_ns,
+            _pack_measurement(measurement) if measurement is not None else None,
+            _number(columns.get("phase")),
+            _number(columns.get("depth_at_1n_mm")),
+            _pack_estimate(estimate) if estimate is not None else None,
+            observation.frames,
+            dropped,
+        )
+    )
 
 
 def _number(value: object) -> float | None:
@@ -102,77 +92,54 @@ def _number(value: object) -> float | None:
 
 def unpack_observation(data: bytes) -> Received:
     """The inverse of `pack_observation`."""
-    t_ns, parts, phase, depth, estimate, frames, dropped = marshal.loads(data)
+    t_ns, measurement, phase, depth, estimate, frames, dropped = marshal.loads(data)
     return Received(
         t_ns,
-        _unpack_measurement(parts) if parts is not None else None,
+        _unpack_measurement(measurement) if measurement is not None else None,
         phase,
         depth,
-        _unpack_estimate(estimate) if estimate is not None else None,
+        _unpack_estimate(t_ns, *estimate) if estimate is not None else None,
         frames,
         dropped,
     )
 
 
-def _pack_measurement(m: Measurement) -> tuple[object, ...]:
+def _pack_measurement(m: Measurement) -> Any:
     q = m.q.tobytes() if m.q is not None else None
     tactile = _pack_tactile(m.tactile) if m.tactile is not None else None
-    return m.cycle, m.t_ns, q, m.q_age, m.torque_permille, m.statuswords, m.enabled, tactile, m.tactile_age
+    return m.cycle, m.t_ns, q, m.q_age, m.torque_permille, m.statuswords, bool(m.enabled), tactile, m.tactile_age
 
 
-def _unpack_measurement(parts: tuple[object, ...]) -> Measurement:
+def _unpack_measurement(parts: Any) -> Measurement:
     cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age = parts
-    return Measurement(
-        cycle,  # type: ignore[arg-type]
-        t_ns,  # type: ignore[arg-type]
-        np.frombuffer(q) if q is not None else None,  # type: ignore[call-overload]
-        age,  # type: ignore[arg-type]
-        torque,  # type: ignore[arg-type]
-        words,  # type: ignore[arg-type]
-        bool(enabled),
-        _unpack_tactile(tactile) if tactile is not None else None,  # type: ignore[arg-type]
-        tactile_age,  # type: ignore[arg-type]
-    )
+    q = np.frombuffer(q) if q is not None else None
+    tactile = _unpack_tactile(tactile) if tactile is not None else None
+    return Measurement(cycle, t_ns, q, age, torque, words, enabled, tactile, tactile_age)
 
 
-def _pack_tactile(sample: TactileSample) -> tuple[object, ...]:
+def _pack_tactile(sample: TactileSample) -> Any:
     frame = sample.frame
-    features = frame.features
-    return (
-        sample.t_sample_ns,
-        sample.cycle,
-        frame.header.pack(),
-        frame.taxels.tobytes(),
-        frame.window,
-        (features.pack(), features.peak) if features is not None else None,
-        frame.t_ns,
-    )
+    features = (frame.features.pack(), frame.features.peak) if frame.features is not None else None
+    header, taxels = frame.header.pack(), frame.taxels.tobytes()
+    return sample.t_sample_ns, sample.cycle, header, taxels, frame.window, features, frame.t_ns
 
 
-def _unpack_tactile(parts: tuple[int, int, bytes, bytes, tuple[int, int, int, int], tuple[bytes, int], int]) -> object:
+def _unpack_tactile(parts: Any) -> TactileSample:
     t_sample_ns, cycle, header, taxels, window, features, t_ns = parts
     image = np.frombuffer(taxels, np.uint8).reshape(16, 16)
     found = Features.unpack(*features) if features is not None else None
     return TactileSample(TactileFrame(TactileHeader.unpack(header), image, window, found, t_ns), t_sample_ns, cycle)
 
 
-def _pack_estimate(estimate: SurfaceEstimate) -> tuple[bytes, bytes, bytes, bool, bool]:
-    first, second = estimate.observed
-    T, K, covariance = (
-        np.ascontiguousarray(a, np.float64).tobytes()
-        for a in (estimate.T_frame_contact, estimate.K, estimate.covariance)
-    )
-    return T, K, covariance, bool(first), bool(second)
+def _pack_estimate(estimate: SurfaceEstimate) -> Any:
+    arrays = (estimate.T_frame_contact, estimate.K, estimate.covariance)
+    observed = tuple(bool(one) for one in estimate.observed)
+    return *(np.ascontiguousarray(array, np.float64).tobytes() for array in arrays), observed
 
 
-def _unpack_estimate(parts: tuple[bytes, bytes, bytes, bool, bool]) -> EstimateParts:
-    T, K, covariance, first, second = parts
-    return EstimateParts(
-        np.frombuffer(T).reshape(4, 4),
-        np.frombuffer(K).reshape(2, 2),
-        np.frombuffer(covariance).reshape(3, 3),
-        (first, second),
-    )
+def _unpack_estimate(t_ns: int, T: bytes, K: bytes, covariance: bytes, observed: tuple[bool, bool]) -> SurfacePatch:
+    T_base_contact, C = np.frombuffer(T).reshape(4, 4), np.frombuffer(covariance).reshape(3, 3)
+    return SurfacePatch(t_ns, T_base_contact, np.frombuffer(K).reshape(2, 2), C, observed)
 
 
 # The bounded queue between a cell and a bridge's process: a pipe that never makes the cell wait.
@@ -279,7 +246,7 @@ def read_records(stream: BinaryIO) -> Iterator[bytes]:
         yield record
 
 
-# A bridge as the cell sees it: an observer that hands everything to a process of its own and never waits for it.
+# The process.
 
 READY_TIMEOUT_S = 60.0
 END_TIMEOUT_S = 30.0
@@ -289,11 +256,12 @@ CLOSE_TIMEOUT_S = 1.0
 KILL_TIMEOUT_S = 2.0
 LATENCY_S = 0.02
 """Samples of this time leave by one system call."""
-_OBSERVATION, _END = b"o", b"e"
+OBSERVATION, END = b"o", b"e"
+"""First byte of a record: what follows."""
 
 
 class BridgeProcess:
-    """One bridge in a process of its own.
+    """One bridge in its process.
 
     Args:
         name: of the bridge.
@@ -366,7 +334,7 @@ class BridgeProcess:
             epoch = 0 if self._virtual else epoch_now_ns() - observation.t_ns
             self._epoch = epoch.to_bytes(8, "little")
         feed = self._feed
-        feed.put(_OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
+        feed.put(OBSERVATION + self._epoch + pack_observation(observation, feed.dropped))
         if self._takes_requests and not feed.broken:
             self._poll_in -= 1
             if self._poll_in <= 0:
@@ -416,7 +384,7 @@ class BridgeProcess:
         try:
             self._feed.flush(_left_s(deadline))
             taken, dropped = self._feed.taken, self._feed.dropped
-            self._feed.put(_END + (summary or "").encode())
+            self._feed.put(END + (summary or "").encode())
             self._feed.flush(_left_s(deadline))
             self._feed.taken, self._feed.dropped = taken, max(dropped, self._feed.dropped - 1)
             self._feed.close()
@@ -426,7 +394,7 @@ class BridgeProcess:
         return self.status()
 
     def _wait(self, deadline_ns: int) -> None:
-        """Until the process has said its last, or its time is up."""
+        """Wait until the process has ended, or its time is up."""
         while (left := _left_s(min(deadline_ns, self._ends_by_ns or deadline_ns))) > 0:
             if not self._listen(left):
                 with contextlib.suppress(subprocess.TimeoutExpired):

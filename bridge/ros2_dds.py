@@ -36,8 +36,6 @@ from canprobe.scene.resolve import resolve
 
 # Whether a command from outside may reach the cell: by the same checks that the scene itself has to pass.
 
-KINDS = ("start", "stop", "target_force_n", "speed_m_s")
-
 
 def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
     """Why a command is refused, or None.
@@ -47,7 +45,7 @@ def refuse(plan: Plan, kind: str, value: float | None) -> str | None:
 
     Args:
         plan: of the run.
-        kind: one of `KINDS`.
+        kind: start, stop, target_force_n or speed_m_s.
         value: N or m/s; None for start and stop.
     """
     if kind in ("start", "stop"):
@@ -149,7 +147,7 @@ def dds_name(type_name: str) -> str:
     return f"{package}::{kind}::dds_::{name}_"
 
 
-# Live ROS 2 topics without ROS: Cyclone DDS with ROS's names, types, hashes and quality of service; commands back.
+# The sink.
 
 EMPTY, FLOAT64, STRING = "std_msgs/msg/Empty", "std_msgs/msg/Float64", "std_msgs/msg/String"
 START, STOP = Topic("/canprobe/start", EMPTY), Topic("/canprobe/stop", EMPTY)
@@ -273,6 +271,4 @@ class Ros2Sink:
         self._status.write(self._node.types.carry(STRING, cdr))
 
 
-def open_sink(context: Context) -> Ros2Sink:
-    """Join the domain."""
-    return Ros2Sink(context)
+open_sink = Ros2Sink

@@ -1,14 +1,13 @@
-"""What every bridge is fed: one neutral sample of the cell, in SI units, with its time in nanoseconds; and what a
-bridge offers.
+"""What every bridge is fed: one neutral sample of the cell in SI units; its tree of frames; and what a bridge offers.
 
-A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool, a
-message type or a bus. Frames are named as in `FRAME_NAMES`; z of the contact frame is the inward normal.
+A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool or a
+message type. Times are in nanoseconds. z of the contact frame is the inward normal.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -16,70 +15,17 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
 from canprobe.robot.kinematics import PumaModel
 from canprobe.scene.model import BridgeSettings
 
-# What every bridge is fed: one neutral sample of the cell, in SI units, with its time in nanoseconds.
-
 Array = NDArray[np.float64]
 
 BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
-FRAME_NAMES = (BASE, "link_1", "link_2", "link_3", "link_4", "link_5", "link_6", FLANGE, PROBE, CONTACT)
+LINKS = (BASE, "link_1", "link_2", "link_3", "link_4", "link_5", "link_6")
+"""base_link, then the frame that each joint turns."""
 JOINT_NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Joints:
-    """The arm at the SYNC of the sample.
-
-    Attributes:
-        position: (6,) rad.
-        T_base_probe: (4, 4) probe's centre frame (z is the pole) to base, m; None in a scene without a probe.
-        age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
-        torque_permille: of each motor's rated torque (6,), as the drive tells it; see `Measurement`.
-        statuswords: CiA 402 statuswords (6,).
-    """
-
-    position: Array
-    T_base_probe: Array | None = None
-    age: tuple[int, ...] = ()
-    torque_permille: tuple[float, ...] = ()
-    statuswords: tuple[int, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TaxelImage:
-    """One frame of the tactile array.
-
-    Attributes:
-        t_ns: when it was sampled, on the clock of the samples.
-        counts: (16, 16) uint8, row by row; zero outside the window.
-        window: (row, column) of the first taxel of the window, None where the whole image came.
-        overload: a taxel reached full scale.
-    """
-
-    t_ns: int
-    counts: NDArray[np.uint8]
-    window: tuple[int, int] | None = None
-    overload: bool = False
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Wrench:
-    """What the object does to the probe, expressed in the probe's centre frame.
-
-    The array feels pressure only: the force runs along the contact normal, without a torque about the sphere's centre.
-
-    Attributes:
-        t_ns: when the array was sampled.
-        force: (3,) N.
-        torque: (3,) N m.
-    """
-
-    t_ns: int
-    force: Array
-    torque: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,14 +33,10 @@ class ContactFrame:
     """Where the probe touches.
 
     Attributes:
-        t_ns: when the array was sampled.
         T_base_contact: (4, 4) contact frame to base, m: origin at the contact point, z along the inward normal.
-        force: magnitude, N.
     """
 
-    t_ns: int
     T_base_contact: Array
-    force: float
 
     @property
     def point(self) -> Array:
@@ -105,6 +47,24 @@ class ContactFrame:
     def normal(self) -> Array:
         """(3,) outward unit normal of the object, base frame."""
         return -self.T_base_contact[:3, 2]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TouchFrame:
+    """One frame of the tactile array.
+
+    Attributes:
+        t_ns: when it was sampled, on the clock of the samples.
+        counts: (16, 16) uint8, row by row; zero outside the window; None in features mode.
+        force: (3,) N that the object exerts on the probe, in the probe's centre frame. The array measures pressure
+            only: the force runs along the contact normal, without a torque about the sphere's centre.
+        contact: None without contact, or without an arm.
+    """
+
+    t_ns: int
+    counts: NDArray[np.uint8] | None
+    force: Array
+    contact: ContactFrame | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -171,30 +131,11 @@ class SurfacePatch:
 
 
 @dataclass(frozen=True, slots=True)
-class CanFrame:
-    """One frame that was on the bus.
-
-    Attributes:
-        t_ns: when, on the clock of the samples.
-        can_id: 11 or 29 bits.
-        data: up to 8 bytes; up to 64 in CAN FD.
-        extended: the identifier has 29 bits.
-        remote: a remote request.
-    """
-
-    t_ns: int
-    can_id: int
-    data: bytes
-    extended: bool = False
-    remote: bool = False
-
-
-@dataclass(frozen=True, slots=True)
 class Diagnostic:
-    """The state of one thing that can be well or not.
+    """The state of a node, or of the cell.
 
     Attributes:
-        name: of the thing, such as `node 3 (joint 3)`.
+        name: such as `node 3 (joint 3)`.
         level: 0 well, 1 worth a look, 2 failed, 3 silent.
         message: one line.
         values: (name, value) pairs as text, units in the name.
@@ -213,13 +154,11 @@ class Sample:
     Attributes:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
         cycle: its number; None before the first cycle and after the last.
-        phase: of the task in lower case (`approach`, `scan`, …); None where the controller tells none.
-        joints: the arm; None without one, or before all joints were heard.
-        taxels: a tactile frame that became usable in this cycle.
-        wrench: what it says of the force.
-        contact: where it was felt; None without contact, or without an arm.
+        phase: of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
+        q: (6,) joint angles at the SYNC, rad; None without an arm, or before all joints were heard.
+        touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
-        frames: what was on the bus since the sample before.
+        frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.
         diagnostics: of all nodes and of the bridge, about once a second.
         dropped: samples that were lost on the way to this bridge so far.
     """
@@ -227,20 +166,15 @@ class Sample:
     t_ns: int
     cycle: int | None = None
     phase: str | None = None
-    joints: Joints | None = None
-    taxels: TaxelImage | None = None
-    wrench: Wrench | None = None
-    contact: ContactFrame | None = None
+    q: Array | None = None
+    touch: TouchFrame | None = None
     patch: SurfacePatch | None = None
-    frames: tuple[CanFrame, ...] = ()
+    frames: Sequence[TimedFrame] = ()
     diagnostics: tuple[Diagnostic, ...] = ()
     dropped: int = 0
 
 
 # The tree of frames, base to contact, as every viewer with tf wants it.
-
-LINKS = FRAME_NAMES[:7]
-"""base_link, then the frame that each joint turns."""
 
 
 def link_transforms(model: PumaModel, q: Array) -> list[tuple[str, str, Array]]:
@@ -297,12 +231,12 @@ def quaternion_of(R: Array) -> tuple[float, float, float, float]:
     return (q[0] * scale, q[1] * scale, q[2] * scale, q[3] * scale)
 
 
-# What a bridge's own file has to offer, and what it is told at its start.
+# What a bridge's module has to offer, and what it gets at its start.
 
 
 @dataclass(frozen=True, slots=True)
 class Context:
-    """What a sink is told.
+    """What a sink gets at its start.
 
     Attributes:
         plan: of the run.

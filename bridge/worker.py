@@ -14,7 +14,7 @@ import os
 import signal
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -22,31 +22,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bridge.process import EstimateParts, Received, read_records, unpack_observation
+from canprobe.bridge.process import END, Received, read_records, unpack_observation
 from canprobe.bridge.sample import (
-    CanFrame,
     ContactFrame,
     Context,
     Diagnostic,
-    Joints,
     Sample,
     Sink,
     SurfacePatch,
-    TaxelImage,
-    Wrench,
+    TouchFrame,
 )
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import patch_of
-from canprobe.cell.controller import Measurement, TactileSample
+from canprobe.cell.array import patch_of
+from canprobe.cell.controller import Measurement
 from canprobe.cell.supervision import TOUCH_FORCE
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError
 from canprobe.planning.bridges import BRIDGES
 from canprobe.planning.make import make_plan
-from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
+from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
-from canprobe.protocol.frames import EFF_FLAG, NO_ERROR, RTR_FLAG, NmtState, describe
-from canprobe.robot.kinematics import forward
+from canprobe.protocol.frames import NO_ERROR, NmtState, describe
 from canprobe.scene.load import parse_scene
 from canprobe.scene.model import BridgeSettings
 from canprobe.scene.resolve import resolve
@@ -56,9 +52,8 @@ from canprobe.tasks.sensing import ContactSensing
 from canprobe.touch.contact import ContactSample, pad_to_direction
 from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.patch.array_model import array_calibration
-from canprobe.touch.patch.image import Patch
 
-# The state of the nodes as a sample tells it, about once a second: from heartbeats, emergencies and statuswords.
+# The state of the nodes, about once a second: from heartbeats, emergencies and statuswords.
 
 PERIOD_NS = 1_000_000_000
 WELL, LOOK, FAILED, SILENT = range(4)
@@ -74,7 +69,7 @@ class Health:
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
-        self._watch = NodeWatch(plan.node_ids, MASTER_NODE_ID, HEARTBEAT_CONSUMED_MS * 1_000_000)
+        self._watch = NodeWatch(plan.node_ids)
         self._heard: dict[int, int] = {}
         self._due_ns: int | None = None
 
@@ -82,9 +77,7 @@ class Health:
         """Take what one observation says; the state of all where it is time for it, else nothing."""
         for frame in received.frames:
             self._push(frame)
-        if received.measurement is None:
-            return ()
-        if self._due_ns is not None and t_ns < self._due_ns:
+        if received.measurement is None or (self._due_ns is not None and t_ns < self._due_ns):
             return ()
         self._due_ns = t_ns + PERIOD_NS
         nodes = tuple(self._node(node, received.measurement, t_ns) for node in self._plan.nodes)
@@ -105,7 +98,6 @@ class Health:
         drive = self._drive(node, measurement)
         event = watch.last_emcy.get(node_id)
         silent = t_ns - self._heard.get(node_id, 0) > HEARTBEAT_CONSUMED_MS * 1_000_000
-        level, message = WELL, "operational"
         if silent:
             level, message = SILENT, f"no heartbeat for more than {HEARTBEAT_CONSUMED_MS} ms"
         elif event is not None and event.emcy.code != NO_ERROR:
@@ -114,6 +106,8 @@ class Health:
             level, message = FAILED, "drive fault"
         elif state is not NmtState.OPERATIONAL:
             level, message = LOOK, state.name.lower() if state is not None else "no heartbeat yet"
+        else:
+            level, message = WELL, "operational"
         values = [("nmt_state", state.name.lower() if state is not None else "unknown")]
         if drive is not None:
             values.append(("drive_state", drive.name.lower()))
@@ -127,7 +121,7 @@ class Health:
 
 
 def _cell(received: Received) -> Diagnostic:
-    """The cell as a whole, and the bridge that tells it."""
+    """The cell as a whole, and what was lost on the way to this bridge."""
     m = received.measurement
     assert m is not None
     oldest = max(m.q_age, default=0)
@@ -156,67 +150,52 @@ class SampleSource:
         arm, array, probe = plan.setup.arm, plan.setup.array, plan.setup.probe
         self._health = Health(plan)
         self._sensing = _sensing(plan.setup)
-        self._model = arm.model if arm is not None else None
-        self._T_flange_probe = probe.T_flange_probe if plan.setup.scene.probe is not None else None
+        self._has_arm = arm is not None
         self._radius = probe.radius
         self._calibration = array_calibration(array.full_scale, probe.radius) if array is not None else None
 
     def sample(self, received: Received) -> Sample:
         """The sample of one observation."""
         measurement, t_ns = received.measurement, received.t_ns
-        frames = tuple(_frame(frame) for frame in received.frames)
         diagnostics = self._health.step(t_ns, received)
+        sample = Sample(t_ns, frames=received.frames, diagnostics=diagnostics, dropped=received.dropped)
         if measurement is None:
-            return Sample(t_ns, frames=frames, diagnostics=diagnostics, dropped=received.dropped)
-        self._feel(received.estimate)  # before the contact, as the task does
+            return sample
+        self._place_on(received.patch)  # before the contact, as the task does
         if received.depth is not None and self._sensing is not None:
             self._sensing.set_depth_at_1_n(received.depth * 1e-3)
-        taxels, wrench, contact = self._touch(measurement, t_ns - measurement.t_ns)
-        return Sample(
-            t_ns,
+        return replace(
+            sample,
             cycle=measurement.cycle,
             phase=_PHASES.get(received.phase) if received.phase is not None else None,
-            joints=self._joints(measurement),
-            taxels=taxels,
-            wrench=wrench,
-            contact=contact,
-            patch=self._patch(received),
-            frames=frames,
-            diagnostics=diagnostics,
-            dropped=received.dropped,
+            q=measurement.q if self._has_arm else None,
+            touch=self._touch(measurement, t_ns - measurement.t_ns),
+            patch=received.patch,
         )
 
-    def _joints(self, m: Measurement) -> Joints | None:
-        if m.q is None or self._model is None:
-            return None
-        tool = self._T_flange_probe
-        T = forward(self._model, m.q) @ tool if tool is not None else None
-        return Joints(m.q, T, m.q_age, m.torque_permille, m.statuswords)
-
-    def _patch(self, received: Received) -> SurfacePatch | None:
-        estimate = received.estimate
-        if estimate is None:
-            return None
-        return SurfacePatch(received.t_ns, estimate.T_frame_contact, estimate.K, estimate.covariance, estimate.observed)
-
-    def _touch(self, m: Measurement, shift_ns: int) -> tuple[TaxelImage | None, Wrench | None, ContactFrame | None]:
-        """What the array felt; ``shift_ns`` takes the cycle's clock to that of the samples."""
+    def _touch(self, m: Measurement, shift_ns: int) -> TouchFrame | None:
+        """What the array measured; ``shift_ns`` takes the cycle's clock to that of the samples."""
         sensing, sample = self._sensing, m.tactile
         patch = sensing.step(m) if sensing is not None else None
         if sample is None or self._calibration is None:
-            return None, None, None
+            return None
         if patch is None:
             patch = patch_of(sample, self._calibration)
-        t_ns = sample.t_sample_ns + shift_ns
-        felt = patch.force > TOUCH_FORCE / 2
-        contact = sensing.contact(sample, patch) if sensing is not None and felt else None
-        wrench = _wrench(t_ns, patch, self._radius)
-        return _image(sample, t_ns), wrench, _contact(t_ns, contact) if contact is not None else None
+        contact = sensing.contact(sample, patch) if sensing is not None and patch.force > TOUCH_FORCE / 2 else None
+        force = np.zeros(3)
+        if patch.force > 0.0:  # the object pushes the probe back along the direction of the contact
+            force = -patch.force * pad_to_direction(patch.u, patch.v, self._radius)
+        return TouchFrame(
+            t_ns=sample.t_sample_ns + shift_ns,
+            counts=sample.frame.taxels if sample.frame.features is None else None,
+            force=force,
+            contact=_contact(contact) if contact is not None else None,
+        )
 
-    def _feel(self, estimate: EstimateParts | None) -> None:
+    def _place_on(self, patch: SurfacePatch | None) -> None:
         """Contacts are placed on the estimated curvature from now on."""
-        if estimate is not None and self._sensing is not None and all(estimate.observed):
-            low, high = np.linalg.eigvalsh(estimate.K).tolist()
+        if patch is not None and self._sensing is not None and all(patch.observed):
+            low, high = np.linalg.eigvalsh(patch.K).tolist()
             self._sensing.set_kappa(np.array([high, low]))
 
 
@@ -230,40 +209,14 @@ def _sensing(setup: Setup) -> ContactSensing | None:
     return make_sensing(replace(touch, shape=None) if isinstance(touch, Touch) else touch)
 
 
-def _frame(frame: TimedFrame) -> CanFrame:
-    can_id, data, t_ns = frame
-    if can_id <= 0x7FF:
-        return CanFrame(t_ns, can_id, data)
-    extended = bool(can_id & EFF_FLAG)
-    return CanFrame(t_ns, can_id & (0x1FFFFFFF if extended else 0x7FF), data, extended, bool(can_id & RTR_FLAG))
+def _contact(contact: ContactSample) -> ContactFrame:
+    return ContactFrame(homogeneous(tangent_rotation(-contact.n_base), contact.p_base))
 
 
-def _image(sample: TactileSample, t_ns: int) -> TaxelImage | None:
-    """The taxels; None in features mode, where there are none."""
-    frame = sample.frame
-    if frame.features is not None:
-        return None
-    row, column, rows, _ = frame.window
-    return TaxelImage(t_ns, frame.taxels, (row, column) if rows < 16 else None, frame.header.overload)
-
-
-def _wrench(t_ns: int, patch: Patch, radius: float) -> Wrench:
-    """The object pushes the probe back along the direction in which it is felt."""
-    if patch.force <= 0.0:
-        return Wrench(t_ns, np.zeros(3), np.zeros(3))
-    return Wrench(t_ns, -patch.force * pad_to_direction(patch.u, patch.v, radius), np.zeros(3))
-
-
-def _contact(t_ns: int, contact: ContactSample) -> ContactFrame:
-    return ContactFrame(t_ns, homogeneous(tangent_rotation(-contact.n_base), contact.p_base), contact.force_n)
-
-
-# The process of one bridge: records from the cell on stdin, lines of JSON back on stdout.
+# The process.
 
 NICE = 10
 """Whatever a bridge computes, the cell and its nodes come first."""
-OBSERVATION, END = b"o"[0], b"e"[0]
-"""First byte of a record: what follows."""
 
 
 def run(name: str, records: Iterator[bytes], fd: int) -> int:
@@ -297,14 +250,14 @@ def run(name: str, records: Iterator[bytes], fd: int) -> int:
     except (CanprobeError, OSError) as error:
         send({"error": str(error)})
         return 1
-    except Exception as error:  # told to the cell in a line, to whoever looks for it in full
+    except Exception as error:  # a line for the cell, the whole for whoever looks for it
         traceback.print_exc()
         send({"error": repr(error)})
         return 1
     return 0
 
 
-def _context(config: dict[str, Any], send: Any) -> Context:
+def _context(config: dict[str, Any], send: Callable[[dict[str, object]], None]) -> Context:
     plan = make_plan(resolve(parse_scene(config["scene"])))
     out = Path(config["out"]) if config["out"] is not None else None
     return Context(plan, plan.scene.bridge or BridgeSettings(), out, send)
@@ -313,19 +266,15 @@ def _context(config: dict[str, Any], send: Any) -> Context:
 def _serve(sink: Sink, source: SampleSource, records: Iterator[bytes]) -> tuple[int, str | None]:
     """Give the sink every sample; how many there were, and the summary."""
     received = 0
-    summary: str | None = None
-    started = False
     for record in records:
         body = record[1:]
-        if record[0] == END:
-            summary = body.decode() or None
-            break
-        if not started:
-            started = True
+        if record[:1] == END:
+            return received, body.decode() or None
+        if not received:
             sink.start(int.from_bytes(body[:8], "little"))
         sink.write(source.sample(unpack_observation(body[8:])))
         received += 1
-    return received, summary
+    return received, None
 
 
 def main() -> int:

@@ -1,11 +1,9 @@
-"""The Python API and what the command line calls: run, open_cell, up, emulate, scan."""
+"""The Python API: run a scene's task, or open its cell for controllers; and the commands that need no results."""
 
 from __future__ import annotations
 
-import contextlib
 import importlib
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -14,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Self
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Observation, Observer, Observers
-from canprobe.errors import BusError, CanprobeError, ResultsError, UsageError
+from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.results.summary import RunResult, log_columns, summarise, write_files
@@ -22,31 +20,24 @@ from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
 from canprobe.session.emulation import emulate, emulate_eds
-from canprobe.session.links import check_links, need_controllers
-from canprobe.session.session import LOCKSTEP, Say, Session, hush_canopen, open_ports, quiet, resolve_scene
-from canprobe.session.up import check_joints, news_teller, telling_notes
+from canprobe.session.looking import commission, monitor, scan
+from canprobe.session.session import Say, Session, quiet, resolve_scene
+from canprobe.session.target import LOCKSTEP, Target
+from canprobe.session.up import check_joints, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.tasks.task import record_of
-from canprobe.tasks.untouched import HoldTask
 
 if TYPE_CHECKING:
-    from canprobe.bus.port import Port
-    from canprobe.cell.commission import Commissioned
-    from canprobe.cell.monitor import CellView
     from canprobe.touch.consistency import Consistency
     from canprobe.touch.surface_map import SurfaceMap
-
-
-MONITOR_PERIOD_NS = 100_000_000
-SILENCE_NS = 1_000_000_000
-"""A bus on which nothing was heard for so long has its controller looked at."""
 
 __all__ = [
     "Command",
     "Measurement",
     "Observation",
     "RunResult",
+    "Target",
     "check_joints",
     "commission",
     "emulate",
@@ -58,8 +49,6 @@ __all__ = [
     "up",
 ]
 
-ROWS_OF_UP = 4000
-"""Cycles that `up` remembers: it runs for days."""
 Progress = Callable[[float, float], None]
 AnyObserver = Observer | Callable[[Observation], None]
 
@@ -93,42 +82,23 @@ def run(
         say: called with each step of bring-up and stop.
         files: False writes nothing.
         force: let the files replace those of an earlier run in ``out``; without, a folder that is not empty is refused.
-        observers: called after each cycle with what it saw, said and had on the bus (`Observation`).
+        observers: called after each cycle with its measurement, command and frames (`Observation`).
         bridge: names of bridges to other tools, besides those of the scene; see `canprobe.planning.bridges`.
 
     Raises:
         UsageError: the scene does not fit; nothing was started.
         BusError: an interface or a node failed. The drives are disabled and the files written, unless no bus opened.
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
-        ResultsError: a file could not be written, for want of room say. The drives are disabled.
+        ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
-    resolved = resolve_scene(
-        scene,
-        interface=interface,
-        channel=channel,
-        sensor_channel=sensor_channel,
-        bitrate=bitrate,
-        seed=seed,
-        duration_s=duration_s,
-        bridge=bridge,
-    )
+    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    resolved = resolve_scene(scene, target, seed=seed, duration_s=duration_s, bridge=bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
     plan = make_plan(resolve(resolved))
     task = make_task(plan)
     with OpenCell(plan, folder, say, observers, task=task) as cell:
         return cell.run(cell.open_to_requests(task), _report(progress, resolved.task.duration_s))
-
-
-def _requested(
-    plan: Plan, task: Controller | None, make: Callable[[], Controller] | None, bridges: Bridges
-) -> Controller:
-    """The task, open to requests where other tools may make any; nothing of the kind is loaded where not."""
-    if not bridges.requests:
-        return task if task is not None else HoldTask()
-    from canprobe.tasks.from_plan import RequestedTask
-
-    return RequestedTask(task, make, bridges.requests, plan.sync.period_ns * 1e-9)
 
 
 def results_folder(scene: Scene, out: Path | str | None = None) -> Path:
@@ -150,7 +120,7 @@ def check_free(folder: Path | None, *, force: bool) -> None:
     """Refuse a folder that holds anything: results never replace others unless that is wanted.
 
     Raises:
-        UsageError: it is not empty, and nobody said that this is well.
+        UsageError: it is not empty, and ``force`` is False.
     """
     if folder is not None and not force and folder.is_dir() and any(folder.iterdir()):
         raise UsageError(
@@ -166,7 +136,7 @@ def _report(progress: Progress | None, total_s: float) -> Callable[[Measurement]
 
 
 def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[ShapeRecord]]:
-    """What the estimator in the loop said, and the others on the same contacts."""
+    """The answers of the estimator in the loop, and of the others on the same contacts."""
     if tracker is None or scene.shape is None:
         return {}
     from canprobe.tasks.from_plan import estimates_of
@@ -177,15 +147,12 @@ def _estimates(scene: Scene, tracker: ShapeTracker | None) -> dict[str, list[Sha
 def _mapped(
     scene: Scene, tracker: ShapeTracker | None, start_s: float
 ) -> tuple[SurfaceMap | None, Consistency | None, dict[str, Any] | None]:
-    """The surface map of a scan, the tests at its crossings, which take a second, and what the summary says of them."""
+    """The surface map of a scan, the tests at its crossings (they take a second), and both for the summary."""
     if tracker is None or scene.shape is None:
         return None, None, None
-    from canprobe.results.scores import map_of_scan, summarise_map
-    from canprobe.touch.consistency import check_consistency
+    from canprobe.results.scores import map_of_scan
 
-    surface_map = map_of_scan(tracker, scene.shape.method, start_s)
-    consistency = check_consistency(surface_map)
-    return surface_map, consistency, summarise_map(surface_map, consistency)
+    return map_of_scan(tracker, scene.shape.method, start_s)
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
@@ -282,7 +249,7 @@ class OpenCell(Session):
 
     def open_to_requests(self, task: Controller) -> Controller:
         """The task, which other tools may start, stop and set where the scene allows that."""
-        return _requested(self.plan, task, None, self._bridges)
+        return self._bridges.open_to_requests(task)
 
     def _finish(self, failure: BaseException | None) -> None:
         """What the run was, once the bus is closed; nothing where none was opened."""
@@ -332,9 +299,9 @@ class OpenCell(Session):
             unwritten = ResultsError("\n".join(self.unwritten))
             unwritten.summary = summary
             raise unwritten
-        for told in self.unwritten:  # what stopped the run counts for more
-            if failure is not None and told != str(failure):
-                failure.add_note(told)
+        for line in self.unwritten:  # what stopped the run comes first
+            if failure is not None and line != str(failure):
+                failure.add_note(line)
 
 
 def _reason(failure: BaseException) -> str:
@@ -388,177 +355,8 @@ def open_cell(
     Leaving it raises:
         ResultsError: a file could not be written.
     """
-    resolved = resolve_scene(
-        scene,
-        interface=interface,
-        channel=channel,
-        sensor_channel=sensor_channel,
-        bitrate=bitrate,
-        seed=seed,
-        bridge=bridge,
-    )
+    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    resolved = resolve_scene(scene, target, seed=seed, bridge=bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)
     return OpenCell(make_plan(resolve(resolved)), folder, say, observers, rows_kept)
-
-
-def up(
-    scene: Scene,
-    *,
-    interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
-    bitrate: int | None = None,
-    say: Say = quiet,
-    bridge: Sequence[str] = (),
-) -> None:
-    """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
-
-    Raises:
-        UsageError, BusError, SafetyStop: as `run`.
-    """
-    if (interface or scene.bus.interface) == LOCKSTEP:
-        raise UsageError("up: a lockstep bus lives inside one run; name a real interface with --bus")
-    resolved = resolve_scene(
-        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate, bridge=bridge
-    )
-    plan = make_plan(resolve(resolved))
-    with (
-        Bridges(plan, None, virtual=False, say=say) as bridges,
-        telling_notes(Session(plan, None, say, bridges.observers, ROWS_OF_UP), say) as session,
-    ):
-        say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
-        session.run(_requested(plan, None, lambda: make_task(plan), bridges), news_teller(session, say))
-
-
-def scan(
-    interface: str, channel: str, bitrate: int, timeout_s: float = 0.2, *, say: Say = quiet
-) -> list[dict[str, Any]]:
-    """List the nodes that answer on a bus, with the identity that 1018h gives.
-
-    Args:
-        interface, channel, bitrate: of the bus.
-        timeout_s: to wait for an answer.
-        say: called with what is wrong with the interface's setting.
-
-    Raises:
-        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
-    """
-    from canprobe.cell.commission import scan_nodes
-
-    with _bus_without_scene(interface, channel, bitrate, say) as port:
-        nodes = scan_nodes(port, timeout_s)
-    if not nodes:
-        need_controllers(interface, {channel: port})
-    return nodes
-
-
-@contextlib.contextmanager
-def _bus_without_scene(interface: str, channel: str, bitrate: int, say: Say) -> Iterator[Port]:
-    """A port of a bus of which nothing more is known, whose setting is no reason to leave it alone."""
-    from canprobe.bus.interfaces import open_port
-    from canprobe.bus.port import MonotonicClock
-    from canprobe.session.links import Expected
-
-    hush_canopen()
-    check_links(interface, {channel: Expected(bitrate, of_scene=False)}, say, must=False)
-    port = open_port(interface, channel, bitrate, MonotonicClock())
-    try:
-        yield port
-    except BusError as error:
-        need_controllers(interface, {channel: port}, error)
-        raise
-    finally:
-        port.close()
-
-
-def commission(
-    interface: str,
-    channel: str,
-    bitrate: int,
-    *,
-    scene: Scene | None = None,
-    assign: Sequence[tuple[tuple[int | None, int | None, int | None, int | None], int]] = (),
-    store: bool = True,
-    say: Say = quiet,
-) -> Commissioned:
-    """Find the nodes that have no id and give them theirs by LSS (CiA 305).
-
-    Args:
-        interface, channel, bitrate: of the bus.
-        scene: whose nodes get their ids; as far as its EDS files and serial numbers tell which is which.
-        assign: or else ((vendor, product, revision, serial number), node id), None for a number that may be any.
-        store: let the devices keep their ids when their power goes.
-        say: called with what is wrong with the interface's setting.
-
-    Raises:
-        UsageError: the scene does not fit.
-        BusError: see `canprobe.cell.commission.commission`.
-        InterfaceError: no such interface, or no node answers and the CAN controller's state is why.
-    """
-    from canprobe.cell.commission import Wanted, commission, wanted_by
-
-    wanted = [Wanted(node_id, "--assign", numbers) for numbers, node_id in assign]
-    if scene is not None:
-        wanted = wanted_by(make_plan(resolve(resolve_scene(scene, interface=interface))))
-    with _bus_without_scene(interface, channel, bitrate, say) as port:
-        done = commission(port, wanted, must=scene is None, store=store)
-    if not done.nodes and not done.unconfigured:
-        need_controllers(interface, {channel: port})
-    return done
-
-
-def monitor(
-    scene: Scene,
-    *,
-    interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
-    bitrate: int | None = None,
-    duration_s: float | None = None,
-    say: Say = quiet,
-) -> Iterator[CellView]:
-    """Look at a running cell ten times a second, sending nothing.
-
-    Args:
-        scene: what is on the bus.
-        interface, channel, sensor_channel, bitrate: in the place of the scene's.
-        duration_s: how long; for ever by default.
-        say: called with what is wrong with the interface's setting.
-
-    Yields:
-        What is known by then; the same object each time.
-
-    Raises:
-        UsageError: the scene does not fit, or its bus is a lockstep bus, which lives inside one run.
-        InterfaceError: no such interface, or it was lost; or a bus is silent and its CAN controller's state is why.
-    """
-    from canprobe.bus.port import MonotonicClock
-    from canprobe.cell.monitor import Monitor
-    from canprobe.session.links import expected_of
-
-    resolved = resolve_scene(
-        scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate
-    )
-    if resolved.bus.interface == LOCKSTEP:
-        raise UsageError("monitor: a lockstep bus lives inside one run; name a real interface with --bus")
-    plan, clock, interface = make_plan(resolve(resolved)), MonotonicClock(), resolved.bus.interface
-    wanted = {name: replace(expected, frames_at_once=0) for name, expected in expected_of(plan).items()}
-    check_links(interface, wanted, say, must=False)
-    with open_ports(plan, clock) as ports:
-        listener = Monitor(plan)
-        start_ns = next_ns = clock.now_ns()
-        duration_ns = None if duration_s is None else duration_s * 1e9
-        patience_ns = SILENCE_NS if duration_ns is None else min(SILENCE_NS, duration_ns)
-        heard_ns = dict.fromkeys(ports, start_ns)
-        while duration_ns is None or next_ns < start_ns + duration_ns:
-            next_ns += MONITOR_PERIOD_NS
-            clock.sleep_until_ns(next_ns)
-            for name, port in ports.items():
-                if frames := port.drain():
-                    listener.push(frames, name)
-                    heard_ns[name] = next_ns
-                elif next_ns - heard_ns[name] >= patience_ns:
-                    need_controllers(interface, {name: port})
-                    heard_ns[name] = next_ns  # the state is asked for once a second at most
-            yield listener.view(clock.now_ns())

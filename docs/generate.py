@@ -1,4 +1,4 @@
-"""What the pages take from the code: all keys of a scene, and the table of conditions. `python docs/generate.py`."""
+"""What the pages take from the code: all keys of a scene. `python docs/generate.py`."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ import ast
 import dataclasses
 import inspect
 import itertools
-import re
 import typing
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from canprobe.cell.conditions import markdown_table
 from canprobe.scene.checks import Only, conditions_of, expected
 from canprobe.scene.load import toml_value
 from canprobe.scene.model import Scene
@@ -127,12 +125,5 @@ def _condition(only: Only) -> str:
     return f"*{'Required' if only.required else 'Only'} with `{only.key}` = {values}.*"
 
 
-def with_conditions(page: str) -> str:
-    """The page of the supervision with the table as it is now in the place of the one that it has."""
-    return re.sub(r"(?m)^\| what \|(?:.*\n)(?:\|.*\n)+", lambda _: markdown_table(), page)
-
-
 if __name__ == "__main__":
     (DOCS / "scene-keys.md").write_text(scene_keys(), encoding="utf-8")
-    supervision = DOCS / "supervision.md"
-    supervision.write_text(with_conditions(supervision.read_text(encoding="utf-8")), encoding="utf-8")

@@ -77,7 +77,7 @@ def has_window_size(od: canopen.ObjectDictionary) -> bool:
 
 
 def has_full_scale(od: canopen.ObjectDictionary) -> bool:
-    """Whether 2004h is that object here; without it the device cannot tell the pressure of its largest count."""
+    """Whether 2004h is that object here; without it the device does not state the pressure of its largest count."""
     return FULL_SCALE in od and od[FULL_SCALE].name == FULL_SCALE_NAME
 
 

@@ -57,7 +57,7 @@ class Faults:
         return tuple(sorted(self.found, key=lambda fault: fault.line))
 
 
-# Bytes of an EDS file → its sections, keys and values, each with its line.
+# The text of a file → its sections.
 
 LINE_END = re.compile(r"\r\n|\n|\r")
 _INLINE_COMMENT = re.compile(r"\s;.*")
@@ -88,7 +88,7 @@ class Section:
     items: dict[str, Item] = field(default_factory=dict)
 
     def value(self, key: str) -> str:
-        """The value, empty where there is none."""
+        """The value; empty where the key is missing."""
         item = self.items.get(key.lower())
         return "" if item is None else item.value
 
@@ -120,7 +120,7 @@ def decode(data: bytes, faults: Faults) -> str:
 
 
 def split_sections(text: str, faults: Faults) -> Sections:
-    """The sections of a text; what is neither section, key nor comment is told and left out."""
+    """The sections of a text; what is neither section, key nor comment is left out with a warning."""
     sections: Sections = {}
     repeated: list[tuple[Section, Section]] = []
     current: Section | None = None
@@ -139,7 +139,7 @@ def split_sections(text: str, faults: Faults) -> Sections:
         else:
             _add(current, line, number, faults)
     for first, again in repeated:
-        _tell_repetition(first, again, faults)
+        _warn_of_repetition(first, again, faults)
     return sections
 
 
@@ -162,7 +162,7 @@ def _add(section: Section, line: str, number: int, faults: Faults) -> None:
         faults.warn(number, section.name, item.key, f"was {first.value!r} in line {first.line} already, which counts")
 
 
-def _tell_repetition(first: Section, again: Section, faults: Faults) -> None:
+def _warn_of_repetition(first: Section, again: Section, faults: Faults) -> None:
     old, new = ({key: item.value for key, item in section.items.items()} for section in (first, again))
     how = "the same" if old == new else "but different"
     faults.warn(again.line, again.name, "", f"is in line {first.line} already, {how}; that one counts")
@@ -188,7 +188,7 @@ def parse_integer(text: str, remark: Remark) -> int:
         remark: called with what is odd about it.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number.
     """
     if match := _HEX.fullmatch(text):
         return int(match[1] + match[2], 16)
@@ -209,7 +209,7 @@ def _leading_zeros(text: str, remark: Remark) -> int:
         if octal != int(text):
             remark(f"{text} is octal by CiA 306, {octal}; {int(text)} is written without the leading zero")
         return octal
-    remark(f"{text} begins with a zero, as octal numbers do, but is none; read as {int(text)}")
+    remark(f"{text} begins with a zero, as octal numbers do, but is not octal; read as {int(text)}")
     return int(text)
 
 
@@ -220,7 +220,7 @@ def parse_sum(text: str, node_id: int, remark: Remark) -> tuple[int, bool]:
         The value for this node, and whether it depends on the node.
 
     Raises:
-        ValueError: it is none.
+        ValueError: it is not a number.
     """
     total, relative = 0, False
     for term in map(str.strip, text.split("+")):
@@ -249,7 +249,7 @@ def parse_flag(text: str, remark: Remark) -> bool:
     return word
 
 
-# What the builders of a dictionary share: the sections, the node, and where they tell what is odd.
+# What the builders of a dictionary share.
 
 
 @dataclass(frozen=True, slots=True)

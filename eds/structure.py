@@ -43,8 +43,6 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
         if head.items:
             source.warn(head, "ParameterName", f"missing; named {name!r}")
     built = (ODArray if kind == ARRAY else ODRecord)(name, index)
-    if location := head.value("StorageLocation"):
-        setattr(built, "storage_location", location)  # noqa: B010 - canopen declares it as None
     members = _compact_members(source, index, head)
     for subindex in subs:
         variable = build_variable(source, subs[subindex], index, subindex, composite=True)
@@ -54,7 +52,7 @@ def build_composite(source: Source, index: int, head: Section, subs: Subs, kind:
         source.warn(head, "", "no section describes a sub-object of it; left out")
         return None
     _check_count(source, head, subs)
-    _check_highest(source, head, subs, members)
+    _check_highest(source, index, head, subs, members)
     for subindex in sorted(members):
         built.add_member(members[subindex])
     return built
@@ -100,8 +98,7 @@ def _check_count(source: Source, head: Section, subs: Subs) -> None:
         source.warn(head, "SubNumber", f"{stated}, but {len(subs)} sub-objects are described; those are taken")
 
 
-def _check_highest(source: Source, head: Section, subs: Subs, members: dict[int, ODVariable]) -> None:
-    index = next(iter(members.values())).index
+def _check_highest(source: Source, index: int, head: Section, subs: Subs, members: dict[int, ODVariable]) -> None:
     highest = max(members)
     if 0 not in members:
         source.warn(head, "", f"subindex 0 is not described; taken for {highest}")
@@ -214,7 +211,7 @@ _FLAGS = {
 
 
 def read_information(source: Source, od: ObjectDictionary) -> None:
-    """Fill in what the dictionary knows of its device; a wrong number is told and left out."""
+    """Fill in what the dictionary knows of its device; a wrong number is left out with a warning."""
     od.node_id = source.node_id
     if (section := source.sections.get("comments")) is not None:
         lines = [item.value for key, item in section.items.items() if key.startswith("line") and key != "lines"]
@@ -239,7 +236,7 @@ def read_information(source: Source, od: ObjectDictionary) -> None:
 
 
 def commissioned_node(sections: Sections) -> int | None:
-    """Node id that a DCF has been made for; None where it tells none."""
+    """Node id that a DCF has been made for; None where it has none."""
     section = _commissioning(sections)
     if section is None:
         return None
@@ -267,7 +264,7 @@ _REQUIRED = ("FileInfo", "DeviceInfo", "MandatoryObjects")
 
 
 def check_lists(source: Source, described: dict[int, Section]) -> None:
-    """Tell missing sections, wrong counts, listed objects without a section, and sections in no list.
+    """Warn of missing sections, wrong counts, listed objects without a section, and sections in no list.
 
     Args:
         source: the file.

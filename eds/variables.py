@@ -36,9 +36,9 @@ _READ_ONLY = frozenset(
 )
 _COMMUNICATION = {1: _U32, 2: _U8, 3: _U16, 5: _U16, 6: _U8}
 COUNTING = frozenset({0x1003, *range(0x1600, 0x1800), *range(0x1A00, 0x1C00)})
-"""Where subindex 0 tells how many entries are in use, and can be written."""
+"""Where sub-index 0 says how many entries are in use, and can be written."""
 _PROFILE_AREA = 0x6000
-"""From here on CiA 402 speaks of drives alone; what other profiles have there is not known here."""
+"""From here on CiA 402 describes drives alone; what other profiles have there is not known here."""
 
 
 def is_variable(index: int, drive: bool) -> bool:
@@ -223,7 +223,7 @@ def _foreign(source: Source, section: Section, data_type: int) -> int:
     return int(datatypes.DOMAIN)
 
 
-# One section of an EDS file → one variable of the dictionary.
+# One section → one variable.
 
 _ACCESS = frozenset({"ro", "wo", "rw", "rwr", "rww", "const"})
 _ACCESS_WORDS = {"r": "ro", "w": "wo", "wr": "rw", "readonly": "ro", "writeonly": "wo", "readwrite": "rw", "c": "const"}
@@ -247,13 +247,14 @@ def build_variable(
     variable.data_type = data_type
     variable.access_type = _access(source, section, index, subindex, composite)
     variable.pdo_mappable = _flag(source, section, "PDOMapping")
-    if location := section.value("StorageLocation"):
-        setattr(variable, "storage_location", location)  # noqa: B010 - canopen declares it as None
     _set_limits(source, section, variable, data_type)
     set_value(source, section, "DefaultValue", variable)
     set_value(source, section, "ParameterValue", variable)
-    _check_default(source, section, variable)
-    _set_extras(section, variable)
+    default, low, high = variable.default, variable.min, variable.max
+    if isinstance(default, int | float) and (
+        (low is not None and default < low) or (high is not None and default > high)
+    ):
+        source.warn(section, "DefaultValue", f"{default} is outside LowLimit and HighLimit; served")
     return variable
 
 
@@ -274,7 +275,7 @@ def set_value(source: Source, section: Section, key: str, variable: ODVariable, 
         return
     if field == "default" and "$" in text and data_type not in TEXTS:
         with suppress(ValueError):
-            variable.relative = parse_sum(text, source.node_id, _silent)[1]
+            variable.relative = parse_sum(text, source.node_id, lambda _: None)[1]
 
 
 def _name(source: Source, section: Section, index: int, subindex: int) -> str:
@@ -326,24 +327,3 @@ def _limit(source: Source, section: Section, key: str, data_type: int) -> int | 
     except (ValueError, OverflowError):
         source.warn(section, key, f"{text!r} is not a value of type {name_of(data_type)}; not used")
         return None
-
-
-def _check_default(source: Source, section: Section, variable: ODVariable) -> None:
-    default = variable.default
-    if not isinstance(default, (int, float)):
-        return
-    too_low = variable.min is not None and default < variable.min
-    if too_low or (variable.max is not None and default > variable.max):
-        source.warn(section, "DefaultValue", f"{default} is outside LowLimit and HighLimit; served")
-
-
-def _set_extras(section: Section, variable: ODVariable) -> None:
-    """What canopen takes beyond the standard."""
-    variable.description = section.value("Description")
-    variable.unit = section.value("Unit")
-    with suppress(ValueError):
-        variable.factor = float(section.value("Factor"))
-
-
-def _silent(text: str) -> None:
-    return None

@@ -13,7 +13,6 @@ from command_lines import command_lines, parse
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.cell.conditions import markdown_table
 from canprobe.cli import COMMANDS, main
 from canprobe.eds.packaged import eds_path
 from canprobe.planning.bridges import BRIDGES
@@ -113,10 +112,6 @@ def test_links_pictures_and_names_of_commands(page):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", TEXTS[page]):
         assert ((ROOT / page).parent / target).is_file(), target
     assert set(re.findall(r"`canprobe (\w+)", TEXTS[page])) <= set(COMMANDS)
-
-
-def test_the_table_of_conditions_is_the_one_that_supervises():
-    assert markdown_table() in TEXTS["docs/supervision.md"], "type: python docs/generate.py"
 
 
 def test_the_readme_stays_short():

@@ -13,7 +13,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from canprobe.bridge.sample import SurfacePatch, link_transforms
-from canprobe.bridge.view.meshes import Array, Colours, Faces, Mesh, cylinder, dome, grid, heat, link, merged, revolved
+from canprobe.bridge.view.meshes import (
+    MAGMA,
+    Array,
+    Colours,
+    Faces,
+    Mesh,
+    cylinder,
+    dome,
+    grid,
+    link,
+    merged,
+    revolved,
+    scale,
+)
 from canprobe.protocol.tactile import SIDE
 from canprobe.robot.kinematics import PumaModel
 from canprobe.touch.contact import pad_to_direction
@@ -167,52 +180,35 @@ REACH_M = 0.055
 WHOLE_M = 0.12
 """Largest radius of a body that is shown whole."""
 STEPS = 40
+LINES = 15
 
 
-def object_mesh(shape: PlacedShape, reach_m: float = REACH_M) -> Mesh:
+def object_mesh(shape: PlacedShape) -> Mesh:
     """The surface of an object near its origin, base frame.
 
-    Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `reach_m` to each side),
-    everything else over a square of twice `reach_m`.
-
-    Args:
-        shape: the true object.
-        reach_m: m.
+    Balls, cylinders, bowls and rings of ordinary size are shown whole (a cylinder over `REACH_M` to each side),
+    everything else over a square of twice `REACH_M`.
     """
     radius = getattr(shape, "radius", math.inf)
     if radius <= WHOLE_M and isinstance(shape, Sphere):
         return _placed(shape, dome(radius, math.pi, rings=32), -radius)
     if radius <= WHOLE_M and isinstance(shape, Cylinder):
-        return _placed(shape, _tube(radius, reach_m), -radius)
+        return _placed(shape, _tube(radius, REACH_M), -radius)
     if radius <= WHOLE_M and isinstance(shape, Bowl):
         return _placed(shape, _hollow(radius), radius)
     if isinstance(shape, Torus) and shape.ring_radius + radius <= WHOLE_M:
         return _ring(shape)
-    return grid(_sheet(shape, reach_m))
+    return grid(_sheet(shape, REACH_M))
 
 
-def object_lines(shape: PlacedShape, reach_m: float = REACH_M, lines: int = 15) -> Array:
-    """Lines on the surface that make its curvature visible.
-
-    Args:
-        shape: the true object.
-        reach_m: to each side of the object's origin, m.
-        lines: in each of two directions.
-
-    Returns:
-        (n, 2, 3) segments, base frame, m.
-    """
-    sheet = _sheet(shape, _sheet_reach(shape, reach_m))
-    picked = np.linspace(0, STEPS, lines).round().astype(int)
+def object_lines(shape: PlacedShape) -> Array:
+    """Lines on the surface in two directions, which make its curvature visible: (n, 2, 3) segments, base frame, m."""
+    radius = math.inf if isinstance(shape, Cylinder) else getattr(shape, "radius", math.inf)
+    sheet = _sheet(shape, min(REACH_M, 0.7 * radius))  # not over the edge of a body seen from above
+    picked = np.linspace(0, STEPS, LINES).round().astype(int)
     along = [np.stack([sheet[i, :-1], sheet[i, 1:]], axis=1) for i in picked]
     across = [np.stack([sheet[:-1, j], sheet[1:, j]], axis=1) for j in picked]
     return np.concatenate([*along, *across])
-
-
-def _sheet_reach(shape: PlacedShape, reach_m: float) -> float:
-    """Not over the edge of a body seen from above."""
-    radius = getattr(shape, "radius", math.inf)
-    return min(reach_m, 0.7 * radius) if not isinstance(shape, Cylinder) else reach_m
 
 
 def _sheet(shape: PlacedShape, reach_m: float) -> Array:
@@ -270,25 +266,9 @@ MOST_M = 0.006
 """Farthest that a shell is drawn from the patch: where curvature was not observed it would be nowhere."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PatchShape:
-    """One estimate to draw, in the contact frame.
-
-    Attributes:
-        surface: (n, 3) points of the disc, m, lifted by `LIFT_M`.
-        above, below: (n, 3) the shells outside and inside the object, exaggerated and cut off, m, lifted too.
-        sigma: (n,) standard deviation of the height, m, as stated; infinite where not observed.
-    """
-
-    surface: Array
-    above: Array
-    below: Array
-    sigma: Array
-
-
-def disc_points(radius: float = RADIUS_M) -> Array:
+def disc_points() -> Array:
     """(n, 2) points of the disc in the tangent plane, ring by ring from the middle, m."""
-    radii = np.linspace(0.0, radius, RINGS + 1)[1:, None]
+    radii = np.linspace(0.0, RADIUS_M, RINGS + 1)[1:, None]
     angles = np.linspace(0.0, 2.0 * math.pi, SECTORS, endpoint=False)[None]
     rings = np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1).reshape(-1, 2)
     points: Array = np.vstack([np.zeros((1, 2)), rings])
@@ -304,19 +284,23 @@ def disc_faces() -> Faces:
     return np.concatenate([middle, np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
 
 
-def patch_shape(patch: SurfacePatch, xy: Array) -> PatchShape:
+def patch_shape(patch: SurfacePatch, xy: Array) -> tuple[Array, Array, Array]:
     """What is drawn of an estimate.
 
     Args:
         patch: of the estimator.
         xy: (n, 2) from :func:`disc_points`.
+
+    Returns:
+        Points of the disc, lifted by `PATCH_LIFT_M`, and the shells outside and inside the object, exaggerated, cut off
+        and lifted too, each (n, 3) in the contact frame, m.
     """
     x, y = xy.T
     height, sigma = patch.heights(x, y)
     shift = np.minimum(2.0 * EXAGGERATION * sigma, MOST_M)
     drawn = height - PATCH_LIFT_M
-    surface, above, below = (np.column_stack([x, y, z]) for z in (drawn, drawn - shift, drawn + shift))
-    return PatchShape(surface, above, below, sigma)
+    surface, outside, inside = (np.column_stack([x, y, z]) for z in (drawn, drawn - shift, drawn + shift))
+    return surface, outside, inside
 
 
 # The tactile array on its dome: where each taxel lies, and its image as colours.
@@ -356,10 +340,10 @@ def tile() -> tuple[Array, NDArray[np.int64]]:
 
 def taxel_colours(taxels: NDArray[np.uint8]) -> Colours:
     """(..., 3) colours of counts; a square-root scale, so that the rim of a patch is seen."""
-    return heat(np.sqrt(taxels.astype(np.float64)), 0.0, np.sqrt(FULL_COUNTS))
+    return scale(np.sqrt(taxels.astype(np.float64)), 0.0, math.sqrt(FULL_COUNTS), MAGMA)
 
 
-def taxel_image(taxels: NDArray[np.uint8], pixels: int = 12) -> Colours:
+def taxel_image(taxels: NDArray[np.uint8], pixels: int) -> Colours:
     """The image as RGB, each taxel a square of so many pixels; v rises upward.
 
     Args:

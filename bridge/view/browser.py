@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import json
 import math
 from collections import deque
@@ -15,8 +16,8 @@ from typing import Any
 import numpy as np
 
 from canprobe.bridge.sample import Context, Sample
-from canprobe.bridge.view.instants import NAMES, Curves, Follower, Moment, curves_of, row_of
-from canprobe.bridge.view.meshes import UNKNOWN, heat, scale
+from canprobe.bridge.view.instants import NAMES, Answer, Follower, Moment, curves_of, row_of
+from canprobe.bridge.view.meshes import MAGMA, UNKNOWN, Array, scale
 from canprobe.bridge.view.path import OFF_PATH, GrowingPath, LoadedPath, Trail, error_scale
 from canprobe.bridge.view.recorded import RecordedRun
 from canprobe.bridge.view.stage import Panel, Stage, address, open_server
@@ -47,7 +48,6 @@ class LiveView:
         errors = error_scale(shape)
         self._stack = ExitStack()
         server = self._server = self._stack.enter_context(open_server(settings.view_port, settings.view_host))
-        self._address = address(server)
         self._stage = Stage(server, scene)
         self._panel = Panel(server, scene, errors)
         self._trail = Trail()
@@ -60,7 +60,7 @@ class LiveView:
     @property
     def where(self) -> str:
         """Its address."""
-        return self._address
+        return address(self._server)
 
     def start(self, epoch_ns: int) -> None:
         """Nothing to do: times are shown from the opening of the bus."""
@@ -68,9 +68,10 @@ class LiveView:
     def write(self, sample: Sample) -> None:
         """Take one sample; now and then show where the cell is."""
         moment = self._follower.take(sample)
-        if sample.contact is not None and moment.phase not in _OFF_PATH:
-            value = moment.error if self._follower.shape is not None else moment.sigma
-            self._trail.add(moment.t_s, sample.contact.point, sample.contact.normal, value)
+        contact = sample.touch.contact if sample.touch is not None else None
+        if contact is not None and moment.phase not in _OFF_PATH:
+            value = _colour_value(moment.answer, self._follower.shape is not None)
+            self._trail.add(moment.t_s, contact.point, contact.normal, value)
         if sample.cycle is not None and (not self._rows or moment.t_s >= self._rows[-1][0] + ROW_S):
             self._rows.append(row_of(moment))
         now_ns = self._clock.now_ns()
@@ -82,8 +83,7 @@ class LiveView:
         curves = None
         if now_ns - self._plot_ns >= PLOT_NS:
             self._plot_ns = now_ns
-            columns = np.array(self._rows, dtype=np.float64).reshape(-1, len(NAMES)).T
-            curves = Curves(dict(zip(NAMES, columns, strict=True)))
+            curves = curves_of(self._rows)
         with self._server.atomic():
             self._stage.show(moment)
             self._path.refresh()
@@ -95,9 +95,7 @@ class LiveView:
         self._stack.close()
 
 
-def open_sink(context: Context) -> LiveView:
-    """The bridge `view`."""
-    return LiveView(context)
+open_sink = LiveView
 
 
 # A recorded run in a browser, with a time slider, play and pause.
@@ -156,8 +154,8 @@ class Player:
             self._play = gui.add_checkbox("play", True)
             self._speed = gui.add_dropdown("speed", ("0.25", "0.5", "1", "2", "4"), initial_value="1")
         self._panel = Panel(server, run.scene, errors)
-        self._curves = curves_of(run.at(t) for t in run.times(max(FRAME_S, run.duration_s / MOST_POINTS)))
-        self._panel.show(run.at(start), self._curves)
+        times = run.times(max(FRAME_S, run.duration_s / MOST_POINTS))
+        self._panel.show(run.at(start), curves_of(row_of(run.at(t)) for t in times))
         self._shown = math.nan
 
     def step(self, dt_s: float) -> None:
@@ -182,6 +180,13 @@ def shape_of(run: RecordedRun) -> PlacedShape | None:
     return None if run.scene.object is None else true_object(run.scene.object)
 
 
+def _colour_value(answer: Answer | None, truth: bool) -> float:
+    """What colours the path, see `error_scale`."""
+    if answer is None:
+        return math.nan
+    return answer.error if truth else answer.sigma
+
+
 def trail_of(run: RecordedRun) -> Trail:
     """The path of a run's contact, coloured by the error of its estimates; by their deviation without a true object."""
     trail, log = Trail(), run.log
@@ -189,9 +194,9 @@ def trail_of(run: RecordedRun) -> Trail:
         return trail
     touched = np.isfinite(log["contact_mm"]).all(axis=1) & ~np.isin(log["phase"], OFF_PATH)
     rows = np.nonzero(touched)[0]
-    answers = np.searchsorted(run.answers, rows, side="right") - 1
-    known = run.sigmas if run.scene.object is None else run.errors
-    values = np.append(known, math.nan)[answers].tolist()  # the last for −1: before the first answer
+    latest = np.searchsorted(run.answer_rows, rows, side="right") - 1
+    answers = (*run.answers, None)  # the last for −1: before the first answer
+    values = [_colour_value(answers[at], run.scene.object is not None) for at in latest.tolist()]
     times, points = log["t_s"][rows].tolist(), log["contact_mm"][rows] * 1e-3
     for t_s, point, normal, value in zip(times, points, log["normal"][rows], values, strict=True):
         trail.add(t_s, point, normal, value)
@@ -218,16 +223,15 @@ def write_page(run: RecordedRun, file: Path) -> None:
         ResultsError: the file cannot be written.
     """
     times = run.times(max(FRAME_S, run.duration_s / MOST_FRAMES))
-    page = _record(run, times)
-    head, middle, tail = page.partition("</head>")
+    head, middle, tail = _record(run, times).partition("</head>")
     panel = files(__package__).joinpath("panel.html").read_text(encoding="utf-8")
     data = json.dumps(_panel_data(run, times), allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
-    title = _escaped(f"canprobe: {run.title}")
+    title = html.escape(f"canprobe: {run.title}", quote=False)
     head = head.replace("<title>Viser</title>", f"<title>{title}</title>")
     write_text(file, f"{head}{panel.replace('/*DATA*/null', data)}{middle}{tail}")
 
 
-def _record(run: RecordedRun, times: Any) -> str:
+def _record(run: RecordedRun, times: Array) -> str:
     """Viser's page with every frame in it."""
     with open_server(0) as server:
         stage = Stage(server, run.scene)
@@ -243,10 +247,10 @@ def _record(run: RecordedRun, times: Any) -> str:
         return str(recorder.as_html())
 
 
-def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
+def _panel_data(run: RecordedRun, times: Array) -> dict[str, Any]:
     """What the panel plots: columns, taxel images, colours; None for what is not finite."""
     moments = [run.at(t) for t in times.tolist()]
-    curves = curves_of(moments)
+    curves = curves_of(map(row_of, moments))
     shape = shape_of(run)
     errors = error_scale(shape)
     task = run.scene.task
@@ -264,14 +268,10 @@ def _panel_data(run: RecordedRun, times: Any) -> dict[str, Any]:
         "sensor": run.scene.sensor is not None,
         "taxels": base64.b64encode(taxels).decode("ascii"),
         "scale": {"high": errors.high, "text": errors.text, "colours": scale(np.linspace(0, 1, 64), 0, 1).tolist()},
-        "heat": heat(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0)).tolist(),
+        "heat": scale(np.sqrt(np.arange(256.0)), 0.0, math.sqrt(255.0), MAGMA).tolist(),
         "unknown": list(UNKNOWN),
     }
 
 
 def _short(x: float) -> float | None:
     return float(f"{x:.5g}") if math.isfinite(x) else None
-
-
-def _escaped(text: str) -> str:
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")

@@ -13,10 +13,27 @@ from canprobe.bridge.sample import ContactFrame, Sample, SurfacePatch
 from canprobe.bridge.view.meshes import Array
 from canprobe.touch.shapes import PlacedShape
 
-# What is shown of one instant, and how it comes from samples, live or recorded.
-
 SILENT_NS = 250_000_000
-"""A tactile frame, and the contact that was felt in it, is shown no longer than this after it came."""
+"""A contact is shown no longer than this after the tactile frame that showed it."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Answer:
+    """An answer of the estimator, compared with the truth.
+
+    Attributes:
+        patch: the answer.
+        error: ‖K − K_true‖ (Frobenius, 1/m) at its contact point; NaN without a true object, or where not all curvature
+            was observed.
+        kappa_true: principal curvatures of the true object there, 1/m, larger first; NaN without a true object.
+        sigma: root of the expected squared error of K as the estimator states it, 1/m; infinite where a part of it was
+            not observed.
+    """
+
+    patch: SurfacePatch
+    error: float
+    kappa_true: tuple[float, float]
+    sigma: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,14 +45,9 @@ class Moment:
         phase: of the task.
         q: (6,) joint angles, rad; None without an arm.
         contact: where the probe touches; None without contact.
-        patch: the newest answer of the estimator.
+        answer: the newest one of the estimator; None before the first.
         taxels: (16, 16) counts of the newest frame; None before the first.
         force: N, of the newest frame; NaN before the first.
-        error: of the patch, 1/m; NaN where there is no truth or no whole answer.
-        kappa_true: principal curvatures of the true object at the patch's contact point, 1/m, larger first; NaN
-            without either.
-        sigma: stated standard deviation of the patch's curvature, as a Frobenius norm, 1/m; infinite where a part of
-            it was not observed, NaN before the first.
         dropped: samples lost on the way so far.
     """
 
@@ -43,36 +55,27 @@ class Moment:
     phase: str | None = None
     q: Array | None = None
     contact: ContactFrame | None = None
-    patch: SurfacePatch | None = None
+    answer: Answer | None = None
     taxels: NDArray[np.uint8] | None = None
     force: float = math.nan
-    error: float = math.nan
-    kappa_true: tuple[float, float] = (math.nan, math.nan)
-    sigma: float = math.nan
     dropped: int = 0
 
 
-def curvature_error(patch: SurfacePatch, shape: PlacedShape) -> float:
-    """‖K − K_true‖ (Frobenius, 1/m) at the patch's contact point; NaN where not all curvature was observed."""
-    if not all(patch.observed) or not np.isfinite(patch.K).all():
-        return math.nan
-    true = shape.closest(patch.T_base_contact[:3, 3])
-    axes = patch.T_base_contact[:3, :2]
-    tensor = (true.directions.T * true.kappa) @ true.directions
-    return float(np.linalg.norm(patch.K - axes.T @ tensor @ axes))
-
-
-def true_kappa(patch: SurfacePatch, shape: PlacedShape) -> tuple[float, float]:
-    """Principal curvatures of the true object at the patch's contact point, 1/m, larger first."""
-    first, second = shape.closest(patch.T_base_contact[:3, 3]).kappa.tolist()
-    return first, second
-
-
-def curvature_sigma(patch: SurfacePatch) -> float:
-    """Root of the expected squared Frobenius error of K, as the estimator states it, 1/m."""
+def judge(patch: SurfacePatch, shape: PlacedShape | None) -> Answer:
+    """An answer beside the true object; None where that is not known."""
     C = patch.covariance
     variance = float(C[0, 0] + 2.0 * C[1, 1] + C[2, 2])
-    return math.sqrt(max(variance, 0.0)) if math.isfinite(variance) else math.inf
+    sigma = math.sqrt(max(variance, 0.0)) if math.isfinite(variance) else math.inf
+    if shape is None:
+        return Answer(patch, math.nan, (math.nan, math.nan), sigma)
+    true = shape.closest(patch.T_base_contact[:3, 3])
+    error = math.nan
+    if all(patch.observed) and np.isfinite(patch.K).all():
+        axes = patch.T_base_contact[:3, :2]
+        tensor = (true.directions.T * true.kappa) @ true.directions
+        error = float(np.linalg.norm(patch.K - axes.T @ tensor @ axes))
+    first, second = true.kappa.tolist()
+    return Answer(patch, error, (first, second), sigma)
 
 
 class Follower:
@@ -90,22 +93,16 @@ class Follower:
     def take(self, sample: Sample) -> Moment:
         """The moment with what was new in a sample."""
         now = replace(self.moment, t_s=sample.t_ns * 1e-9, phase=sample.phase, dropped=sample.dropped)
-        if sample.joints is not None:
-            now = replace(now, q=sample.joints.position)
-        if sample.taxels is not None:
+        if sample.q is not None:
+            now = replace(now, q=sample.q)
+        if (touch := sample.touch) is not None:
             self._felt_ns = sample.t_ns
-            force = 0.0 if sample.wrench is None else float(np.linalg.norm(sample.wrench.force))
-            now = replace(now, taxels=sample.taxels.counts, force=force, contact=sample.contact)
-        elif sample.wrench is not None:  # features only
-            self._felt_ns = sample.t_ns
-            now = replace(now, force=float(np.linalg.norm(sample.wrench.force)), contact=sample.contact)
+            taxels = now.taxels if touch.counts is None else touch.counts
+            now = replace(now, taxels=taxels, force=float(np.linalg.norm(touch.force)), contact=touch.contact)
         elif sample.t_ns - self._felt_ns > SILENT_NS:
             now = replace(now, contact=None)
         if sample.patch is not None:
-            now = replace(now, patch=sample.patch, sigma=curvature_sigma(sample.patch))
-            if self.shape is not None:
-                error, kappa = curvature_error(sample.patch, self.shape), true_kappa(sample.patch, self.shape)
-                now = replace(now, error=error, kappa_true=kappa)
+            now = replace(now, answer=judge(sample.patch, self.shape))
         self.moment = now
         return now
 
@@ -115,18 +112,8 @@ class Follower:
 NAMES = ("t_s", "force", "kappa1", "low1", "high1", "kappa2", "low2", "high2", "true1", "true2", "error", "sigma")
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Curves:
-    """Columns of one length; NaN where there is nothing to plot.
-
-    Attributes:
-        columns: by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands.
-    """
-
-    columns: dict[str, Array]
-
-    def __getitem__(self, name: str) -> Array:
-        return self.columns[name]
+Curves = dict[str, Array]
+"""Columns by the names of `NAMES`; s, N, 1/m; low and high are the ends of the 95 % bands; NaN: nothing to plot."""
 
 
 def kappa_sigmas(patch: SurfacePatch) -> tuple[float, float]:
@@ -143,21 +130,20 @@ def kappa_sigmas(patch: SurfacePatch) -> tuple[float, float]:
 
 def row_of(moment: Moment) -> tuple[float, ...]:
     """One row of the plots, in the order of `NAMES`."""
-    nan = math.nan
-    if moment.patch is None:
-        bands: tuple[float, ...] = (nan,) * 6
-    else:
-        kappa, sigmas = moment.patch.kappa, kappa_sigmas(moment.patch)
-        bands = tuple(
-            x
-            for k, s in zip(kappa, sigmas, strict=True)
-            for x in ((k, k - 1.96 * s, k + 1.96 * s) if math.isfinite(s) else (k, nan, nan))
-        )
-    sigma = moment.sigma if math.isfinite(moment.sigma) else nan
-    return (moment.t_s, moment.force, *bands, *moment.kappa_true, moment.error, sigma)
+    nan, answer = math.nan, moment.answer
+    if answer is None:
+        return (moment.t_s, moment.force, *(nan,) * (len(NAMES) - 2))
+    kappa, sigmas = answer.patch.kappa, kappa_sigmas(answer.patch)
+    bands = (
+        x
+        for k, s in zip(kappa, sigmas, strict=True)
+        for x in ((k, k - 1.96 * s, k + 1.96 * s) if math.isfinite(s) else (k, nan, nan))
+    )
+    sigma = answer.sigma if math.isfinite(answer.sigma) else nan
+    return (moment.t_s, moment.force, *bands, *answer.kappa_true, answer.error, sigma)
 
 
-def curves_of(moments: Iterable[Moment]) -> Curves:
-    """Columns of a run's moments."""
-    rows = np.array([row_of(moment) for moment in moments], dtype=np.float64).reshape(-1, len(NAMES))
-    return Curves(dict(zip(NAMES, rows.T, strict=True)))
+def curves_of(rows: Iterable[tuple[float, ...]]) -> Curves:
+    """Columns of rows from `row_of`."""
+    columns = np.array(list(rows), dtype=np.float64).reshape(-1, len(NAMES)).T
+    return dict(zip(NAMES, columns, strict=True))

@@ -8,12 +8,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
-# Triangle meshes as plain arrays: prisms with rounded rims, solids of revolution, grids.
 
 Array = NDArray[np.float64]
 Faces = NDArray[np.int64]
@@ -39,23 +37,13 @@ class Mesh:
         """The mesh carried by a transform (4, 4)."""
         return Mesh(self.vertices @ T[:3, :3].T + T[:3, 3], self.faces)
 
-    @property
-    def volume(self) -> float:
-        """Enclosed volume of a closed mesh, m³; negative where it is inside out."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
-        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
-
 
 def merged(meshes: Iterable[Mesh]) -> Mesh:
     """Several meshes as one."""
-    vertices: list[Array] = []
-    faces: list[Faces] = []
-    count = 0
-    for mesh in meshes:
-        vertices.append(mesh.vertices)
-        faces.append(mesh.faces + count)
-        count += len(mesh.vertices)
-    return Mesh(np.concatenate(vertices), np.concatenate(faces))
+    parts = list(meshes)
+    starts = accumulate((len(mesh.vertices) for mesh in parts), initial=0)
+    faces = [mesh.faces + start for mesh, start in zip(parts, starts, strict=False)]
+    return Mesh(np.concatenate([mesh.vertices for mesh in parts]), np.concatenate(faces))
 
 
 def grid(points: ArrayLike) -> Mesh:
@@ -72,12 +60,8 @@ def grid(points: ArrayLike) -> Mesh:
     return Mesh(p.reshape(-1, 3), faces)
 
 
-def prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
-    """A closed body along z from outlines at rising heights: walls between them, flat ends.
-
-    Args:
-        rings: (outline (n, 2) m, counter-clockwise and convex; height m), all of one n, with increasing height.
-    """
+def _prism(rings: Iterable[tuple[Array, float]]) -> Mesh:
+    """A closed body along z: walls between rising (outline (n, 2), counter-clockwise and convex; height), flat ends."""
     outlines = [np.column_stack([outline, np.full(len(outline), z)]) for outline, z in rings]
     closed = [np.vstack([ring, ring[:1]]) for ring in outlines]
     # a wall seen from outside: round the outline first, then up
@@ -129,13 +113,12 @@ def link(first: Circle, second: Circle, span: tuple[float, float], rim: float = 
     """
     (a, r0), (b, r1) = first, second
     low, high = span
-    steps = [0.0] if rim <= 0.0 else [math.radians(angle) for angle in (0.0, 22.5, 45.0, 67.5, 90.0)]
-    inset = [rim * (1.0 - math.sin(angle)) for angle in steps] if rim > 0.0 else [0.0]
-    rise = [rim * (1.0 - math.cos(angle)) for angle in steps]
-    outlines = [link_outline((a, r0 - i), (b, r1 - i)) for i in inset]
-    below = [(outline, low + z) for outline, z in zip(outlines, rise, strict=True)]
-    above = [(outline, high - z) for outline, z in zip(outlines, rise, strict=True)][::-1]
-    return prism([*below, *above])
+    steps = (0.0, 22.5, 45.0, 67.5, 90.0) if rim > 0.0 else (90.0,)
+    rings = []  # outline, and how far it lies inside the flat side
+    for angle in map(math.radians, steps):
+        inset = rim * (1.0 - math.sin(angle))
+        rings.append((link_outline((a, r0 - inset), (b, r1 - inset)), rim * (1.0 - math.cos(angle))))
+    return _prism([*((ring, low + z) for ring, z in rings), *((ring, high - z) for ring, z in reversed(rings))])
 
 
 def cylinder(radius: float, span: tuple[float, float], rim: float = 0.0) -> Mesh:
@@ -156,55 +139,46 @@ def revolved(profile: ArrayLike, sectors: int = SECTORS) -> Mesh:
     return grid(np.stack([x, y, np.broadcast_to(p[:, 1], x.shape)], axis=-1))
 
 
-def dome(radius: float, opening_rad: float, rings: int = 24, sectors: int = SECTORS) -> Mesh:
+def dome(radius: float, opening_rad: float, rings: int = 24) -> Mesh:
     """The part of a sphere round its pole (+z), centre at the origin.
 
     Args:
         radius: m.
         opening_rad: angle from the pole to the rim; π for the whole sphere.
         rings: from the rim to the pole.
-        sectors: round the pole.
     """
     angle = np.linspace(opening_rad, 0.0, rings + 1)
-    return revolved(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]), sectors)
+    return revolved(np.column_stack([radius * np.sin(angle), radius * np.cos(angle)]))
 
 
 # Colours of numbers: a scale that is even to the eye, dark blue to yellow.
 
 Colours = NDArray[np.uint8]
 
-_STOPS = np.array(
+VIRIDIS = np.array(
     (
         (68, 1, 84), (71, 44, 122), (59, 81, 139), (44, 113, 142), (33, 144, 141),
         (39, 173, 129), (92, 200, 99), (170, 220, 50), (253, 231, 37),
     ),
     dtype=np.float64,
 )  # fmt: skip
-"""Viridis at ninths. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
-_HEAT = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)), dtype=np.float64)
-"""Magma at quarters, of the same source."""
+"""At ninths. Source: Smith and van der Walt, matplotlib 2.0, CC0."""
+MAGMA = np.array(((0, 0, 4), (81, 18, 124), (183, 55, 121), (252, 137, 97), (252, 253, 191)), dtype=np.float64)
+"""At quarters, of the same source."""
 UNKNOWN = (138, 148, 160)
 
 
-def scale(values: ArrayLike, low: float, high: float) -> Colours:
+def scale(values: ArrayLike, low: float, high: float, stops: Array = VIRIDIS) -> Colours:
     """Colours of values between two ends, those beyond take the end's; what is not finite is grey.
 
     Args:
         values: (...,) any unit.
         low, high: in the same unit, low < high.
+        stops: `VIRIDIS`, dark blue to yellow, or `MAGMA`, black to light yellow.
 
     Returns:
         (..., 3) RGB, 0–255.
     """
-    return _between(values, low, high, _STOPS)
-
-
-def heat(values: ArrayLike, low: float, high: float) -> Colours:
-    """As :func:`scale`, black to light yellow, for taxel images."""
-    return _between(values, low, high, _HEAT)
-
-
-def _between(values: ArrayLike, low: float, high: float, stops: NDArray[np.float64]) -> Colours:
     x = np.asarray(values, dtype=np.float64)
     known = np.isfinite(x)
     place = np.clip((np.where(known, x, low) - low) / (high - low), 0.0, 1.0) * (len(stops) - 1)

@@ -22,7 +22,7 @@ LIFT_M = 1e-3
 GAP_M = 8e-3
 """Two contacts farther apart are not joined: the probe was lifted between them."""
 OFF_PATH = (Phase.APPROACH, Phase.RETREAT, Phase.DONE)
-"""Phases in which what the array still feels, or feels first, is no point of the path."""
+"""Phases whose contacts are not points of the path."""
 SHARE, LEAST_PER_M, UNCERTAIN_PER_M = 0.05, 0.5, 2.0
 
 
@@ -39,7 +39,7 @@ class ErrorScale:
     text: str
 
     def colours(self, values: Array) -> Colours:
-        """(n, 3) colours of values (n,), 1/m; grey where there is none."""
+        """(n, 3) colours of values (n,), 1/m; grey where a value is not finite."""
         return scale(values, 0.0, self.high)
 
 
@@ -56,14 +56,9 @@ def error_scale(shape: PlacedShape | None) -> ErrorScale:
 
 
 class Trail:
-    """Collects contacts into segments.
+    """Collects contacts into segments."""
 
-    Args:
-        spacing_m: see `SPACING_M`.
-    """
-
-    def __init__(self, spacing_m: float = SPACING_M) -> None:
-        self._spacing = spacing_m
+    def __init__(self) -> None:
         self._last: Array | None = None
         self.segments: list[Array] = []
         self.values: list[float] = []
@@ -86,7 +81,7 @@ class Trail:
             self._last = lifted
             return False
         step = float(np.linalg.norm(lifted - self._last))
-        if step < self._spacing:
+        if step < SPACING_M:
             return False
         joined = step < GAP_M
         if joined:
@@ -156,8 +151,7 @@ class GrowingPath:
 
     def __init__(self, api: Any, trail: Trail, scale: ErrorScale) -> None:
         self._api, self._trail, self._scale = api, trail, scale
-        self._done = 0
-        self._sent = 0
+        self._done = self._sent = 0
 
     def refresh(self) -> None:
         """Send what has come since."""

@@ -6,6 +6,7 @@ import json
 import math
 import zipfile
 from bisect import bisect_right
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
-from canprobe.bridge.view.instants import Moment, curvature_error, curvature_sigma, true_kappa
+from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
 from canprobe.bus.disk import read_candump
-from canprobe.cell.assembly import make_tactile
+from canprobe.cell.array import make_tactile
 from canprobe.errors import UsageError
 from canprobe.planning.make import make_plan
 from canprobe.results.summary import SCHEMA, check_clock
@@ -26,39 +27,6 @@ from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.tasks.probing import Phase
 from canprobe.touch.linear_algebra import tangent_rotation
-
-# The tactile images of a recorded bus, without the rest of the cell.
-
-TaxelFrames = tuple[tuple[float, NDArray[np.uint8]], ...]
-
-
-def read_taxels(file: Path, scene: Scene) -> TaxelFrames:
-    """Tactile frames with the time of their arrival, on the clock of the log.
-
-    Args:
-        file: a candump log; nothing comes from one that does not exist.
-        scene: with a sensor.
-
-    Returns:
-        (t_s, (16, 16) uint8 counts) by rising time; empty in features mode.
-
-    Raises:
-        UsageError: a line that is not candump's.
-    """
-    assert scene.sensor is not None
-    if scene.sensor.mode == "features" or not file.is_file():
-        return ()
-    receiver = make_tactile(make_plan(resolve(scene)))
-    assert receiver is not None
-    frames = []
-    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
-        frame = receiver.assembler.push(can_id, data, t_ns)
-        if frame is not None:
-            frames.append((t_ns * 1e-9, frame.taxels))
-    return tuple(frames)
-
-
-# A folder that `canprobe run` wrote → what there is to show, instant by instant.
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),
@@ -73,7 +41,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "K_covariance_per_m2": (3, 3),
 }
 """Columns of ``log.npz`` that are shown, and the shape of a row."""
-_UNKNOWN = (math.nan, math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -82,23 +49,22 @@ class RecordedRun:
 
     Attributes:
         scene: as resolved.
-        title: of the scene.
         log: the columns of `_SHAPES` that the run has; every row one cycle.
-        answers: rows at which the estimator gave a new answer.
-        patches: the answers.
-        errors, sigmas, true: of each answer, 1/m, as in `Moment`; `true` (n, 2).
-        taxels: (t_s, (16, 16) counts) of each tactile frame.
+        answer_rows: rows at which the estimator gave a new answer.
+        answers: at each of them.
+        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time on the clock of the log.
     """
 
     scene: Scene
-    title: str
     log: dict[str, Array]
-    answers: NDArray[np.int64]
-    patches: tuple[SurfacePatch, ...]
-    errors: Array
-    sigmas: Array
-    true: Array
+    answer_rows: NDArray[np.int64]
+    answers: tuple[Answer, ...]
     taxels: tuple[tuple[float, NDArray[np.uint8]], ...]
+
+    @property
+    def title(self) -> str:
+        """Of the scene."""
+        return self.scene.title or self.scene.name
 
     @property
     def duration_s(self) -> float:
@@ -114,19 +80,16 @@ class RecordedRun:
         """What the cell knew at an instant."""
         log = self.log
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
-        answer = int(np.searchsorted(self.answers, row, side="right")) - 1
+        answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
         frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
         return Moment(
             t_s=float(log["t_s"][row]),
             phase=self._phase(row),
             q=log["q_rad"][row] if "q_rad" in log and np.isfinite(log["q_rad"][row]).all() else None,
             contact=self._contact(row),
-            patch=self.patches[answer] if answer >= 0 else None,
+            answer=self.answers[answer] if answer >= 0 else None,
             taxels=self.taxels[frame][1] if frame >= 0 else None,
             force=float(log["force_n"][row]) if "force_n" in log else math.nan,
-            error=float(self.errors[answer]) if answer >= 0 else math.nan,
-            kappa_true=(float(self.true[answer, 0]), float(self.true[answer, 1])) if answer >= 0 else _UNKNOWN,
-            sigma=float(self.sigmas[answer]) if answer >= 0 else math.nan,
         )
 
     def _phase(self, row: int) -> str | None:
@@ -139,8 +102,7 @@ class RecordedRun:
         T = np.eye(4)
         T[:3, :3] = tangent_rotation(-self.log["normal"][row])
         T[:3, 3] = self.log["contact_mm"][row] * 1e-3
-        t_ns = round(float(self.log["t_s"][row]) * 1e9)
-        return ContactFrame(t_ns, T, float(self.log["force_n"][row]))
+        return ContactFrame(T)
 
 
 def read_run(folder: Path) -> RecordedRun:
@@ -162,15 +124,27 @@ def read_run(folder: Path) -> RecordedRun:
     _check_schema(folder / "summary.json")
     scene = load_scene(folder / "scene.toml")
     log = _read_log(folder / "log.npz")
-    answers, patches = _answers(log)
+    rows = _new_answers(log)
     shape = None if scene.object is None else true_object(scene.object)
-    errors = [math.nan if shape is None else curvature_error(patch, shape) for patch in patches]
-    true = [_UNKNOWN if shape is None else true_kappa(patch, shape) for patch in patches]
-    taxels = read_taxels(folder / "bus.log", scene) if scene.sensor is not None else ()
     return RecordedRun(
-        scene, scene.title or scene.name, log, answers, patches, np.array(errors),
-        np.array([curvature_sigma(patch) for patch in patches]), np.array(true).reshape(-1, 2), taxels,
-    )  # fmt: skip
+        scene=scene,
+        log=log,
+        answer_rows=rows,
+        answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
+        taxels=tuple(_read_taxels(folder / "bus.log", scene)),
+    )
+
+
+def _read_taxels(file: Path, scene: Scene) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """The tactile frames of a candump log; none where there is no log, or in features mode."""
+    if scene.sensor is None or scene.sensor.mode == "features" or not file.is_file():
+        return
+    receiver = make_tactile(make_plan(resolve(scene)))
+    assert receiver is not None
+    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
+        frame = receiver.assembler.push(can_id, data, t_ns)
+        if frame is not None:
+            yield t_ns * 1e-9, frame.taxels
 
 
 def _check_schema(file: Path) -> None:
@@ -207,15 +181,14 @@ def _read_log(file: Path) -> dict[str, Array]:
     return log
 
 
-def _answers(log: dict[str, Array]) -> tuple[NDArray[np.int64], tuple[SurfacePatch, ...]]:
-    """Rows at which the estimate changed, and the estimates; the log repeats each until the next."""
+def _new_answers(log: dict[str, Array]) -> NDArray[np.int64]:
+    """Rows at which the estimate changed; the log repeats each until the next."""
     if "K_per_m" not in log or "T_base_contact_m" not in log:
-        return np.empty(0, np.int64), ()
+        return np.empty(0, np.int64)
     key = np.concatenate([log[name].reshape(len(log["t_s"]), -1) for name in ("T_base_contact_m", "K_per_m")], axis=1)
     known = np.isfinite(log["T_base_contact_m"]).all(axis=(1, 2))
     new = np.append(True, (key[1:] != key[:-1]).any(axis=1)) & known
-    rows = np.nonzero(new)[0]
-    return rows, tuple(_patch(log, int(row)) for row in rows)
+    return np.nonzero(new)[0]
 
 
 def _patch(log: dict[str, Array], row: int) -> SurfacePatch:

@@ -5,6 +5,7 @@ them.
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import math
 from collections.abc import Iterator
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.bridge.database import need
 from canprobe.bridge.sample import quaternion_of
 from canprobe.bridge.view.bodies import (
     arm_parts,
@@ -31,10 +33,11 @@ from canprobe.bridge.view.bodies import (
 from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
 from canprobe.bridge.view.path import ErrorScale
-from canprobe.errors import InterfaceError, UsageError
-from canprobe.robot.kinematics import MODELS
+from canprobe.errors import InterfaceError
+from canprobe.robot.kinematics import MODELS, PumaModel
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
+from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
 
@@ -62,7 +65,7 @@ class Stage:
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
         self._light()
         if self._shape is not None:
-            self._add_object()
+            self._add_object(self._shape)
         if self._model is not None:
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
             for part in arm_parts(self._model):
@@ -95,11 +98,10 @@ class Stage:
             section_color=(200, 206, 212), plane_color=(247, 248, 250), plane_opacity=1.0, shadow_opacity=0.25,
         )  # fmt: skip
 
-    def _add_object(self) -> None:
-        assert self._shape is not None
-        self._add("/object/ghost", object_mesh(self._shape), OBJECT, opacity=0.45, side="double", cast_shadow=False)
+    def _add_object(self, shape: PlacedShape) -> None:
+        self._add("/object/ghost", object_mesh(shape), OBJECT, opacity=0.45, side="double", cast_shadow=False)
         self._api.add_line_segments(
-            "/object/lines", object_lines(self._shape).astype(np.float32), (96, 116, 140), thickness=1.0,
+            "/object/lines", object_lines(shape).astype(np.float32), (96, 116, 140), thickness=1.0,
             thickness_units="screen",
         )  # fmt: skip
 
@@ -157,7 +159,7 @@ class Stage:
     def show(self, moment: Moment) -> None:
         """Move everything to a moment."""
         if moment.q is not None and self._model is not None:
-            self._move_arm(moment.q)
+            self._move_arm(self._model, moment.q)
         if moment.taxels is not None and self._taxels is not None:
             counts = moment.taxels.reshape(-1)
             self._taxels.batched_colors = linear_light(taxel_colours(counts))
@@ -165,9 +167,8 @@ class Stage:
         self._show_contact(moment)
         self._show_patch(moment)
 
-    def _move_arm(self, q: Array) -> None:
-        assert self._model is not None
-        frames = link_frames(self._model, q)
+    def _move_arm(self, model: PumaModel, q: Array) -> None:
+        frames = link_frames(model, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
@@ -186,21 +187,19 @@ class Stage:
         self._label.text = f"{moment.force:.2f} N"
 
     def _show_patch(self, moment: Moment) -> None:
-        patch = moment.patch
+        patch = moment.answer.patch if moment.answer is not None else None
         self._patch.visible = patch is not None
         if patch is None or patch is self._drawn_patch:
             return
         self._drawn_patch = patch
-        shape = patch_shape(patch, self._xy)
         _place(self._patch, patch.T_base_contact)
-        self._disc.vertices = shape.surface.astype(np.float32)
         self._disc.color = PATCH if all(patch.observed) else UNKNOWN
-        for handle, vertices in zip(self._shells, (shape.above, shape.below), strict=True):
+        for handle, vertices in zip((self._disc, *self._shells), patch_shape(patch, self._xy), strict=True):
             handle.vertices = vertices.astype(np.float32)
 
 
 def _opacities(counts: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Taxels that feel nothing are hardly there."""
+    """Taxels without pressure are almost transparent."""
     return np.where(counts > 0, 0.85, 0.04).astype(np.float32)
 
 
@@ -212,27 +211,23 @@ def _place(handle: Any, T: Array) -> None:
 
 # A viser server that says nothing on stdout and leaves nothing behind.
 
-PIP = "pip install 'canprobe[view]'"
-DEFAULT_PORT = 8080
-
 
 @contextlib.contextmanager
-def open_server(port: int, host: str = "127.0.0.1", title: str = "canprobe") -> Iterator[Any]:
+def open_server(port: int, host: str = "127.0.0.1") -> Iterator[Any]:
     """A server for browsers, stopped on leaving.
 
     Args:
         port: 0 lets the system choose; where it is taken, the next free one.
         host: 0.0.0.0 for other machines too.
-        title: above the panel.
 
     Raises:
         UsageError: viser is not installed.
         InterfaceError: no port can be had.
     """
-    viser = import_viser()
+    viser = need("viser", "view", "the view")
     with contextlib.redirect_stdout(io.StringIO()):  # viser greets and leaves with a box on stdout
         try:
-            server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
+            server = viser.ViserServer(host=host, port=port, label="canprobe", verbose=False)
         except OSError as error:
             raise InterfaceError(f"{host}:{port}: no port to show the cell on: {error.strerror or error}") from error
     try:
@@ -240,15 +235,6 @@ def open_server(port: int, host: str = "127.0.0.1", title: str = "canprobe") -> 
     finally:
         with contextlib.redirect_stdout(io.StringIO()):
             server.stop()
-
-
-def import_viser() -> Any:
-    """The package, or a `UsageError` with the line that installs it."""
-    try:
-        import viser
-    except ImportError as error:
-        raise UsageError(f"the view needs viser: {PIP}") from error
-    return viser
 
 
 def address(server: Any) -> str:
@@ -296,7 +282,7 @@ class Panel:
             self._add_plot(gui, "error of K; grey: stated deviation (1/m)", ("error", "sigma"), (INK, FAINT))
 
     def _add_plot(self, gui: Any, title: str, names: tuple[str, ...], colours: tuple[str, ...]) -> None:
-        uplot = import_viser().uplot
+        uplot = importlib.import_module("viser").uplot
         series = [uplot.Series(label="t (s)")]
         for name, colour in zip(names, colours, strict=True):
             thin = name.startswith(("low", "high", "true")) or name in ("target", "sigma")
@@ -331,20 +317,20 @@ class Panel:
             rows.append(("phase", moment.phase))
         if math.isfinite(moment.force):
             rows.append(("force", f"{moment.force:.2f} N"))
-        if moment.patch is not None:
-            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in moment.patch.kappa)
+        if (answer := moment.answer) is not None:
+            kappa = ", ".join("not observed" if math.isnan(k) else f"{k:.2f}" for k in answer.patch.kappa)
             rows.append(("κ", f"{kappa} 1/m"))
-            if math.isfinite(moment.kappa_true[0]):
-                rows.append(("κ true", f"{moment.kappa_true[0]:.2f}, {moment.kappa_true[1]:.2f} 1/m"))
-            rows.append(("error of K", "–" if math.isnan(moment.error) else f"{moment.error:.2f} 1/m"))
+            if math.isfinite(answer.kappa_true[0]):
+                rows.append(("κ true", f"{answer.kappa_true[0]:.2f}, {answer.kappa_true[1]:.2f} 1/m"))
+            rows.append(("error of K", "–" if math.isnan(answer.error) else f"{answer.error:.2f} 1/m"))
         if moment.dropped:
             rows.append(("samples dropped", str(moment.dropped)))
         return "| | |\n|:--|:--|\n" + "\n".join(f"| {name} | **{text}** |" for name, text in rows)
 
 
 def _scales(times: Any, columns: list[Any]) -> dict[str, Any]:
-    """Fixed ends of the axes: uPlot finds none of its own where a value is missing (NaN)."""
-    scale_of = import_viser().uplot.Scale
+    """Fixed ends of the axes: uPlot cannot find them where a value is missing (NaN)."""
+    scale_of = importlib.import_module("viser").uplot.Scale
     values = np.concatenate([column[np.isfinite(column)] for column in columns]) if columns else np.empty(0)
     low, high = np.percentile(values, (1.0, 99.0)).tolist() if len(values) else (0.0, 1.0)
     low = min(low, 0.0)

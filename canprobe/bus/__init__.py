@@ -1,4 +1,4 @@
-"""Where canprobe touches the world: clocks, CAN ports, canopen's network over them, and files.
+"""Where canprobe touches the world: clocks, CAN ports, requests and answers over them, and files.
 
 Everything above knows two small interfaces, both in `port`: a `Clock` (now, sleep until) and a `Port` (`send_batch`,
 `drain`, counters, the controller's state). Behind them:
@@ -8,7 +8,7 @@ Everything above knows two small interfaces, both in `port`: a `Clock` (now, sle
     socketcan, mmsg, link          a raw socket, a burst of frames a system call; how the link is set
     interfaces                     any interface of python-can
 
-`network` and `sdo_client` give canopen a bus without threads: whoever waits pumps the port, in the port's own time.
+`network` asks and waits for answers without threads (SDO, LSS): whoever waits pumps the port, in the port's own time.
 `scheduling` asks the machine for real time and keeps interrupts between two cycles. `disk` writes files whole or not
 at all, and reads and writes logs.
 

@@ -1,4 +1,4 @@
-"""The CAN controllers on one timed bus: who has to wait, who is cut off, and when he comes back."""
+"""The CAN controllers on one timed bus: which have to wait, which are bus off, and when they come back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from canprobe.bus.lockstep import BusNode, LockstepPort
 from canprobe.bus.port import ControllerState
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, SUSPEND_BITS
 
-# Error counters of one CAN controller: error active, error passive, bus off, and the way back.
+# Error counters of one controller: error active, error passive, bus off, and the way back.
 #
 # Source: ISO 11898-1:2015, fault confinement: rules for the transmit and the receive error counter.
 
@@ -50,8 +50,8 @@ class ErrorCounters:
         """It sent an error flag as the transmitter.
 
         Args:
-            acknowledge: for want of an acknowledgement, and nobody answered its flag; error passive it then does not
-                count, so that a node alone on its bus never goes bus off.
+            acknowledge: the acknowledgement was missing and no other node sent an error flag. An error-passive node
+                does not count that, so that a node alone on its bus never goes bus off.
         """
         if acknowledge and self.state is ControllerState.PASSIVE:
             return
@@ -66,18 +66,18 @@ class ErrorCounters:
             self.receive += 1
 
     def transmitted(self) -> None:
-        """A frame of its own went through."""
+        """It sent a frame without an error."""
         self.transmit = max(0, self.transmit - 1)
 
     def received(self) -> None:
-        """A frame of another went through."""
+        """It received a frame without an error."""
         if self.receive >= PASSIVE_FROM:
             self.receive = PASSIVE_FROM - 1  # the standard leaves 119 to 127
         elif self.receive:
             self.receive -= 1
 
     def heard_recessive(self, sequences: int) -> bool:
-        """It heard so many sequences of eleven recessive bits; whether it is now back, with both counters at 0."""
+        """It heard so many sequences of eleven recessive bits; whether it is active again, with both counters at 0."""
         if not self.outstanding:
             return False
         self.outstanding = max(0, self.outstanding - sequences)
@@ -87,7 +87,7 @@ class ErrorCounters:
         return True
 
 
-# The CAN controllers on one timed bus: who has to wait, who is cut off, and when he comes back.
+# All controllers of a bus.
 
 _RECESSIVE_BITS = 11
 _AFTER_ACK_BITS = (
@@ -96,13 +96,13 @@ _AFTER_ACK_BITS = (
 
 
 class Controllers:
-    """Error counters of every node, and what follows from them. As long as no bit fails, nothing has to be asked.
+    """Error counters of every node, and what follows from them. They matter only once a bit has failed.
 
     Args:
         bits_ns: time of so many bits.
 
     Attributes:
-        troubled: somebody's counters are not 0.
+        troubled: a controller's counters are not 0.
         suspended: error-passive nodes that must not start before this time after a frame of their own.
     """
 
@@ -138,7 +138,7 @@ class Controllers:
         return self.troubled and bool(self._counters[node].outstanding)
 
     def off(self) -> list[BusNode]:
-        """Who is bus off."""
+        """The nodes that are bus off."""
         return [node for node, counters in self._counters.items() if counters.outstanding]
 
     def fail(self, sender: BusNode, end_ns: int) -> None:
@@ -153,10 +153,10 @@ class Controllers:
             if isinstance(node.owner, LockstepPort):
                 node.owner.counters.error_frames += 1
         self._suspend(sender, end_ns)
-        self._tell()
+        self._show_states()
 
     def succeed(self, sender: BusNode, end_ns: int) -> None:
-        """A frame has ended at `end_ns`; only of interest while somebody is troubled."""
+        """A frame has ended at `end_ns`; only of interest while a controller is troubled."""
         self._quiet_ns = end_ns - self._bits_ns(_AFTER_ACK_BITS)
         for node, counters in self._counters.items():
             if node is sender:
@@ -164,7 +164,7 @@ class Controllers:
             elif not counters.outstanding:
                 counters.received()
         self._suspend(sender, end_ns)
-        self._tell()
+        self._show_states()
         self.troubled = any(c.transmit or c.receive or c.outstanding for c in self._counters.values())
 
     def hear_silence(self, until_ns: int) -> None:
@@ -173,7 +173,7 @@ class Controllers:
         count = (until_ns - self._quiet_ns) // sequence
         self._quiet_ns += count * sequence
         if any([counters.heard_recessive(count) for counters in self._counters.values()]):
-            self._tell()
+            self._show_states()
 
     def next_return_ns(self) -> int | None:
         """When the next node that is bus off comes back, if the wire stays silent."""
@@ -187,7 +187,7 @@ class Controllers:
         else:
             self.suspended.pop(sender, None)
 
-    def _tell(self) -> None:
+    def _show_states(self) -> None:
         """Ports show the state of their controller."""
         for node, counters in self._counters.items():
             if isinstance(node.owner, LockstepPort):

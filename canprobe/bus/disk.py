@@ -1,4 +1,4 @@
-"""Files at the edge: whole or not there, columns as `.npz`, and logs of a bus as candump and as python-can's forms.
+"""Files at the edge: whole or not there, columns as `.npz`, and logs of a bus in candump's format.
 
 CAN FD frames, which here are those of more than 8 bytes, stand as `521##1<data>`: 1 is the bit rate switch.
 
@@ -10,19 +10,17 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import re
-import struct
 import zipfile
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from io import FileIO
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Protocol
+from typing import Any
 
-import can
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.port import ERR_BUS, ERR_FLAG, Clock, ControllerState, Port, PortCounters, TimedFrame
+from canprobe.bus.port import ControllerState, PlainPort, Port, TimedFrame
 from canprobe.errors import ResultsError, UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
 
@@ -133,32 +131,18 @@ class _ChannelLines:
         self._names: dict[int, str] = {}
 
     def line(self, can_id: int, data: bytes, t_ns: int) -> str:
-        """The same as `format_line`, counted from the log's first instant, in a fraction of its time."""
+        """The line of one frame, newline included; ns below the microsecond are cut off."""
         second, us = divmod((t_ns - self._t0_ns) // 1000, 1_000_000)
         if second != self._second:
-            self._second, self._prefix = second, _format_second(second)
+            self._second, self._prefix = second, f"({second:010d}."
         name = self._names.get(can_id)
         if name is None:
             name = self._names[can_id] = f") {self._channel} {_format_id(can_id)}#"
-        plain = len(data) <= CLASSIC_BYTES and not can_id & RTR_FLAG
-        payload = data.hex().upper() if plain else _format_payload(can_id, data)
+        if len(data) > CLASSIC_BYTES:
+            payload = f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
+        else:
+            payload = "R" if can_id & RTR_FLAG else data.hex().upper()
         return f"{self._prefix}{us:06d}{name}{payload}\n"
-
-
-def format_line(channel: str, can_id: int, data: bytes, t_ns: int) -> str:
-    """Return the line of one frame, newline included; ns below the microsecond are cut off."""
-    second, us = divmod(t_ns // 1000, 1_000_000)
-    return f"{_format_second(second)}{us:06d}) {channel} {_format_id(can_id)}#{_format_payload(can_id, data)}\n"
-
-
-def _format_second(second: int) -> str:
-    return f"({second:010d}."
-
-
-def _format_payload(can_id: int, data: bytes) -> str:
-    if len(data) > CLASSIC_BYTES:
-        return f"#{_BIT_RATE_SWITCH}{data.hex().upper()}"
-    return "R" if can_id & RTR_FLAG else data.hex().upper()
 
 
 def _format_id(can_id: int) -> str:
@@ -169,7 +153,7 @@ def _format_id(can_id: int) -> str:
 
 
 def _opened_alone(path: str | Path) -> FileIO:
-    """An empty file to write to, which nobody else can open so before it is closed."""
+    """An empty file to write to, locked against other runs until it is closed."""
     file = open(path, "ab", buffering=0)  # noqa: SIM115 - the caller's
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -225,7 +209,10 @@ def _parse_line(text: str, path: str | Path, number: int) -> tuple[int, str, int
     match = _LINE.fullmatch(text)
     if match is None:
         form = "(seconds.microseconds) channel ID#DATA, or ID##fDATA for CAN FD"
-        raise UsageError(f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'")
+        raise UsageError(
+            f"{path}:{number}: no candump line: {text[:60]!r}; expected '{form}'; python-can's can_logconvert converts"
+            " other logs"
+        )
     t_ns = (int(match["s"]) * 1_000_000 + int(match["us"])) * 1000
     return t_ns, match["channel"], _parse_id(match), bytes.fromhex(match["fd"] or match["data"] or "")
 
@@ -237,16 +224,7 @@ def _parse_id(match: re.Match[str]) -> int:
     return can_id | RTR_FLAG if match["data"] is None and match["fd"] is None else can_id
 
 
-class FrameWriter(Protocol):
-    """Something frames are written to, such as a `CandumpWriter`."""
-
-    @property
-    def write(self) -> Callable[[int, bytes, int], None]:
-        """Called with (can_id, data, t_ns)."""
-        ...
-
-
-class RecordingPort:
+class RecordingPort(PlainPort):
     """A `Port` that writes down what passes through it, sent frames with the time of sending.
 
     In real time a received frame is written when it is drained, with the time of its reception, so a line may be older
@@ -254,41 +232,23 @@ class RecordingPort:
 
     Args:
         port: the port to use.
-        writer: where to write; it is not closed with the port.
+        write: called with (can_id, data, t_ns), such as `CandumpWriter.write`.
     """
 
-    def __init__(self, port: Port, writer: FrameWriter) -> None:
+    def __init__(self, port: Port, write: Callable[[int, bytes, int], None]) -> None:
         self._port = port
-        self._write = writer.write
-
-    @property
-    def clock(self) -> Clock:
-        """The port's clock."""
-        return self._port.clock
-
-    @property
-    def channel(self) -> str:
-        """The port's channel."""
-        return self._port.channel
-
-    @property
-    def counters(self) -> PortCounters:
-        """The port's counters."""
-        return self._port.counters
+        self._write = write
+        self.clock, self.channel, self.counters = port.clock, port.channel, port.counters
+        self.stamps_arrival, self.wait, self.close = port.stamps_arrival, port.wait, port.close
 
     @property
     def state(self) -> ControllerState:
-        """As the port tells it."""
+        """That of the port."""
         return self._port.state
-
-    @property
-    def stamps_arrival(self) -> bool:
-        """As the port does."""
-        return self._port.stamps_arrival
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` and write them down, with `t_ns` where it is given."""
-        sent_ns = self._port.clock.now_ns() if t_ns is None else t_ns
+        sent_ns = self.clock.now_ns() if t_ns is None else t_ns
         self._port.send_batch(frames)
         for can_id, data in frames:
             self._write(can_id, data, sent_ns)
@@ -300,16 +260,8 @@ class RecordingPort:
             self._write(can_id, data, t_ns)
         return frames
 
-    def wait(self, until_ns: int) -> None:
-        """Wait as the port does."""
-        self._port.wait(until_ns)
 
-    def close(self) -> None:
-        """Close the port; the writer stays open."""
-        self._port.close()
-
-
-# Files that are whole or not there, whatever stops the writing, and one way to say why one could not be written.
+# Files that are whole or not there, whatever stops the writing.
 
 _WRONG_PATH = (FileNotFoundError, NotADirectoryError, IsADirectoryError, PermissionError)
 
@@ -325,8 +277,8 @@ def whole_file(path: Path) -> Iterator[Path]:
         path: what it is called afterwards; an older one is replaced, a link followed, a device or a pipe written to.
 
     Raises:
-        ResultsError: it cannot be written, for want of room say; an older one is as it was.
-        UsageError: it cannot be there: no such folder, or nobody may write there.
+        ResultsError: it cannot be written, for example on a full disk; an older one is as it was.
+        UsageError: it cannot be there: no such folder, or no permission to write.
     """
     whole = path.resolve()
     part = whole if path.exists() and not path.is_file() else whole.with_name(f".part-{whole.name}")
@@ -352,116 +304,7 @@ def write_text(path: Path, text: str, *, encoding: str = "utf-8", newline: str |
         part.write_text(text, encoding=encoding, newline=newline)
 
 
-# Logs of a bus in any form that python-can writes and reads: BLF for Vector's tools, ASC, TRC; candump by our own.
-#
-# The suffix names the form: ``.blf``, ``.asc``, ``.trc``, and ``.log``, ``.txt`` or none for candump, as which a file
-# of any other name is read too.
-
-_READERS: dict[str, Any] = {".asc": can.ASCReader, ".blf": can.BLFReader, ".trc": can.TRCReader}
-_WRITERS: dict[str, Any] = {".asc": can.ASCWriter, ".blf": can.BLFWriter, ".trc": can.TRCWriter}
-_Logged = tuple[int, str, int, bytes]
-FOREIGN = tuple(_READERS)
-"""Suffixes of the forms that python-can writes and reads for us."""
-_CANDUMP = (".log", ".txt", "")
-_STANDARD_MASK, _EXTENDED_MASK = 0x7FF, 0x1FFFFFFF
-
-
-def read_log(path: str | Path) -> Iterator[_Logged]:
-    """Read a log in the form that its suffix names.
-
-    Yields:
-        (t_ns, channel, can_id, data) of each frame, as `read_candump`; channels that a form numbers are can0, can1, ….
-
-    Raises:
-        UsageError: the file cannot be read, or is not of that form.
-    """
-    make_reader = _READERS.get(Path(path).suffix.lower())
-    if make_reader is None:
-        yield from read_candump(path)
-        return
-    try:  # a file of our own, as python-can leaves its one open where it is no log
-        with (
-            open(path, "rb") if make_reader is can.BLFReader else open(path, encoding="utf-8", errors="replace") as file
-        ):
-            for message in make_reader(file):
-                channel = message.channel if isinstance(message.channel, str) else f"can{message.channel or 0}"
-                yield round(message.timestamp * 1e6) * 1000, channel, _can_id(message), bytes(message.data)
-    except OSError as error:
-        raise UsageError(f"{path}: {error.strerror or error}") from error
-    except (ValueError, can.CanError, KeyError, IndexError, struct.error) as error:
-        raise UsageError(f"{path}: no {Path(path).suffix} log: {error}") from error
-
-
-def convert_log(source: str | Path, target: Path) -> int:
-    """Write a log in another form; both are named by their suffixes.
-
-    Args:
-        source: any log.
-        target: written anew.
-
-    Returns:
-        How many frames.
-
-    Raises:
-        UsageError: source and target are one file, one of them cannot be opened, the source is no log, or the target's
-            suffix names no form.
-        ResultsError: the target cannot be written; an older one is as it was.
-    """
-    form = target.suffix.lower()
-    if form not in (*FOREIGN, *_CANDUMP):
-        raise UsageError(f"{target}: expected .log (candump), {', '.join(FOREIGN)}, got {target.suffix}")
-    if target.exists() and target.samefile(source):
-        raise UsageError(f"{target}: a log cannot be converted into itself")
-    write = _write_candump if form in _CANDUMP else _write_foreign
-    with (
-        whole_file(target) as part,
-        part.open("wb") if form == ".blf" else part.open("w", encoding="utf-8", newline="\n") as file,
-    ):
-        return write(read_log(source), file, target)
-
-
-def _write_candump(frames: Iterable[_Logged], file: IO[Any], _: Path) -> int:
-    count = 0
-    for t_ns, channel, can_id, data in frames:
-        file.write(format_line(channel, can_id, data, t_ns))
-        count += 1
-    return count
-
-
-def _write_foreign(frames: Iterable[_Logged], file: IO[Any], target: Path) -> int:
-    count = 0
-    with _WRITERS[target.suffix.lower()](file) as writer:
-        if isinstance(writer, can.TRCWriter):
-            writer.filepath = str(target.absolute())  # stands in its header
-        for frame in frames:
-            writer.on_message_received(_message(*frame))
-            count += 1
-    return count
-
-
-def _can_id(message: can.Message) -> int:
-    if message.is_error_frame:  # most of these formats say no more than that there was an error
-        return ERR_FLAG | (int(message.arbitration_id) or ERR_BUS)
-    flags = (EFF_FLAG if message.is_extended_id else 0) | (RTR_FLAG if message.is_remote_frame else 0)
-    return int(message.arbitration_id) | flags
-
-
-def _message(t_ns: int, channel: str, can_id: int, data: bytes) -> can.Message:
-    extended = bool(can_id & EFF_FLAG)
-    return can.Message(
-        timestamp=t_ns * 1e-9,
-        arbitration_id=can_id & (_EXTENDED_MASK if extended else _STANDARD_MASK),
-        is_extended_id=extended,
-        is_remote_frame=bool(can_id & RTR_FLAG),
-        is_error_frame=bool(can_id & ERR_FLAG),
-        data=data,
-        is_fd=len(data) > 8,
-        bitrate_switch=len(data) > 8,
-        channel=channel,
-    )
-
-
-# Columns in an ``.npz`` file: written, read, or told what is wrong with it.
+# Columns in an ``.npz`` file.
 
 
 def write_npz(path: Path, columns: Mapping[str, NDArray[Any]]) -> None:

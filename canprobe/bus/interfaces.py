@@ -10,12 +10,13 @@ from typing import Any
 
 import can
 
+from canprobe.bus.mmsg import HAS_BATCHES
 from canprobe.bus.port import (
     ERR_BUS,
     ERR_FLAG,
-    CanFilter,
     Clock,
     ControllerState,
+    PlainPort,
     Port,
     PortCounters,
     Reports,
@@ -35,7 +36,6 @@ def open_port(
     bitrate: int,
     clock: Clock,
     *,
-    filters: Sequence[CanFilter] | None = None,
     data_bitrate: int | None = None,
     waits: bool = False,
     reports: Reports | None = None,
@@ -47,7 +47,6 @@ def open_port(
         channel: the channel as that interface names it, such as `can0`.
         bitrate: in bit/s; a SocketCAN interface has its own, set with `ip link`.
         clock: a clock in real time.
-        filters: what is let in; everything by default.
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
         waits: wait for a full transmit queue as long as it takes; only SocketCAN can.
         reports: who hears of error frames, and of what the user has to know.
@@ -56,17 +55,13 @@ def open_port(
         UsageError: there is no interface of that name.
         InterfaceError: it is missing, down, or cannot be opened; with what to do.
     """
-    if interface == "socketcan":
+    if interface == "socketcan" and HAS_BATCHES:  # else python-can's
         from canprobe.bus.socketcan import SocketCanPort
 
-        return SocketCanPort(
-            channel, clock, filters=filters, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports
-        )
+        return SocketCanPort(channel, clock, bitrate=bitrate, data_bitrate=data_bitrate, waits=waits, reports=reports)
     if interface == "lockstep":
         raise UsageError(f"{channel}: a lockstep bus lives inside one run; there is nothing to open")
-    return PythonCanPort(
-        interface, channel, bitrate, clock, filters=filters, data_bitrate=data_bitrate, reports=reports
-    )
+    return PythonCanPort(interface, channel, bitrate, clock, data_bitrate=data_bitrate, reports=reports)
 
 
 # Which received frames are our own, on a bus that gives a sender back what it sent.
@@ -107,7 +102,6 @@ class Echoes:
 # Frames are stamped with the time at which they are taken from python-can, whose own stamps differ between interfaces.
 # It costs some 10 µs a frame; for SocketCAN use `canprobe.bus.socketcan`.
 
-_STANDARD_MASK = 0x7FF
 _EXTENDED_MASK = 0x1FFFFFFF
 CLASSIC_BYTES = 8
 _STATES = {
@@ -121,7 +115,7 @@ _HAS_CLASSES = ("socketcan", "socketcand")
 """Interfaces whose error frames have SocketCAN's class bits; those of others are bus errors."""
 
 
-class PythonCanPort:
+class PythonCanPort(PlainPort):
     """One python-can bus.
 
     Args:
@@ -129,13 +123,12 @@ class PythonCanPort:
         channel: the channel as that interface names it.
         bitrate: in bit/s, for interfaces that set it themselves.
         clock: the clock for waits and stamps.
-        filters: what is let in; everything by default.
         data_bitrate: of the data phase of CAN FD frames; None: classical frames only.
         reports: who hears of error frames.
 
     Attributes:
         counters: what has passed; `ignored` are CAN FD frames where they are not wanted.
-        state: the controller's state as the last error frame told, or python-can at that time.
+        state: the controller's state as of the last error frame.
 
     Raises:
         UsageError: python-can has no such interface.
@@ -149,7 +142,6 @@ class PythonCanPort:
         bitrate: int,
         clock: Clock,
         *,
-        filters: Sequence[CanFilter] | None = None,
         data_bitrate: int | None = None,
         reports: Reports | None = None,
     ) -> None:
@@ -162,7 +154,7 @@ class PythonCanPort:
         self.state = ControllerState.ACTIVE
         self._arrived: deque[can.Message] = deque()
         self._echoes = Echoes() if interface in _HEARS_ITSELF else None
-        self._bus: can.BusABC | None = _open(interface, channel, bitrate, filters, data_bitrate)
+        self._bus: can.BusABC | None = _open(interface, channel, bitrate, data_bitrate)
 
     stamps_arrival = False
 
@@ -245,9 +237,7 @@ class PythonCanPort:
         self._reports.error_frame(can_id, data, t_ns)
 
 
-def _open(
-    interface: str, channel: str, bitrate: int, filters: Sequence[CanFilter] | None, data_bitrate: int | None
-) -> can.BusABC:
+def _open(interface: str, channel: str, bitrate: int, data_bitrate: int | None) -> can.BusABC:
     logging.getLogger("can").setLevel(logging.CRITICAL)
     if interface not in can.VALID_INTERFACES:
         names = ", ".join(sorted(can.VALID_INTERFACES))
@@ -257,8 +247,6 @@ def _open(
         options |= {"fd": True, "data_bitrate": data_bitrate}
         if interface == "virtual":
             options = {**options, "protocol": can.CanProtocol.CAN_FD}
-    if filters is not None:
-        options["can_filters"] = [_filter(can_id, mask) for can_id, mask in filters]
     try:
         return can.Bus(**options)
     except (can.CanError, OSError, ValueError, TypeError, ImportError) as error:
@@ -266,15 +254,6 @@ def _open(
     except Exception as error:  # where a driver's library is missing, python-can trips over anything
         why = f"is its driver installed? python-can says {type(error).__name__}: {error}"
         raise InterfaceError(f"{channel}: {interface} cannot be opened; {why}") from error
-
-
-def _filter(can_id: int, mask: int) -> dict[str, Any]:
-    wide = bool(can_id & EFF_FLAG)
-    return {
-        "can_id": can_id & (_EXTENDED_MASK if wide else _STANDARD_MASK),
-        "can_mask": mask & (_EXTENDED_MASK if wide else _STANDARD_MASK),
-        "extended": wide,
-    }
 
 
 def _message(channel: str, can_id: int, data: bytes, fd: bool) -> can.Message:

@@ -1,4 +1,4 @@
-"""How a SocketCAN interface is set: what `ip -details -statistics -json link show` tells of it, and the lines
+"""How a SocketCAN interface is set: what `ip -details -statistics -json link show` shows of it, and the lines
 that set it.
 
 Drivers and versions of iproute2 leave things out, and write numbers as texts: what is not there is None.
@@ -28,7 +28,7 @@ class LinkState:
 
     Attributes:
         name: such as `can0`.
-        kind: `can` for hardware, `vcan` or `vxcan`; None where the driver does not tell.
+        kind: `can` for hardware, `vcan` or `vxcan`; None where the driver does not report it.
         is_up: it is there and switched on.
         tx_queue: frames that the kernel queues (txqueuelen).
         bitrate, data_bitrate: bit/s; the second of CAN FD.

@@ -3,7 +3,7 @@
 Each participant and each port has one outgoing queue. At one instant the bus first lets everybody speak whose deadline
 has come, then carries the frames one by one: of the heads of all queues the one that wins the arbitration, so lowest
 identifier first, first in first out for each sender, ties by order of attachment. Nobody receives what it sent. Answers
-join at the same instant, until nobody has anything to say. A frame takes no time on the wire.
+join at the same instant, until nobody has anything to send. A frame takes no time on the wire.
 
 A deadline that a reception moves to the present is served when the frames already waiting have gone.
 """
@@ -13,9 +13,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Container, Sequence
 from heapq import heapify, heappop, heappush
-from typing import Protocol
 
-from canprobe.bus.port import ControllerState, PortCounters, TimedFrame, VirtualClock
+from canprobe.bus.port import ControllerState, PlainPort, PortCounters, TimedFrame, VirtualClock
 from canprobe.errors import BusError, InterfaceError
 from canprobe.protocol.frame_bits import FD_LENGTHS
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG, Frame
@@ -26,49 +25,75 @@ Recorder = Callable[[int, bytes, int], None]
 CLASSIC_BYTES = 8
 
 
-class Participant(Protocol):
-    """A node that is a pure function of frames and time; what it returns is sent in that order.
+EVERY_ID = range(1 << 32)
 
-    It may have an attribute `listens`, a container that always holds the identifiers it takes at present; the bus then
-    spares it the others. If those change, it also has an attribute `rerouted`, a function of the bus's that it calls.
+
+class Participant:
+    """What lives on an emulated bus, as a function of frames and time. The base class hears all and sends nothing.
+
+    The bus sends what `start`, `receive` and `advance` return, in that order.
+
+    Attributes:
+        hears_every_sync: also a SYNC that a served bus leaves unanswered, because the next one has come already.
     """
+
+    hears_every_sync = False
+
+    @property
+    def name(self) -> str:
+        """For messages."""
+        return type(self).__name__
+
+    @property
+    def kind(self) -> type:
+        """On a served bus participants of one kind answer a SYNC before those of the next kind hear it."""
+        return type(self)
 
     @property
     def next_deadline_ns(self) -> int | None:
         """When `advance` has to be called next, `None` if only a frame can wake it."""
-        ...
+        return None
+
+    @property
+    def listens(self) -> Container[int]:
+        """The identifiers that it takes at present; the bus spares it the others."""
+        return EVERY_ID
+
+    @property
+    def patient(self) -> frozenset[int]:
+        """Those of them that require nothing before the next SYNC."""
+        return frozenset()
+
+    def connect(self, rerouted: Callable[[], None]) -> None:
+        """Before `start`: `rerouted` is to be called whenever `listens` or `patient` has changed."""
 
     def start(self, t_ns: int) -> Sequence[Frame]:
-        """Begin to live at `t_ns`."""
-        ...
+        """Power on at `t_ns`."""
+        return ()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
         """Take a frame from the bus."""
-        ...
+        return ()
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         """Do what is due at `t_ns`; afterwards the next deadline lies later."""
-        ...
+        return ()
 
 
 Listener = tuple[Callable[[int, bytes, int], Sequence[Frame]], "BusNode"]
-_Receiver = tuple[Callable[[int, bytes, int], Sequence[Frame]], "BusNode", Container[int] | None]
-"""How to call a participant, its queue, and the identifiers it listens to (None: all)."""
 
 
 class BusNode:
     """The bus's view of one sender: its queue, and where its frames go."""
 
-    __slots__ = ("due", "inboxes", "listeners", "order", "outbox", "owner", "receivers")
+    __slots__ = ("due", "listeners", "order", "outbox", "owner")
 
-    def __init__(self, owner: Participant | LockstepPort, order: int) -> None:
+    def __init__(self, owner: Participant, order: int) -> None:
         self.owner = owner
         self.order = order
         self.outbox: deque[Frame] = deque()
         self.due: int | None = None  # the owner's deadline, as last seen
-        self.receivers: tuple[_Receiver, ...] = ()
         self.listeners: dict[int, tuple[Listener, ...]] = {}  # of an identifier, found once until somebody reroutes
-        self.inboxes: tuple[Callable[[TimedFrame], None], ...] = ()
 
 
 class LockstepBus:
@@ -88,20 +113,18 @@ class LockstepBus:
         self.clock = clock
         self.channel = channel
         self.recorder: Recorder | None = None
-        self.error_recorder: Recorder | None = None  # told each error frame, where bits can fail
+        self.error_recorder: Recorder | None = None  # called with each error frame, where bits can fail
         self._max_frames = max_frames
         self._count = 0
         self._nodes: list[BusNode] = []
-        self._participants: tuple[tuple[BusNode, Participant], ...] = ()
         self._heads: list[tuple[int, int, BusNode]] = []
         self._settling = False
         clock.attach(self)
 
     def attach(self, participant: Participant) -> None:
-        """Put `participant` on the bus and start it; what it says is carried when time moves or a port is used."""
+        """Put `participant` on the bus and start it; what it sends is carried when time moves or a port is used."""
         node = self._add(participant)
-        if hasattr(participant, "rerouted"):
-            participant.rerouted = self._forget_listeners
+        participant.connect(self._forget_listeners)
         self._queue(node, participant.start(self.clock.now_ns()))
         node.due = participant.next_deadline_ns
 
@@ -120,8 +143,8 @@ class LockstepBus:
         if self._heads:
             return self.clock.now_ns()
         first: int | None = None
-        for node, owner in self._participants:
-            due = node.due = owner.next_deadline_ns
+        for node in self._nodes:
+            due = node.due = node.owner.next_deadline_ns
             if due is not None and (first is None or due < first):
                 first = due
         return first
@@ -167,38 +190,43 @@ class LockstepBus:
 
     def _advance_due(self, t_ns: int) -> bool:
         advanced = False
-        for node, owner in self._participants:
+        for node in self._nodes:
             if node.due is not None and node.due <= t_ns:
                 advanced = True
-                self._queue(node, owner.advance(t_ns))
-                node.due = owner.next_deadline_ns
+                self._queue(node, node.owner.advance(t_ns))
+                node.due = node.owner.next_deadline_ns
         return advanced
 
     def _deliver(self, t_ns: int, limit: int) -> int:
         """Carry frames until all queues are empty; return how many more may follow at this instant."""
-        heads = self._heads
         recorder = self.recorder
-        while heads:
-            _, _, sender = heappop(heads)
-            outbox = sender.outbox
-            can_id, data = outbox.popleft()
-            if outbox:
-                heappush(heads, (arbitration_key(outbox[0][0]), sender.order, sender))
+        while self._heads:
+            sender, (can_id, data) = self._take_next()
             limit -= 1
             if limit < 0:
-                what = f"{can_id:03X} from {name_of(sender.owner)} is frame {self._max_frames + 1} of this instant"
+                what = f"{can_id:03X} from {sender.owner.name} is frame {self._max_frames + 1} of this instant"
                 raise self._endless(t_ns, what)
             if recorder is not None:
                 recorder(can_id, data, t_ns)
-            for receive, receiver in self._listeners_of(sender, can_id):
-                answers = receive(can_id, data, t_ns)
-                receiver.due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
-                if answers:
-                    self._queue(receiver, answers)
-            frame = (can_id, data, t_ns)
-            for put in sender.inboxes:
-                put(frame)
+            self._hand_over(sender, can_id, data, t_ns)
         return limit
+
+    def _take_next(self) -> tuple[BusNode, Frame]:
+        """Take the frame that wins the arbitration out of its queue."""
+        _, _, sender = heappop(self._heads)
+        outbox = sender.outbox
+        frame = outbox.popleft()
+        if outbox:
+            heappush(self._heads, (arbitration_key(outbox[0][0]), sender.order, sender))
+        return sender, frame
+
+    def _hand_over(self, sender: BusNode, can_id: int, data: bytes, t_ns: int) -> None:
+        """Everybody hears a frame but its sender; the answers are queued."""
+        for receive, receiver in self._listeners_of(sender, can_id):
+            answers = receive(can_id, data, t_ns)
+            receiver.due = receiver.owner.next_deadline_ns
+            if answers:
+                self._queue(receiver, answers)
 
     def _queue(self, node: BusNode, frames: Sequence[Frame]) -> None:
         if not frames:
@@ -213,53 +241,39 @@ class LockstepBus:
         can_id, data = frame
         if len(data) > CLASSIC_BYTES and not (self.fd and len(data) in FD_LENGTHS):
             has = f"CAN FD has {', '.join(map(str, FD_LENGTHS[9:]))} above 8" if self.fd else "CAN has 8"
-            raise BusError(f"{self.channel}: {name_of(node.owner)} sends {len(data)} bytes with {can_id:03X}; {has}")
+            raise BusError(f"{self.channel}: {node.owner.name} sends {len(data)} bytes with {can_id:03X}; {has}")
 
-    @staticmethod
-    def _listeners_of(sender: BusNode, can_id: int) -> tuple[Listener, ...]:
+    def _listeners_of(self, sender: BusNode, can_id: int) -> tuple[Listener, ...]:
         listeners = sender.listeners.get(can_id)
         if listeners is None:
             listeners = sender.listeners[can_id] = tuple(
-                (receive, node) for receive, node, listens in sender.receivers if listens is None or can_id in listens
+                (node.owner.receive, node)
+                for node in self._nodes
+                if node is not sender and can_id in node.owner.listens
             )
         return listeners
 
-    def _add(self, owner: Participant | LockstepPort) -> BusNode:
+    def _add(self, owner: Participant) -> BusNode:
         if any(node.owner is owner for node in self._nodes):
-            raise BusError(f"{self.channel}: {name_of(owner)} is on the bus already")
+            raise BusError(f"{self.channel}: {owner.name} is on the bus already")
         node = BusNode(owner, self._count)
         self._count += 1
         self._nodes.append(node)
-        self._connect()
+        self._forget_listeners()
         return node
 
-    def _remove(self, owner: Participant | LockstepPort) -> None:
+    def _remove(self, owner: Participant) -> None:
         self._nodes = [node for node in self._nodes if node.owner is not owner]
         self._heads = [head for head in self._heads if head[2].owner is not owner]
         heapify(self._heads)
-        self._connect()
-
-    def _connect(self) -> None:
-        """Work out once who hears whom."""
-        self._participants = tuple((n, n.owner) for n in self._nodes if not isinstance(n.owner, LockstepPort))
-        for node in self._nodes:
-            node.receivers = tuple(
-                (owner.receive, other, getattr(owner, "listens", None))
-                for other, owner in self._participants
-                if other is not node
-            )
-            node.listeners.clear()
-            ports = (other.owner for other in self._nodes if other is not node)
-            node.inboxes = tuple(port.inbox.append for port in ports if isinstance(port, LockstepPort))
+        self._forget_listeners()
 
     def _forget_listeners(self) -> None:
         for node in self._nodes:
             node.listeners.clear()
 
     def _names_due(self, t_ns: int) -> str:
-        return ", ".join(
-            name_of(owner) for node, owner in self._participants if node.due is not None and node.due <= t_ns
-        )
+        return ", ".join(node.owner.name for node in self._nodes if node.due is not None and node.due <= t_ns)
 
     def _endless(self, t_ns: int, what: str) -> BusError:
         self._heads.clear()
@@ -268,16 +282,15 @@ class LockstepBus:
         return BusError(f"{self.channel}: no end at {t_ns * 1e-9:.6f} s: {what}")
 
 
-class LockstepPort:
+class LockstepPort(Participant, PlainPort):
     """A master's `Port` on a `LockstepBus`; see there for the order of frames.
 
     Attributes:
-        state: of a controller that this bus does not have: as it was set, to see what a cell does about it.
+        state: error state of the controller; a timed bus with bit errors sets it (`canprobe.bus.controllers`).
     """
 
-    __slots__ = ("_bus", "_open", "counters", "inbox", "node", "state")
-
     node: BusNode
+    next_deadline_ns = None
 
     def __init__(self, bus: LockstepBus) -> None:
         self._bus = bus
@@ -297,6 +310,11 @@ class LockstepPort:
         return self._bus.channel
 
     stamps_arrival = True
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        """Keep a frame for `drain`."""
+        self.inbox.append((can_id, data, t_ns))
+        return ()
 
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send `frames` now and let everybody answer; the answers are there when this returns."""
@@ -341,8 +359,3 @@ def arbitration_key(can_id: int) -> int:
         can_id &= 0x1FFFFFFF
         return (can_id >> 18) << 21 | 0b11 << 19 | (can_id & 0x3FFFF) << 1 | remote
     return (can_id & 0x7FF) << 21 | remote << 20
-
-
-def name_of(owner: object) -> str:
-    """Name a participant in a message: its own `name` if it has one."""
-    return str(getattr(owner, "name", type(owner).__name__))

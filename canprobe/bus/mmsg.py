@@ -1,7 +1,6 @@
-"""Many CAN frames a system call: recvmmsg and sendmmsg through ctypes, and the plain calls where they do not exist.
+"""Many CAN frames a system call: recvmmsg and sendmmsg through ctypes, on systems of 64 bits.
 
-Both classes do the same for one non-blocking raw CAN socket; where a system call costs 20 µs, as in a user-mode Linux
-guest, a burst costs a tenth with the first.
+Where a system call costs 20 µs, as in a user-mode Linux guest, a burst costs a tenth of what single calls do.
 
 Source: recvmmsg(2), sendmmsg(2), Linux include/uapi/linux/can.h (struct can_frame, struct canfd_frame),
 net/core/sock.c (control messages).
@@ -15,7 +14,6 @@ import os
 import socket
 import struct
 from collections.abc import Sequence
-from typing import Protocol
 
 from canprobe.protocol.frames import Frame
 
@@ -38,20 +36,8 @@ _MSG_WAITFORONE = 0x10000
 _BATCH = 64
 
 
-class FrameSocket(Protocol):
-    """Moves frames through one socket."""
-
-    def receive(self, wait: bool = False) -> list[Row]:
-        """Return what is there; OSError if the interface failed.
-
-        Args:
-            wait: for the first frame, as long as the socket's own time-out says; it must be a blocking one.
-        """
-        ...
-
-    def send(self, frames: Sequence[Frame]) -> int:
-        """Hand over frames from the first on; return how many were taken; OSError if not even one was."""
-        ...
+HAS_BATCHES = struct.calcsize("P") == 8
+"""The layout of the control messages above is that of 64 bits."""
 
 
 class _IoVec(ctypes.Structure):
@@ -95,15 +81,12 @@ class _Slots:
         self.fresh = bytes(self.headers)
 
 
-class BatchedSocket:
-    """recvmmsg and sendmmsg.
+class FrameSocket:
+    """Moves frames through one socket with recvmmsg and sendmmsg.
 
     Args:
         sock: a raw CAN socket.
         fd: it takes CAN FD frames too.
-
-    Raises:
-        AttributeError: this C library does not have them.
     """
 
     def __init__(self, sock: socket.socket, fd: bool = False) -> None:
@@ -117,7 +100,11 @@ class BatchedSocket:
         self._out = _Slots(self._frame.size, 0)
 
     def receive(self, wait: bool = False) -> list[Row]:
-        """Return everything that is there, 64 frames a call."""
+        """Return everything that is there, 64 frames a call; OSError if the interface failed.
+
+        Args:
+            wait: for the first frame, as long as the socket's own time-out says; it must be a blocking one.
+        """
         rows: list[Row] = []
         slots = self._in
         count = _BATCH
@@ -126,7 +113,7 @@ class BatchedSocket:
             count = self._recvmmsg(self._fd, slots.headers, _BATCH, flags, None)
             flags = socket.MSG_DONTWAIT
             if count < 0:
-                if _nothing_there(ctypes.get_errno()):
+                if ctypes.get_errno() in (errno.EAGAIN, errno.EINTR):
                     break
                 raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
             for can_id, length, _, data, _, _, kind, s, ns, _, _, drop_kind, drops in self._slot.iter_unpack(
@@ -138,7 +125,7 @@ class BatchedSocket:
         return rows
 
     def send(self, frames: Sequence[Frame]) -> int:
-        """Send up to 64 frames with one call."""
+        """Hand over up to 64 frames with one call; return how many were taken; OSError if not even one was."""
         out, form = self._out, self._frame
         offset = 0
         for k, (can_id, data) in enumerate(frames[:_BATCH]):
@@ -151,59 +138,3 @@ class BatchedSocket:
         if count < 0:
             raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
         return count
-
-
-class PlainSocket:
-    """recvmsg and send, one frame a call."""
-
-    def __init__(self, sock: socket.socket, fd: bool = False) -> None:
-        self._socket = sock
-        self._size = _FD_FRAME.size if fd else _FRAME.size
-
-    def receive(self, wait: bool = False) -> list[Row]:
-        """Return everything that is there."""
-        rows: list[Row] = []
-        flags = 0 if wait else socket.MSG_DONTWAIT
-        while True:
-            try:
-                raw, control, _, _ = self._socket.recvmsg(self._size, _CONTROL, flags)
-            except OSError as error:
-                if _nothing_there(error.errno):
-                    return rows
-                raise
-            flags = socket.MSG_DONTWAIT
-            can_id, length, _, data = (_FD_FRAME if len(raw) == _FD_FRAME.size else _FRAME).unpack(raw)
-            rows.append((can_id, data[:length], *_parse_control(control)))
-
-    def send(self, frames: Sequence[Frame]) -> int:
-        """Send the first frame."""
-        can_id, data = frames[0]
-        long = len(data) > CLASSIC_BYTES
-        packed = (_FD_FRAME if long else _FRAME).pack(can_id, len(data), _BIT_RATE_SWITCH if long else 0, data)
-        self._socket.send(packed, socket.MSG_DONTWAIT)
-        return 1
-
-
-def frame_socket(sock: socket.socket, batched: bool = True, fd: bool = False) -> FrameSocket:
-    """Return the quickest way through `sock` that this machine has; with `fd` it takes CAN FD frames too."""
-    if batched and struct.calcsize("P") == 8:  # the layout of the control messages above is that of 64 bits
-        try:
-            return BatchedSocket(sock, fd)
-        except AttributeError:
-            pass
-    return PlainSocket(sock, fd)
-
-
-def _nothing_there(number: int | None) -> bool:
-    return number in (errno.EAGAIN, errno.EINTR)
-
-
-def _parse_control(control: Sequence[tuple[int, int, bytes]]) -> tuple[int, int]:
-    stamp_ns = drops = 0
-    for _, kind, data in control:
-        if kind == SO_TIMESTAMPNS and len(data) == 16:
-            s, ns = struct.unpack("=qq", data)
-            stamp_ns = s * 1_000_000_000 + ns
-        elif kind == SO_RXQ_OVFL:
-            (drops,) = struct.unpack("=I", data[:4])
-    return stamp_ns, drops

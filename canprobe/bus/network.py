@@ -1,207 +1,83 @@
-"""canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own
-time.
+"""Requests and answers over any `Port` without threads: SDO transfers, LSS, and who answers at all.
 
-Whoever waits for an answer pumps the port: it receives frames itself, gives canopen its own and everything else to a
-callback, so that nothing is lost. Time-outs run on the port's clock; on a `LockstepBus` they cost no real time.
+Whoever waits for an answer pumps the port: it receives the frames itself, gives each to those that subscribed to its
+identifier and everything else to a callback, so that nothing is lost. Time-outs run on the port's clock; on a
+`LockstepBus` they cost no real time. Not for the cycle, which has its own way to the port.
 
-Not for the cycle: PDO objects of canopen and periodic messages are left out on purpose.
+SDO. A *dialogue* is a generator: it yields the 8 bytes of a request, or None to wait on, and is sent the 8 bytes of
+each answer. `upload` and `download` are parts of such dialogues (`yield from`). What a node needs is written as a plain
+sequence, and `hold_dialogues` waits for all nodes together: the accesses of one node come one after another, those of
+different nodes side by side. canopen's client is not used, because it waits for a thread and for one node at a time.
+
+Source: CiA 301, SDO protocols (expedited download, expedited and segmented upload, abort); CiA 305 (LSS).
 """
 
 from __future__ import annotations
 
-import queue
-import struct
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, Never, cast
+from collections.abc import Callable, Generator, Iterable, Mapping
+from typing import Any
 
-import canopen
-from canopen.lss import LssError, LssMaster
-from canopen.node.remote import RemoteNode
-from canopen.sdo.client import SdoClient
-from canopen.sdo.exceptions import SdoCommunicationError
+from canopen.objectdictionary import ODVariable
+from canopen.objectdictionary.datatypes import SIGNED_TYPES
+from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.port import Port, TimedFrame
-from canprobe.errors import UsageError
+from canprobe.errors import BusError
 from canprobe.protocol.frames import (
-    EFF_FLAG,
+    LSS_ANSWER_ID,
     LSS_LENGTH,
     LSS_REQUEST_ID,
     NOTHING_ASKED,
-    RTR_FLAG,
     SDO_RX_BASE,
     SDO_TX_BASE,
+    LssAddress,
     LssCommand,
+    LssError,
+    LssState,
     pack_fastscan,
     pack_lss,
     pack_number,
 )
 
-# canopen's LSS master, waiting by receiving: on the port's clock, whatever that is.
-#
-# canopen's own waits for a thread that puts answers into a queue, sleeps 10 ms after each question of a search and 0.2
-# s after each part of an address, and takes a second answer to one question for the answer to the next one.
+# A port that is pumped by whoever waits.
 
-SETTLE_S = 0.005
-"""Several nodes may give the same answer to one question, one after another: so long the later ones are waited for."""
+Taker = Callable[[int, bytes, int], object]
+"""Called with (can_id, data, t_ns) of a frame."""
 
 
-class _Arrivals(queue.Queue[bytes]):
-    """Answers; whoever waits for one, receives."""
-
-    def __init__(self, network: PumpedNetwork) -> None:
-        super().__init__()
-        self._network = network
-
-    def get(self, block: bool = True, timeout: float | None = None) -> bytes:
-        self._network.pump_until(lambda: self.qsize() > 0, timeout or 0.0)
-        return super().get(block=False)
-
-
-class PumpedLss(LssMaster):
-    """LSS over a `PumpedNetwork`; RESPONSE_TIMEOUT (s) runs on the port's clock. Errors are canopen's `LssError`."""
-
-    RESPONSE_TIMEOUT = 0.5
-    SCAN_TIMEOUT = 0.05
-    """How long nobody has to answer a question of fastscan before it is taken for a no."""
-
-    def __init__(self, network: PumpedNetwork) -> None:
-        self._pumped = network
-        super().__init__()
-        self.network = network
-
-    @property
-    def responses(self) -> queue.Queue[Any]:
-        """Answers that have arrived. canopen forgets old ones by putting a new queue in their place."""
-        return self._arrivals
-
-    @responses.setter
-    def responses(self, _: Any) -> None:
-        self._arrivals = _Arrivals(self._pumped)
-
-    def on_message_received(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """Keep an answer; one of another length is none."""
-        if len(data) != LSS_LENGTH:
-            raise struct.error("an LSS message has 8 bytes")
-        self.responses.put(bytes(data))
-
-    def send_switch_state_selective(
-        self, vendorId: int, productCode: int, revisionNumber: int, serialNumber: int
-    ) -> bool:
-        """Put the node of this address into configuration; whether it answered."""
-        numbers = (vendorId, productCode, revisionNumber, serialNumber)
-        *first, last = [pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), n) for i, n in enumerate(numbers)]
-        for message in first:
-            self._pumped.send_message(LSS_REQUEST_ID, message)
-        return self._ask(last, self.RESPONSE_TIMEOUT, LssCommand.SELECTED) > 0
-
-    def inquire_node_ids(self) -> list[int]:
-        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
-        self._ask(pack_lss(LssCommand.INQUIRE_NODE_ID), self.RESPONSE_TIMEOUT, LssCommand.INQUIRE_NODE_ID)
-        return [answer[1] for answer in self._answers]
-
-    def fast_scan(self) -> tuple[bool, list[int] | None]:
-        """Find the unconfigured node with the lowest address; it is in configuration afterwards.
-
-        Returns:
-            (True, the four numbers of 1018h), or (False, None) where nobody answers.
-
-        Raises:
-            LssError: somebody answers, but to no address: answers were lost or came late.
-        """
-        for timeout_s in (self.SCAN_TIMEOUT, 5 * self.SCAN_TIMEOUT):
-            if not self._identified(0, NOTHING_ASKED, 0, 0, self.RESPONSE_TIMEOUT):
-                return False, None
-            if (numbers := self._search(timeout_s)) is not None:
-                return True, numbers
-        raise LssError("nodes without an id answer, but not to the end of a search; connect them one at a time")
-
-    def _search(self, timeout_s: float) -> list[int] | None:
-        found: list[int] = []
-        for position in range(4):
-            number = 0
-            for bit in range(31, -1, -1):
-                if not self._identified(number, bit, position, position, timeout_s):
-                    number |= 1 << bit
-            if not self._identified(number, 0, position, (position + 1) % 4, self.RESPONSE_TIMEOUT):
-                return None
-            found.append(number)
-        return found
-
-    def _identified(self, number: int, bit: int, position: int, following: int, timeout_s: float) -> bool:
-        return self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED) > 0
-
-    def _ask(self, message: bytes, timeout_s: float, answer: LssCommand) -> int:
-        """Ask, and count the answers that come; `_answers` are they."""
-        self._pumped.pump_until(lambda: True, 0.0)
-        self.responses = None
-        self._pumped.send_message(LSS_REQUEST_ID, message)
-        self._answers: Sequence[bytes] = ()
-        if self._pumped.pump_until(lambda: self.responses.qsize() > 0, timeout_s):
-            self._pumped.pump_until(lambda: False, SETTLE_S)
-            arrived = [self.responses.get_nowait() for _ in range(self.responses.qsize())]
-            self._answers = [data for data in arrived if data[0] == answer]
-        return len(self._answers)
-
-
-# canopen's `Network` without its threads: SDO, NMT, EMCY, LSS and heartbeats over any `Port`, in the port's own time.
-
-_NOT_FOR_CANOPEN = EFF_FLAG | RTR_FLAG
-_SDO_LENGTH = 8
-
-
-class PumpedNetwork(canopen.Network):
-    """A canopen network that receives only while somebody waits, or what it is fed.
+class PumpedNetwork:
+    """A port with subscribers, which receives only while somebody waits, or what it is fed.
 
     Args:
         port: the connection to the bus; it is not closed with the network.
-        other: called with (can_id, data, t_ns) for each frame that arrives during a wait and is not canopen's.
-
-    Attributes:
-        malformed: frames that canopen could not unpack, such as an EMCY of three bytes; they are dropped.
+        other: called with each frame that arrives during a wait and that nobody subscribed to.
     """
 
-    def __init__(self, port: Port, other: Callable[[int, bytes, int], None] | None = None) -> None:
-        super().__init__()
+    def __init__(self, port: Port, other: Taker = lambda *_: None) -> None:
         self.port = port
-        self.other = other
-        self.malformed = 0
-        self.unsubscribe(self.lss.LSS_RX_COBID)  # of canopen's own, which waits for a thread
-        self.lss = PumpedLss(self)
-        self.subscribe(self.lss.LSS_RX_COBID, self.lss.on_message_received)
+        self._other = other
+        self._takers: dict[int, list[Taker]] = {}
 
-    def send_message(self, can_id: int, data: bytes, remote: bool = False) -> None:
+    def subscribe(self, can_id: int, take: Taker) -> None:
+        """Let `take` have the frames of an identifier."""
+        self._takers.setdefault(can_id, []).append(take)
+
+    def unsubscribe(self, can_id: int, take: Taker) -> None:
+        """Undo one `subscribe`."""
+        takers = self._takers[can_id]
+        takers.remove(take)
+        if not takers:
+            del self._takers[can_id]
+
+    def send_message(self, can_id: int, data: bytes) -> None:
         """Send one frame through the port."""
-        self.port.send_batch(((can_id | RTR_FLAG if remote else can_id, bytes(data)),))
-
-    def send_periodic(self, can_id: int, data: bytes, period: float, remote: bool = False) -> Never:
-        """Refuse: nothing here sends by itself.
-
-        Raises:
-            UsageError: always.
-        """
-        raise UsageError(f"{can_id:03X} cannot be sent periodically by a PumpedNetwork; send it from the cycle")
-
-    def connect(self, *args: Any, **kwargs: Any) -> PumpedNetwork:
-        """Return the network itself: it is connected by its port."""
-        return self
-
-    def add_node(self, node: Any, object_dictionary: Any = None, upload_eds: bool = False) -> PumpedNode:
-        """Add a remote node by number and object dictionary, with clients that pump the port.
-
-        Raises:
-            UsageError: `node` is another RemoteNode, whose clients wait for a thread, or an EDS is to be uploaded.
-        """
-        if isinstance(node, int):
-            node = PumpedNode(node, object_dictionary)
-        if upload_eds or not isinstance(node, PumpedNode):
-            raise UsageError("a PumpedNetwork takes a node by number with its object dictionary, or a PumpedNode")
-        self[cast(int, node.id)] = node
-        return node
+        self.port.send_batch(((can_id, data),))
 
     def feed(self, frames: Iterable[TimedFrame]) -> None:
-        """Give canopen frames that were drained elsewhere; those that nobody subscribed to are ignored."""
+        """Give subscribers frames that were drained elsewhere; the others are ignored."""
         for can_id, data, t_ns in frames:
-            self._notify(can_id, data, t_ns)
+            for take in self._takers.get(can_id, ()):
+                take(can_id, data, t_ns)
 
     def pump_until(self, done: Callable[[], bool], timeout_s: float) -> bool:
         """Receive until `done()`, at most `timeout_s` on the port's clock.
@@ -220,58 +96,313 @@ class PumpedNetwork(canopen.Network):
         return True
 
     def _pump(self) -> None:
-        other = self.other
-        for can_id, data, t_ns in self.port.drain():
-            if can_id in self.subscribers:
-                self._notify(can_id, data, t_ns)
-            elif other is not None:
-                other(can_id, data, t_ns)
+        for frame in self.port.drain():
+            for take in self._takers.get(frame[0], (self._other,)):
+                take(*frame)
 
-    def _notify(self, can_id: int, data: bytes, t_ns: int) -> None:
-        if can_id & _NOT_FOR_CANOPEN:
+
+# SDO transfers to many nodes at once.
+
+Dialogue = Generator[bytes | None, bytes, Any]
+"""The transfers with one node."""
+
+_LENGTH = 8
+_ABORT, _DOWNLOADED, _UPLOADED, _SEGMENT, _EXPEDITED, _SIZED = 0x80, 0x60, 0x40, 0x00, 0x02, 0x01
+_MOST_EXPEDITED = 4
+_TIMED_OUT = 0x05040000
+ROUND_S = 0.02
+"""How long the others wait for the slowest answer: asking again at once, low node ids would take the whole bus."""
+
+
+class SdoTimeoutError(SdoCommunicationError):
+    """A request got no answer in time, however often it was sent."""
+
+
+def download(index: int, subindex: int, data: bytes) -> Generator[bytes | None, bytes, None]:
+    """Write up to four bytes.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or more than four bytes.
+    """
+    if not 0 < len(data) <= _MOST_EXPEDITED:
+        raise SdoCommunicationError(f"{index:04X}h:{subindex:02X} takes {len(data)} bytes; a concise write has 1 to 4")
+    command = 0x23 | (_MOST_EXPEDITED - len(data)) << 2
+    yield from _answered(bytes((command,)), index, subindex, data.ljust(4, b"\0"), _DOWNLOADED)
+
+
+def read_value(variable: ODVariable) -> Generator[bytes | None, bytes, Any]:
+    """Read an entry by its data type, in the entry's own length whatever the length of the answer.
+
+    Many nodes answer with four bytes where the entry has one or two. The bytes beyond its length must be padding.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or one that does not fit the entry.
+    """
+    size = len(variable) // 8
+    data = yield from upload(variable.index, variable.subindex, size)
+    own, beyond = data[:size], data[size:]
+    negative = variable.data_type in SIGNED_TYPES and own[-1:] >= b"\x80"
+    if len(own) < size or (any(beyond) and not (negative and min(beyond) == 0xFF)):
+        got = f"{len(data)}: {data.hex(' ')}" if data else "none"
+        raise SdoCommunicationError(f"expected {size} byte{'s' * (size > 1)}, got {got}")
+    return variable.decode_raw(own)
+
+
+def upload(index: int, subindex: int, size: int = _MOST_EXPEDITED) -> Generator[bytes | None, bytes, bytes]:
+    """Read an entry of any length.
+
+    Args:
+        index, subindex: of the entry.
+        size: bytes to take of an expedited answer that does not state how many of its four bytes are the value.
+
+    Raises:
+        SdoAbortedError: the node refused.
+        SdoCommunicationError: no answer, or one segment twice.
+    """
+    answer = yield from _answered(b"\x40", index, subindex, bytes(4), _UPLOADED)
+    if answer[0] & _EXPEDITED:
+        return answer[4 : 8 - (answer[0] >> 2 & 3)] if answer[0] & _SIZED else answer[4 : 4 + size]
+    return (yield from _segments())
+
+
+def _answered(
+    command: bytes, index: int, subindex: int, data: bytes, expected: int
+) -> Generator[bytes | None, bytes, bytes]:
+    multiplexer = index.to_bytes(2, "little") + bytes((subindex,))
+    answer = yield command + multiplexer + data
+    while answer[1:4] != multiplexer or not (answer[0] == _ABORT or answer[0] & 0xE0 == expected):
+        answer = yield None  # a late one, to an earlier request: of this entry too, which is read after it was written
+    _check_abort(answer)
+    return answer
+
+
+def _segments() -> Generator[bytes | None, bytes, bytes]:
+    data, toggle, last = b"", 0, False
+    while not last:
+        answer = yield bytes((0x60 | toggle,)) + bytes(7)
+        while not (answer[0] == _ABORT or answer[0] & 0xE0 == _SEGMENT):  # a late one, to the request that began this
+            answer = yield None
+        _check_abort(answer)
+        if answer[0] & 0xF0 != toggle:
+            raise SdoCommunicationError("Toggle bit mismatch")
+        data += answer[1 : 8 - (answer[0] >> 1 & 7)]
+        toggle ^= 0x10
+        last = bool(answer[0] & 1)
+    return data
+
+
+def _check_abort(answer: bytes) -> None:
+    if answer[0] == _ABORT:
+        raise SdoAbortedError(int.from_bytes(answer[4:], "little"))
+
+
+class _Talk:
+    """One dialogue under way."""
+
+    def __init__(self, network: PumpedNetwork, node_id: int, dialogue: Dialogue, timeout_ns: int, retries: int) -> None:
+        self.node_id = node_id
+        self.inbox: list[bytes] = []
+        self.over = False
+        self.due_ns = 0
+        self.repeated = 0
+        self._network = network
+        self._dialogue = dialogue
+        self._timeout_ns = timeout_ns
+        self._retries = retries
+        self._request = b""
+        self._tries = 0
+        self._go_on(lambda: next(dialogue))
+
+    def take(self, _id: int, data: bytes, _t_ns: int) -> None:
+        """Keep an answer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
+        if len(data) == _LENGTH and not self.over:
+            self.inbox.append(data)
+
+    def serve(self) -> None:
+        """Hand the dialogue its answers; where none came in time, ask again or give up."""
+        while self.inbox and not self.over:
+            answer = self.inbox.pop(0)
+            self._go_on(lambda answer=answer: self._dialogue.send(answer))  # type: ignore[misc]
+        if self.over or self.due_ns > self._network.port.clock.now_ns():
             return
+        self._transmit(bytes((_ABORT,)) + self._request[1:4] + _TIMED_OUT.to_bytes(4, "little"))
+        if self._tries <= self._retries and self._request[0] >> 5 != 3:  # a segment cannot be asked for twice
+            self.repeated += 1
+            self._ask()
+        else:
+            tries = f", {self._tries} times" if self._tries > 1 else ""
+            late = SdoTimeoutError(f"No SDO response received within {self._timeout_ns * 1e-9:g} s{tries}")
+            self._go_on(lambda: self._dialogue.throw(late))
+
+    def _go_on(self, step: Callable[[], bytes | None]) -> None:
         try:
-            self.notify(can_id, bytearray(data), t_ns * 1e-9)
-        except struct.error:
-            self.malformed += 1
+            request = step()
+        except StopIteration:
+            self.over = True
+            return
+        if request is not None:
+            self._request, self._tries = request, 0
+            self.inbox.clear()
+            self._ask()
+
+    def _ask(self) -> None:
+        self._tries += 1
+        self.due_ns = self._network.port.clock.now_ns() + self._timeout_ns
+        self._transmit(self._request)
+
+    def _transmit(self, data: bytes) -> None:
+        self._network.send_message(SDO_RX_BASE + self.node_id, data)
 
 
-class PumpedNode(RemoteNode):
-    """A canopen `RemoteNode` whose SDO waits pump the network."""
+def hold_dialogues(
+    network: PumpedNetwork, dialogues: Mapping[int, Dialogue], *, timeout_s: float, retries: int = 0
+) -> dict[int, int]:
+    """Carry out dialogues with several nodes at once, on the predefined SDO channel.
 
-    def add_sdo(self, rx_cobid: int, tx_cobid: int) -> PumpedSdoClient:
-        """Add an SDO client on these identifiers."""
-        client = PumpedSdoClient(rx_cobid, tx_cobid, self.object_dictionary)  # type: ignore[no-untyped-call]
-        self.sdo_channels.append(client)
-        if self.has_network():
-            client.network = self.network
-            self.network.subscribe(client.tx_cobid, client.on_response)
-        return client
+    Args:
+        network: pumped meanwhile.
+        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
+        timeout_s: for an answer.
+        retries: how often a request without an answer is sent again.
+
+    Returns:
+        Requests that were sent again, by node id.
+    """
+    talks: list[_Talk] = []
+    try:
+        for node_id, dialogue in dialogues.items():
+            talks.append(_Talk(network, node_id, dialogue, round(timeout_s * 1e9), retries))
+            network.subscribe(SDO_TX_BASE + node_id, talks[-1].take)
+        while waiting := [talk for talk in talks if not talk.over]:
+            left_s = max(0, min(talk.due_ns for talk in waiting) - network.port.clock.now_ns()) * 1e-9
+            network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, ROUND_S))
+            for talk in waiting:
+                talk.serve()
+    finally:
+        for talk in talks:
+            network.unsubscribe(SDO_TX_BASE + talk.node_id, talk.take)
+    return {talk.node_id: talk.repeated for talk in talks}
 
 
-class PumpedSdoClient(SdoClient):
-    """canopen's SDO client, waiting by receiving; its RESPONSE_TIMEOUT (s) runs on the port's clock."""
+# LSS: finds nodes without an id, one after another, and gives them one.
 
-    def on_response(self, can_id: int, data: bytearray, timestamp: float) -> None:
-        """Keep a response for the transfer; anything but 8 bytes is no SDO (CiA 301, 7.2.4.3)."""
-        if len(data) != _SDO_LENGTH:
-            raise struct.error("an SDO response has 8 bytes")
-        super().on_response(can_id, data, timestamp)  # type: ignore[no-untyped-call]
+SETTLE_S = 0.005
+"""Wait after the first answer: several nodes may give the same answer to one question, one after another."""
+ANSWER_S = 0.5
+SEARCH_S = 0.05
+"""Time without an answer after which a question of fastscan counts as answered with no."""
 
-    def read_response(self) -> bytes:
-        """Receive until a response is there, then read it as canopen does.
+
+class LssAnswerError(BusError):
+    """An LSS slave gives no answer, an error code, or answers that do not agree."""
+
+
+class Lss:
+    """The LSS master on a network. All slaves answer with one identifier, so it asks one question at a time."""
+
+    def __init__(self, network: PumpedNetwork) -> None:
+        self._network = network
+
+    def release(self) -> None:
+        """Put all nodes into the waiting state; a node that got an id boots with it."""
+        self._send(pack_lss(LssCommand.SWITCH_GLOBAL, bytes((LssState.WAITING,))))
+
+    def select(self, address: LssAddress) -> bool:
+        """Put the node of this address into configuration; whether it answered."""
+        *first, last = [
+            pack_number(LssCommand(LssCommand.SELECT_VENDOR + i), number) for i, number in enumerate(address.numbers)
+        ]
+        for message in first:
+            self._send(message)
+        return bool(self._ask(last, ANSWER_S, LssCommand.SELECTED))
+
+    def inquire_node_ids(self) -> list[int]:
+        """What all the nodes in configuration answer: one node id, unless several devices have one address."""
+        command = LssCommand.INQUIRE_NODE_ID
+        return [answer[1] for answer in self._ask(pack_lss(command), ANSWER_S, command)]
+
+    def configure_node_id(self, node_id: int) -> None:
+        """Give the node in configuration its id.
 
         Raises:
-            SdoCommunicationError: none came in RESPONSE_TIMEOUT.
-            SdoAbortedError: the server aborted.
+            LssAnswerError: it does not answer or refuses.
         """
-        arrived = cast(PumpedNetwork, self.network).pump_until(
-            lambda: not self.responses.empty(), self.RESPONSE_TIMEOUT
+        if code := self._configure(LssCommand.CONFIGURE_NODE_ID, node_id):
+            raise LssAnswerError(f"LSS error {code}")
+
+    def store(self) -> bool:
+        """Let the node in configuration keep its id when its power goes; False where it does not support that.
+
+        Raises:
+            LssAnswerError: it does not answer or could not store it.
+        """
+        if (code := self._configure(LssCommand.STORE)) > LssError.REFUSED:
+            raise LssAnswerError(f"it could not store it: LSS error {code}")
+        return code == LssError.NONE
+
+    def fast_scan(self) -> LssAddress | None:
+        """Find the unconfigured node with the lowest address; it is in configuration afterwards.
+
+        Returns:
+            Its address; None where nobody answers.
+
+        Raises:
+            LssAnswerError: somebody answers, but to no address: answers were lost or came late.
+        """
+        for timeout_s in (SEARCH_S, 5 * SEARCH_S):
+            if not self._identified(0, NOTHING_ASKED, 0, 0, ANSWER_S):
+                return None
+            if (address := self._search(timeout_s)) is not None:
+                return address
+        raise LssAnswerError(
+            f"{self._network.port.channel}: nodes without an id answer, but not to the end of a search; connect them"
+            " one at a time"
         )
-        if not arrived:
-            raise SdoCommunicationError("No SDO response received")
-        response: bytes = super().read_response()  # type: ignore[no-untyped-call]
-        return response
+
+    def _search(self, timeout_s: float) -> LssAddress | None:
+        found: list[int] = []
+        for position in range(4):
+            number = 0
+            for bit in range(31, -1, -1):
+                if not self._identified(number, bit, position, position, timeout_s):
+                    number |= 1 << bit
+            if not self._identified(number, 0, position, (position + 1) % 4, ANSWER_S):
+                return None
+            found.append(number)
+        return LssAddress(*found)
+
+    def _identified(self, number: int, bit: int, position: int, following: int, timeout_s: float) -> bool:
+        return bool(self._ask(pack_fastscan(number, bit, position, following), timeout_s, LssCommand.IDENTIFIED))
+
+    def _configure(self, command: LssCommand, value: int = 0) -> int:
+        answers = self._ask(pack_lss(command, bytes((value,))), ANSWER_S, command)
+        if not answers:
+            raise LssAnswerError(f"no answer to {command.name.lower().replace('_', ' ')}")
+        return answers[0][1]
+
+    def _send(self, message: bytes) -> None:
+        self._network.send_message(LSS_REQUEST_ID, message)
+
+    def _ask(self, message: bytes, timeout_s: float, command: LssCommand) -> list[bytes]:
+        """Send a question; the answers with this command that come."""
+        network = self._network
+        answers: list[bytes] = []
+
+        def take(_id: int, data: bytes, _t_ns: int) -> None:
+            if len(data) == LSS_LENGTH:
+                answers.append(data)
+
+        network.pump_until(lambda: True, 0.0)  # late answers to earlier questions
+        network.subscribe(LSS_ANSWER_ID, take)
+        try:
+            self._send(message)
+            if network.pump_until(lambda: bool(answers), timeout_s):
+                network.pump_until(lambda: False, SETTLE_S)
+        finally:
+            network.unsubscribe(LSS_ANSWER_ID, take)
+        return [answer for answer in answers if answer[0] == command]
 
 
 # Who is there? One SDO read of 1000h to each node id, all at once; any answer counts, an abort too.

@@ -15,7 +15,7 @@ import ctypes
 import errno
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, fields
 from enum import IntEnum
 from typing import Protocol
@@ -142,16 +142,11 @@ class Timespec(ctypes.Structure):
 
 
 class MonotonicClock:
-    """CLOCK_MONOTONIC, with sleeps on absolute deadlines so that periods do not drift.
+    """CLOCK_MONOTONIC, with sleeps on absolute deadlines so that periods do not drift."""
 
-    Args:
-        spin_ns: the last part of each sleep, spent awake; 150 µs steadies the wake-up where a core can be spared.
-    """
+    __slots__ = ("_clock_nanosleep", "_request")
 
-    __slots__ = ("_clock_nanosleep", "_request", "_spin_ns")
-
-    def __init__(self, spin_ns: int = 0) -> None:
-        self._spin_ns = spin_ns
+    def __init__(self) -> None:
         self._request = Timespec()
         self._clock_nanosleep = getattr(ctypes.CDLL(None), "clock_nanosleep", None)
 
@@ -164,20 +159,15 @@ class MonotonicClock:
 
         A time that is past costs a reading of the clock: the system call alone costs five in a virtual machine.
         """
-        if time.monotonic_ns() >= t_ns:
+        now_ns = time.monotonic_ns()
+        if now_ns >= t_ns:
             return
-        self._sleep(t_ns - self._spin_ns)
-        if self._spin_ns:
-            while time.monotonic_ns() < t_ns:
-                pass
-
-    def _sleep(self, t_ns: int) -> None:
         clock_nanosleep = self._clock_nanosleep
         if clock_nanosleep is None:
-            time.sleep(max(0, t_ns - time.monotonic_ns()) * 1e-9)
+            time.sleep((t_ns - now_ns) * 1e-9)
             return
         request = self._request
-        request.tv_sec, request.tv_nsec = divmod(max(0, t_ns), 1_000_000_000)
+        request.tv_sec, request.tv_nsec = divmod(t_ns, 1_000_000_000)
         while status := clock_nanosleep(_CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None):
             if status != errno.EINTR:
                 raise OSError(status, os.strerror(status))
@@ -207,12 +197,9 @@ _OVERFLOWS, _WARNINGS, _PASSIVES, _ACTIVE = 0x03, 0x0C, 0x30, 0x40
 TimedFrame = tuple[int, bytes, int]
 """A received frame: can_id, data, time of reception in ns on the port's clock."""
 
-CanFilter = tuple[int, int]
-"""A frame is let in if `can_id & mask == filter_id & mask` for one of the filters: (filter_id, mask)."""
-
 
 class ControllerState(IntEnum):
-    """Error state of the CAN controller, as far as error frames tell (ISO 11898-1 fault confinement)."""
+    """Error state of the CAN controller, as far as error frames show it (ISO 11898-1 fault confinement)."""
 
     ACTIVE = 0
     WARNING = 1
@@ -223,7 +210,7 @@ class ControllerState(IntEnum):
 def is_bus_error(can_id: int) -> bool:
     """Whether this is an error frame of a frame that went wrong: protocol, acknowledgement or bit error.
 
-    A lost arbitration, which some drivers report every time, and a change of the controller's state are none.
+    A lost arbitration, which some drivers report every time, and a change of the controller's state do not count.
     """
     return bool(can_id & ERR_FLAG and can_id & _BUS_ERRORS)
 
@@ -234,13 +221,13 @@ def state_after(state: ControllerState, can_id: int, data: bytes) -> ControllerS
         return ControllerState.BUS_OFF
     if can_id & ERR_RESTARTED:
         return ControllerState.ACTIVE
-    for bits, told in (
+    for bits, reported in (
         (_PASSIVES, ControllerState.PASSIVE),
         (_WARNINGS, ControllerState.WARNING),
         (_ACTIVE, ControllerState.ACTIVE),
     ):
         if _of_controller(can_id, data) & bits:
-            return told
+            return reported
     return state
 
 
@@ -285,7 +272,7 @@ class Reports:
 
     Attributes:
         error_frame: called with (can_id, data, t_ns) of every error frame.
-        say: called with what the user has to know.
+        say: called with each message for the user.
     """
 
     error_frame: Callable[[int, bytes, int], None] = _nobody
@@ -312,7 +299,7 @@ class Port(Protocol):
 
     @property
     def state(self) -> ControllerState:
-        """The CAN controller's error state, as far as the port can tell."""
+        """The CAN controller's error state, as far as the port knows it."""
         ...
 
     @property
@@ -348,21 +335,49 @@ class Port(Protocol):
         """
         ...
 
+    def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
+        """Wait for frames, until `until_ns` at the latest, and return them.
+
+        Raises:
+            InterfaceError: the interface is down, closed or lost.
+        """
+        ...
+
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Let frames with these 11-bit identifiers wake nobody, where the interface can: they come with the next other.
+
+        Raises:
+            InterfaceError: the port has filters, or the interface is lost.
+        """
+        ...
+
     def close(self) -> None:
         """Give the interface back; closing twice is allowed, everything else afterwards raises InterfaceError."""
         ...
 
 
+class PlainPort:
+    """Base class of ports that wait and drain in two calls, and are woken by every frame."""
+
+    def wait_and_drain(self: Port, until_ns: int) -> list[TimedFrame]:
+        """Wait for frames, until `until_ns` at the latest, and return them."""
+        self.wait(until_ns)
+        return self.drain()
+
+    def defer(self, can_ids: Collection[int]) -> None:
+        """Nothing: these frames wake the port too."""
+
+
 # Several buses as one `Port`: what is sent goes to the bus of its receiver, what arrives comes in the order of time.
 #
 # SYNC, NMT, TIME and the master's heartbeat go to all of them, so that one SYNC counts on every bus. A bus that is lost
-# is told once; then the others go on without it, so that their nodes can be stopped in an orderly way.
+# is reported once; then the others go on without it, so that their nodes can be stopped in an orderly way.
 
 _SLICE_NS = 200_000
 """How long one bus is waited for before the others are looked at again."""
 
 
-class JoinedPort:
+class JoinedPort(PlainPort):
     """A port on several buses.
 
     Args:
@@ -375,16 +390,9 @@ class JoinedPort:
         self._routes = {can_id: self._ports[channel] for can_id, channel in routes.items()}
         self._arrived: list[TimedFrame] = []
         self._lost: set[str] = set()
-
-    @property
-    def clock(self) -> Clock:
-        """The ports' clock."""
-        return next(iter(self._ports.values())).clock
-
-    @property
-    def channel(self) -> str:
-        """The channels."""
-        return "+".join(self._ports)
+        self.clock = next(iter(ports.values())).clock
+        self.channel = "+".join(ports)
+        self.stamps_arrival = all(port.stamps_arrival for port in ports.values())
 
     @property
     def counters(self) -> PortCounters:
@@ -397,16 +405,11 @@ class JoinedPort:
         """The worst of their controllers' states."""
         return max(port.state for port in self._ports.values())
 
-    @property
-    def stamps_arrival(self) -> bool:
-        """Whether all of them do."""
-        return all(port.stamps_arrival for port in self._ports.values())
-
     def send_batch(self, frames: Sequence[Frame], t_ns: int | None = None) -> None:
         """Send each frame on the bus of its identifier, or on all.
 
         Raises:
-            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each bus is told
+            InterfaceError: a bus is down, closed, lost or stays full; the others have their frames. Each is reported
                 once, as long as there is another.
         """
 

@@ -41,12 +41,12 @@ def ask_for_processor() -> bool:
 def realtime(priority: int, say: Callable[[str], None], *, processor_from_last: int = 0) -> Iterator[None]:
     """Within the block this process is scheduled by SCHED_FIFO, on one processor, with its memory locked.
 
-    Each of the three is asked for by itself; what is not permitted is said, with the way to it, and done without.
+    Each of the three is asked for by itself; what is not permitted is reported, with the way to it, and left out.
     Everything is given back at the end.
 
     Args:
         priority: SCHED_FIFO priority, 1–99; interrupt threads of a PREEMPT_RT kernel have 50.
-        say: is told what was not permitted.
+        say: called with what was not permitted.
         processor_from_last: 0 for the last processor, 1 for the one before it; no choice where there are not so many.
     """
     wishes: tuple[tuple[Callable[[], Callable[[], object]], str, str], ...] = (

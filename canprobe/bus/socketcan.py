@@ -22,10 +22,9 @@ import time
 from collections.abc import Collection, Sequence
 
 from canprobe.bus.link import TX_QUEUE, drop_queued, emptying_line, ip_line, setting_line, sudo
-from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row, frame_socket
+from canprobe.bus.mmsg import CLASSIC_BYTES, SO_RXQ_OVFL, SO_TIMESTAMPNS, FrameSocket, Row
 from canprobe.bus.port import (
     ERR_FLAG,
-    CanFilter,
     Clock,
     ControllerState,
     PortCounters,
@@ -44,6 +43,7 @@ _CAN_RAW_ERR_FILTER = 2
 _CAN_RAW_FD_FRAMES = 5
 _CAN_RAW_JOIN_FILTERS = 6
 _CAN_INV_FILTER = 0x20000000
+_SINGLE_WAIT_US = 2000  # how late a deadline may be served on an idle bus
 _CAN_ERR_MASK = 0x1FFFFFFF
 _SO_RCVBUFFORCE = 33
 _SO_MEMINFO, _MEMINFO, _WMEM_ALLOC = 55, struct.Struct("=9I"), 2
@@ -56,7 +56,7 @@ _RECEIVE_BUFFER = 4 << 20
 _RETRY_S, _LATER_RETRY_S = 200e-6, 2e-3
 _PATIENCE_NS = 10_000_000
 _TELL_NS = 1_000_000_000
-"""A queue that has been full for so long is told to the user, where it is waited for."""
+"""A port that waits reports a queue that has been full for so long."""
 _STUCK_NS, _LINGER_NS = 100_000_000, 1_000_000_000
 """How long a port that closes waits for the next queued frame to leave, and for all of them."""
 _RECALIBRATE_NS = 1_000_000_000
@@ -68,8 +68,6 @@ class SocketCanPort:
     Args:
         channel: the interface, such as `can0`.
         clock: a clock that shows CLOCK_MONOTONIC.
-        filters: what the kernel lets in; everything by default.
-        batched: use recvmmsg and sendmmsg where they exist.
         bitrate: that the interface is to have, bit/s: for the lines to type; it is not looked at.
         data_bitrate: send and receive CAN FD frames too; None: classical frames only.
         waits: wait for a full queue as long as it takes, as a device does for its bus; else up to 10 ms.
@@ -77,7 +75,7 @@ class SocketCanPort:
 
     Attributes:
         counters: what has passed.
-        state: the controller's state as the last error frame told; ACTIVE before the first.
+        state: the controller's state as of the last error frame; ACTIVE before the first.
 
     Raises:
         InterfaceError: the interface is missing, down, no CAN interface, or not set up for CAN FD; with the line to
@@ -89,8 +87,6 @@ class SocketCanPort:
         channel: str,
         clock: Clock,
         *,
-        filters: Sequence[CanFilter] | None = None,
-        batched: bool = True,
         bitrate: int = 1_000_000,
         data_bitrate: int | None = None,
         waits: bool = False,
@@ -107,15 +103,14 @@ class SocketCanPort:
         self.channel = channel
         self.counters = PortCounters()
         self.state = ControllerState.ACTIVE
-        self._socket = _open(channel, filters, fd=fd)
-        self._frames = frame_socket(self._socket, batched, fd)
-        self._batched = batched
-        self._filtered = filters is not None
+        self._socket = _open(channel, fd=fd)
+        self._frames = FrameSocket(self._socket, fd)
         self._patient: socket.socket | None = None
         self._patient_frames: FrameSocket | None = None
         self._dropped = [0, 0]
         self._poll = _Poll(self._socket.fileno())
-        self._offset_ns = self._calibrated_ns = self._patience_ns = self._told_ns = 0
+        self._blocks = False
+        self._offset_ns = self._calibrated_ns = self._told_ns = 0
 
     stamps_arrival = True
 
@@ -172,41 +167,33 @@ class SocketCanPort:
             if self._poll(left_ns):
                 return
 
-    def receive(self, timeout_ns: int) -> list[TimedFrame]:
-        """Wait for frames and return them, as `wait` and `drain` do, with one system call where they take three.
-
-        Args:
-            timeout_ns: longest wait; it is set once and kept.
-        """
+    def wait_and_drain(self, until_ns: int) -> list[TimedFrame]:
+        """As `wait` and `drain`, with one system call where they take three. It waits 2 ms, whatever `until_ns` is."""
         self._check_open()
-        if timeout_ns != self._patience_ns:
+        if not self._blocks:
             self._socket.setblocking(True)
-            seconds, ns = divmod(timeout_ns, 1_000_000_000)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", seconds, ns // 1000))
-            self._patience_ns = timeout_ns
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, struct.pack("@ll", 0, _SINGLE_WAIT_US))
+            self._blocks = True
         return self._take(wait=True)
 
     def defer(self, can_ids: Collection[int]) -> None:
-        """Let frames with these 11-bit identifiers wake nobody: `drain` and `receive` return them with the next other,
-        `receive` also at its time-out.
+        """Let frames with these 11-bit identifiers wake nobody: `drain` and `wait_and_drain` return them with the next
+        other, `wait_and_drain` also at its time-out.
 
         Whoever has to do nothing about them before that frame (synchronous PDOs: before the SYNC) is spared a wake-up
         for each. They keep their place by their time of arrival. At a change of the identifiers a frame may come twice.
 
         Raises:
-            InterfaceError: this port was opened with filters of its own, or the interface is lost.
+            InterfaceError: the interface is lost.
         """
-        if self._filtered:
-            raise InterfaceError(f"{self.channel}: a port with filters cannot defer frames")
         self._check_open()
         mask = 0x7FF | EFF_FLAG | RTR_FLAG
         if self._patient is not None:
             self._patient.close()
             self._patient = self._patient_frames = None
         if can_ids:
-            filters = [(can_id, mask) for can_id in can_ids]
-            self._patient = _open(self.channel, filters, errors=False, fd=self._fd)
-            self._patient_frames = frame_socket(self._patient, self._batched, self._fd)
+            self._patient = _open(self.channel, [(can_id, mask) for can_id in can_ids], fd=self._fd)
+            self._patient_frames = FrameSocket(self._patient, self._fd)
         try:
             self._socket.setsockopt(_SOL_CAN_RAW, _CAN_RAW_JOIN_FILTERS, struct.pack("=I", 1))
             others = [(can_id | _CAN_INV_FILTER, mask) for can_id in can_ids] or [(0, 0)]
@@ -375,15 +362,16 @@ def _how_to_make(channel: str) -> str:
     return "is the adapter plugged in? The interfaces there are: ip -br link show type can"
 
 
-def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = True, fd: bool = False) -> socket.socket:
+def _open(channel: str, only: Sequence[tuple[int, int]] | None = None, *, fd: bool) -> socket.socket:
+    """A raw socket for all frames and error frames, or only for those with `can_id & mask == id & mask`: (id, mask)."""
     sock = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     try:
         sock.setblocking(False)
         if fd:
             sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FD_FRAMES, struct.pack("=i", 1))
-        if filters is not None:
-            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(filters))
-        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if errors else 0))
+        if only is not None:
+            sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_FILTER, _packed(only))
+        sock.setsockopt(_SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", _CAN_ERR_MASK if only is None else 0))
         sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         sock.setsockopt(socket.SOL_SOCKET, SO_RXQ_OVFL, 1)
         _enlarge_buffer(sock)
@@ -394,7 +382,7 @@ def _open(channel: str, filters: Sequence[CanFilter] | None, *, errors: bool = T
     return sock
 
 
-def _packed(filters: Sequence[CanFilter]) -> bytes:
+def _packed(filters: Sequence[tuple[int, int]]) -> bytes:
     return b"".join(struct.pack("=II", can_id, mask) for can_id, mask in filters)
 
 

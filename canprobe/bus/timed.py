@@ -26,7 +26,6 @@ from canprobe.bus.lockstep import (
     LockstepPort,
     Participant,
     arbitration_key,
-    name_of,
 )
 from canprobe.bus.port import ERR_BUS, ERR_FLAG, ERR_PROTOCOL, VirtualClock
 from canprobe.protocol.frame_bits import ERROR_DELIMITER_BITS, ERROR_FLAG_BITS, INTERMISSION_BITS, exact_bits
@@ -72,10 +71,6 @@ Queue = Literal["priority", "fifo"]
 LINGER_NS = 50_000_000
 """How long a port that closes lets the bus carry what is queued, at most."""
 _NS = 1_000_000_000
-_RECESSIVE_BITS = 11
-_AFTER_ACK_BITS = (
-    8  # recessive bits before a frame's or an error frame's end: ACK delimiter and end of frame, delimiter
-)
 _ERROR_BITS = 2 * ERROR_FLAG_BITS + ERROR_DELIMITER_BITS  # the others answer the flag of the first with theirs
 
 _Entry = tuple[int, int, BusNode, Frame]
@@ -130,7 +125,7 @@ class TimedBus(LockstepBus):
 
     # what is to be seen
 
-    def counters(self, owner: Participant | LockstepPort) -> ErrorCounters:
+    def counters(self, owner: Participant) -> ErrorCounters:
         """Error counters of a participant or a port.
 
         Raises:
@@ -242,7 +237,7 @@ class TimedBus(LockstepBus):
         self.settle()
 
     def _earliest(self) -> int | None:
-        dues = [node.due for node, _ in self._participants if node.due is not None]
+        dues = [node.due for node in self._nodes if node.due is not None]
         return min(dues) if dues else None
 
     def _bits_ns(self, bits: int) -> int:
@@ -264,9 +259,7 @@ class TimedBus(LockstepBus):
             self._compete(node, frames)
         if len(self._ready) + len(node.outbox) > self._max_frames:
             self._ready.clear()
-            raise self._endless(
-                self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {name_of(node.owner)}"
-            )
+            raise self._endless(self.clock.now_ns(), f"more than {self._max_frames} frames wait, of {node.owner.name}")
 
     def _is_ready(self, node: BusNode) -> bool:
         flying = self._flying
@@ -346,31 +339,18 @@ class TimedBus(LockstepBus):
         if self._controllers.troubled:
             self._controllers.succeed(sender, t_ns)
             off = self._controllers.off()
-        self._hand_over(sender, frame, t_ns, off)
-
-    def _hand_over(self, sender: BusNode, frame: Frame, t_ns: int, off: Sequence[BusNode]) -> None:
-        """Everybody hears a frame but its sender and those who are bus off."""
         can_id, data = frame
         if self.recorder is not None:
             self.recorder(can_id, data, t_ns)
-        listeners = sender.listeners.get(can_id)
-        if listeners is None:
-            listeners = self._listeners_of(sender, can_id)
-        if off:
-            listeners = tuple(listener for listener in listeners if listener[1] not in off)
-        for receive, receiver in listeners:
+        for receive, receiver in self._listeners_of(sender, can_id):
+            if receiver in off:
+                continue
             answers = receive(can_id, data, t_ns)
-            due = receiver.owner.next_deadline_ns  # type: ignore[union-attr]
+            due = receiver.owner.next_deadline_ns
             if due != receiver.due:
                 self._reschedule(receiver, due)
             if answers:
                 self._queue(receiver, answers)
-        stamped = (can_id, data, t_ns)
-        if off:
-            self._deliver_to_ports(sender, stamped, off)
-        else:
-            for put in sender.inboxes:
-                put(stamped)
 
     def _reschedule(self, node: BusNode, due_ns: int | None) -> None:
         """A participant's deadline has moved."""
@@ -380,11 +360,6 @@ class TimedBus(LockstepBus):
             self._first_due = due_ns
         elif before == first:
             self._first_due = self._earliest()
-
-    def _deliver_to_ports(self, sender: BusNode, stamped: tuple[int, bytes, int], off: Sequence[BusNode]) -> None:
-        for node in self._nodes:
-            if node is not sender and node not in off and isinstance(node.owner, LockstepPort):
-                node.owner.inbox.append(stamped)
 
     # errors
 
@@ -401,7 +376,7 @@ class TimedBus(LockstepBus):
             heappush(self._ready, entry)
 
     def _silence(self, node: BusNode) -> None:
-        """A node that is bus off loses what it wanted to say."""
+        """A node that is bus off loses what it wanted to send."""
         node.outbox.clear()
         self._ready = [entry for entry in self._ready if entry[2] is not node]
         heapify(self._ready)
@@ -415,13 +390,13 @@ class TimedBus(LockstepBus):
             pass
         super().remove_port(port)
 
-    def _add(self, owner: Participant | LockstepPort) -> BusNode:
+    def _add(self, owner: Participant) -> BusNode:
         node = super()._add(owner)
         self._controllers.add(node)
         self._stale = True
         return node
 
-    def _remove(self, owner: Participant | LockstepPort) -> None:
+    def _remove(self, owner: Participant) -> None:
         for node in [node for node in self._nodes if node.owner is owner]:
             self._silence(node)
             self._controllers.remove(node)

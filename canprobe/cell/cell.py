@@ -1,31 +1,30 @@
-"""The cell: brought up, run cycle by cycle under supervision, and always left with the drives disabled."""
+"""The cell: brought up, run cycle by cycle under supervision, and left with the drives disabled on every way out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from canprobe.bus.network import PumpedNetwork
-from canprobe.bus.port import Port, PortCounters, TimedFrame
+from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock
 from canprobe.bus.scheduling import Interrupts
-from canprobe.cell.bringup import BringUp, BringUpTimes, NodeReport, NodeSetup
-from canprobe.cell.controller import Command, Controller, Measurement, TactileSample, as_controller
-from canprobe.cell.cycle import Cycle, CycleSettings, Observers
-from canprobe.cell.drives import DriveGroup, TactileReceiver, Vector
+from canprobe.cell.array import make_tactile, patch_from
+from canprobe.cell.bringup import BringUp
+from canprobe.cell.configuration import make_setups
+from canprobe.cell.controller import Command, Controller, Measurement, as_controller
+from canprobe.cell.cycle import Cycle, Observers
+from canprobe.cell.drives import make_drives
 from canprobe.cell.log import Notes, RunLog
-from canprobe.cell.supervision import Limits, Reaction, Seen
-from canprobe.cell.supervisor import Finding, Supervisor
-from canprobe.cell.watch import NodeWatch, obeys
+from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
+from canprobe.cell.supervisor import JointGuard, Supervisor
+from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
-
-if TYPE_CHECKING:
-    from canprobe.cell.supervisor import LiftOff
-    from canprobe.touch.patch.image import Patch
 
 Result = TypeVar("Result")
 
@@ -33,7 +32,7 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 ENABLE_TIMEOUT_S = 2.0
 STOP_TIMEOUT_S = 0.5
-FREE_IT = "free it; a run does not begin while the array feels a force"
+FREE_IT = "free it; a run does not begin while the array measures a force"
 OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
 """Of the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
@@ -49,70 +48,61 @@ class Cell:
     """One cell on one bus. A context manager: entering brings the nodes up, leaving stops them safely.
 
     Args:
+        plan: of the scene.
         port: the bus; it is closed on leaving.
-        setups: the nodes to bring up.
-        settings: times of the cycle.
-        drives: the arm, or None.
-        tactile: the sensor, or None.
-        limits: what the supervision must not let pass.
-        patch_from: the patch of a tactile sample; None where nothing can press.
-        lift_from: makes the way off an object, of a function that tells whether a node obeys; None without a touch.
         say: called with each step of bring-up and stop.
-        times: time-outs of bring-up.
         log_failure: says why frames are no longer written down, None while they are.
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
 
     Attributes:
+        drives, tactile: of the arm and the array; None in a scene without one.
         log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
             how long bring-up took; `start_ns` brings them onto the run's clock.
         notes: what went wrong and was lived with.
+        watch: what the nodes report of themselves.
         supervisor: the checks, from bring-up on.
+        cycle: None before bring-up is done.
     """
 
     def __init__(
         self,
+        plan: Plan,
         port: Port,
-        setups: tuple[NodeSetup, ...],
-        settings: CycleSettings,
         *,
-        drives: DriveGroup | None,
-        tactile: TactileReceiver | None,
-        limits: Limits,
-        patch_from: Callable[[TactileSample], Patch] | None = None,
-        lift_from: Callable[[Callable[[int], bool]], LiftOff] | None = None,
         say: Callable[[str], None] = lambda _: None,
-        times: BringUpTimes | None = None,
         log_failure: Callable[[], str | None] = lambda: None,
         observers: Observers | None = None,
         rows_kept: int | None = None,
         origin_ns: int = 0,
     ) -> None:
+        setup = plan.setup
         self.log = RunLog(rows_kept)
-        self._origin_ns = origin_ns
-        self._rows_kept = rows_kept
-        self.drives = drives
-        self.tactile = tactile
+        self.drives = make_drives(plan)
+        self.tactile = make_tactile(plan)
         self.notes = Notes()
-        self.watch = NodeWatch(tuple(s.node_id for s in setups), settings.master_id, limits.heartbeat_timeout_ns)
+        self.watch = NodeWatch(plan.node_ids)
         self.cycle: Cycle | None = None
+        guard = JointGuard(plan) if setup.arm is not None else None
+        seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
+        self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
+        self._plan = plan
         self._port = port
-        self._settings = settings
         self._to_say = say
         self._log_failure = log_failure
-        self.supervisor = Supervisor(Seen(limits, self.watch, drives, tactile, port.counters), patch_from)
-        self._lift_from = lift_from
         self._observers = observers
+        self._rows_kept = rows_kept
+        self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, setups, times, self._say)
+        self._bring_up = BringUp(self._network, self.watch, make_setups(plan), setup.bring_up, self._say)
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
         self._controller = Controller()
-        for node_id in self.watch.node_ids:  # canopen's nodes take these too, once they exist
+        for node_id in self.watch.node_ids:
             for base in (HEARTBEAT_BASE, EMCY_BASE):
-                self._network.subscribe(base + node_id, self._watched)
+                self._network.subscribe(base + node_id, self.watch.push)
 
     @property
     def start_ns(self) -> int:
@@ -129,38 +119,30 @@ class Cell:
         """What has passed through the cell's port."""
         return self._port.counters
 
-    @property
-    def bring_up_reports(self) -> tuple[NodeReport, ...]:
-        """How far each node came in bring-up."""
-        return self._bring_up.reports
-
     def _say(self, text: str) -> None:
-        """Tell the user; whether anybody can hear it must not decide what becomes of the drives."""
+        """Report a step to the user; a failure of that must not decide what becomes of the drives."""
         try:
             self._to_say(text)
         except Exception as error:
-            self.notes.add(f"steps could not be told: {type(error).__name__}")
-
-    def _watched(self, can_id: int, data: bytearray, t_s: float) -> None:
-        self.watch.push(can_id, bytes(data), round(t_s * 1e9))
+            self.notes.add(f"steps could not be reported: {type(error).__name__}")
 
     def _other(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """A frame that arrived during an SDO transfer and is not canopen's."""
+        """A frame that arrived during bring-up and that nobody subscribed to."""
         if self.tactile is not None and can_id in self.tactile.cob_ids:
             self.tactile.push(can_id, data, t_ns)
         else:
             self.watch.push(can_id, data, t_ns)
 
     def listen(self) -> None:
-        """Hear whether somebody else is master here, before anything is started for this cell; nothing is sent.
+        """Listen for another master, before anything is started for this cell; nothing is sent.
 
         Raises:
-            BusError: somebody is.
+            BusError: there is one.
         """
         self._bring_up.listen()
 
     def hear(self, frames: Iterable[TimedFrame]) -> None:
-        """Take what arrived before bring-up while somebody else waited on the port."""
+        """Take what arrived before bring-up, while another reader waited on the port."""
         for frame in frames:
             self.watch.push(*frame)
 
@@ -169,11 +151,12 @@ class Cell:
             self._bring_up.run()
             self.cycle = Cycle(
                 self._port,
-                self._settings,
+                self._plan,
                 drives=self.drives,
                 tactile=self.tactile,
                 watch=self.watch,
                 other=self._network.feed,
+                on_arrival=not isinstance(self._port.clock, VirtualClock),
                 kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
@@ -208,33 +191,34 @@ class Cell:
         runs = as_controller(controller)
         if self._running:
             raise UsageError("the cell runs a controller already, which must not run another one in its step")
-        self._running = True
+        self._controller, self._retreats_for, self._running = runs, None, True
         try:
-            self._run(runs, progress)
+            self._enable()
+            with Interrupts(self._stuck) as interrupts:
+                while not self._run_cycle(interrupts, progress):
+                    pass
         finally:
             self._running = False
 
-    def _run(self, controller: Controller, progress: Callable[[Measurement], None]) -> None:
-        self._controller = controller
-        self._retreats_for = None
-        self._enable(controller.inspect)
+    def _run_cycle(self, interrupts: Interrupts, progress: Callable[[Measurement], None]) -> bool:
+        """One cycle of the controller; True where it is done."""
         assert self.cycle is not None
-        with Interrupts(self._stuck) as interrupts:
-            while True:
-                measurement = self.cycle.begin()
-                held = self._supervise(measurement)
-                command = self._or_lift_off(self._ask, _hold if held else controller.step, measurement, interrupts)
-                command = self._guarded(measurement, command)
-                self.cycle.end(command)
-                self._or_lift_off(controller.update)
-                self.cycle.count_work()
-                self._record(measurement, command)
-                progress(measurement)
-                if command.stop_reason is not None:
-                    found = self._retreats_for
-                    raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
-                if command.done:
-                    return
+        measurement = self.cycle.begin()
+        held = self._supervise(measurement)
+        step = _hold if held else self._controller.step
+        command = self._or_lift_off(self._ask, step, measurement, interrupts)
+        command, finding = self.supervisor.guard_target(command)
+        if finding is not None:
+            self._react(finding)
+        self.cycle.end(command)
+        self._or_lift_off(self._controller.update)
+        self.cycle.count_work()
+        self._record(measurement, command)
+        progress(measurement)
+        if command.stop_reason is not None:
+            found = self._retreats_for
+            raise found if found and str(found) == command.stop_reason else SafetyStop(command.stop_reason)
+        return bool(command.done)
 
     def _ask(self, step: Callable[[Measurement], Command], measurement: Measurement, interrupts: Interrupts) -> Command:
         """What the controller wants.
@@ -251,7 +235,7 @@ class Cell:
             raise UsageError(f"controller: expected done to be True or False, got {command.done!r}")
         if not OWN_COLUMNS.isdisjoint(command.columns):
             taken = ", ".join(sorted(OWN_COLUMNS.intersection(command.columns)))
-            raise UsageError(f"controller: expected columns of its own, got {taken}, which the cell writes itself")
+            raise UsageError(f"controller: expected other columns than the cell's, got {taken}")
         return command
 
     def _or_lift_off(self, work: Callable[..., Result], *arguments: object) -> Result:
@@ -263,20 +247,20 @@ class Cell:
             raise
 
     def _stuck(self) -> bool:
-        """The controller, or whoever is called after it, has not come back for long."""
+        """The controller, or what is called after it, has not returned for long."""
         assert self.cycle is not None
         return self._port.clock.now_ns() - self.cycle.sync_ns > STUCK_NS
 
     # enabling and supervision
 
-    def _enable(self, inspect: Callable[[Vector], str | None]) -> None:
+    def _enable(self) -> None:
         if self.drives is None:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
         self._cycle_until((), WARM_UP_S)
         self._await_rest()
-        if (reason := inspect(self.drives.joints())) is not None:
+        if (reason := self._controller.inspect(self.drives.joints())) is not None:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
         if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
@@ -284,21 +268,21 @@ class Cell:
             node_id = self.drives.axes[i].node_id
             raise NodeError(
                 node_id,
-                f"(joint {i + 1}) is {instead} {ENABLE_TIMEOUT_S:g} s after it was told to enable operation"
+                f"(joint {i + 1}) is {instead} {ENABLE_TIMEOUT_S:g} s after the command to enable operation"
                 + self.watch.last_words(node_id),
             )
 
     def _await_rest(self) -> None:
-        """Enable nothing that is not known to stand still: a drive is told to stay where it says it is."""
+        """Enable nothing that is not known to stand still: the first target of a drive is its reported position."""
         assert self.drives is not None
-        for _ in range(int(ENABLE_TIMEOUT_S * 1e9 / self._settings.period_ns)):
-            if self.drives.at_rest:
+        for _ in range(int(ENABLE_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
+            if all(self.drives.rests):
                 return
-            self._cycle_until((), 1.5e-9 * self._settings.period_ns)
+            self._cycle_until((), 1.5e-9 * self._plan.sync.period_ns)
         axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
         raise NodeError(
             axis.node_id,
-            f"tells no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            f"reports no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
             + self.watch.last_words(axis.node_id),
         )
 
@@ -306,14 +290,14 @@ class Cell:
         self,
         states: tuple[DriveState, ...],
         timeout_s: float,
-        check: Callable[[Measurement], None] = lambda _: None,
+        check: Callable[[], None] = lambda: None,
     ) -> bool:
         """Cycle with held targets until every drive is in one of the states; False after the time-out."""
         assert self.cycle is not None and self.drives is not None
-        for _ in range(int(timeout_s * 1e9 / self._settings.period_ns)):
+        for _ in range(int(timeout_s * 1e9 / self._plan.sync.period_ns)):
             measurement = self.cycle.begin()
             self._look(measurement)
-            check(measurement)
+            check()
             reached = bool(states) and measurement.q is not None and self.drives.all_in(*states)
             self.cycle.end(None)
             self._record(measurement, None)
@@ -334,7 +318,7 @@ class Cell:
             log_failure=self._log_failure(),
         )
 
-    def _supervise_enabling(self, _: Measurement) -> None:
+    def _supervise_enabling(self) -> None:
         finding = self.supervisor.finding(enabling=True)
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
             raise finding.error
@@ -354,13 +338,6 @@ class Cell:
             self.notes.add_error(finding.error, "hold", (self.start_ns + measurement.t_ns) * 1e-9)
         return self._holding
 
-    def _guarded(self, measurement: Measurement, command: Command) -> Command:
-        """The command that may be sent."""
-        command, finding = self.supervisor.guard_target(command)
-        if finding is not None:
-            self._react(finding)
-        return command
-
     def _react(self, finding: Finding) -> None:
         reaction = finding.condition.reaction
         if reaction is Reaction.RETREAT and self._controller.lets_go:
@@ -374,9 +351,11 @@ class Cell:
     def _lift_off(self, error: BaseException) -> None:
         """Take the probe off what it presses on, as far as that goes, before the cell is stopped for ``error``."""
         supervisor = self.supervisor
-        if self._lift_from is None or not supervisor.pressing() or supervisor.must_stop():
+        if self.drives is None or self.tactile is None or not supervisor.pressing() or supervisor.must_stop():
             return
-        lift = self._lift_from(lambda node_id: obeys(self.watch, node_id, error))
+        from canprobe.cell.lift_off import LiftOff
+
+        lift = LiftOff(self._plan, self.drives, self.watch, error)
         t_s = (self.start_ns + supervisor.seen.measurement.t_ns) * 1e-9
         if not lift.possible:
             self.notes.add("no lift-off: a drive may be moving, or none obeys", t_s=t_s)
@@ -384,17 +363,14 @@ class Cell:
         self._say("lift off with the drives that obey")
         self.notes.add("lift off", t_s=t_s)
         lift.begin()
+        assert self.cycle is not None
         try:
-            self._lift(lift)
+            while (command := lift.command(supervisor)) is not None:
+                self.cycle.end(command)
+                self._record(supervisor.seen.measurement, command)
+                self._look(self.cycle.begin())
         except CanprobeError as failure:
             self.notes.add(f"while lifting off: {failure}")
-
-    def _lift(self, lift: LiftOff) -> None:
-        assert self.cycle is not None
-        while (command := lift.command(self.supervisor)) is not None:
-            self.cycle.end(command)
-            self._record(self.supervisor.seen.measurement, command)
-            self._look(self.cycle.begin())
 
     def _note_alarms(self) -> None:
         for event in self.watch.news():
@@ -428,7 +404,7 @@ class Cell:
             self.notes.add(line)
 
     def _try(self, action: Callable[[], None]) -> None:
-        """Run one step of the way out to its end: an interrupt starts it again once, a failure is noted."""
+        """Run one step of the way out to its end: an interrupt repeats it once, a failure is noted."""
         for _ in range(2):
             try:
                 action()

@@ -1,22 +1,24 @@
-"""What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again."""
+"""What `canprobe scan --lss` does: list the nodes, find devices without an id, give them ids, list again.
+
+`commission` is the whole of it. Which device gets which id follows from identities; where two devices could be meant
+it is an error. Source: CiA 305, by canopen's LSS client.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from canopen import ObjectDictionary
-from canopen.lss import ERROR_STORE_NOT_SUPPORTED, LssError
 from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.network import PumpedNetwork, PumpedNode, answering_nodes
+from canprobe.bus.network import Lss, LssAnswerError, PumpedNetwork, answering_nodes, hold_dialogues, upload
 from canprobe.bus.port import Port
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import HEARTBEAT_BASE, LssAddress, NmtCommand, pack_nmt
 
-# Which device gets which node id: nothing is left to chance.
+# Which device gets which node id.
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +42,7 @@ class Wanted:
 
 @dataclass(frozen=True, slots=True)
 class Assignment:
-    """What one device is told.
-
-    Attributes:
-        address: of the device.
-        node_id: that it gets.
-        before: that it has; None for none.
-    """
+    """The device with this address gets `node_id`; `before` is the id that it has, None for none."""
 
     address: LssAddress
     node_id: int
@@ -61,22 +57,20 @@ def choose_assignments(
     channel: str,
     must: bool = True,
 ) -> list[Assignment]:
-    """Which device gets which id. Nothing is left to chance: where two devices could be meant, it is an error.
+    """Which device gets which id.
 
     Args:
         wanted: the ids to give.
         unconfigured: devices without an id.
         present: devices that have one; None where 1018h is not complete.
         channel: of the bus, for messages.
-        must: each wanted id needs a device; False: those that nobody fits are left out.
+        must: each wanted id needs a device; False: ids that no device fits are left out.
 
     Raises:
-        NodeError: an id is in use by another device, nobody fits, or more than one device does.
+        NodeError: an id is in use by another device, no device fits, or more than one does.
     """
-    chosen: list[Assignment] = []
-    for want in wanted:
-        if (assignment := _choose(want, unconfigured, present, channel, must)) is not None:
-            chosen.append(assignment)
+    choices = [_choose(want, unconfigured, present, channel, must) for want in wanted]
+    chosen = [assignment for assignment in choices if assignment is not None]
     taken: dict[LssAddress, int] = {}
     for one in chosen:
         if one.address in taken:
@@ -96,7 +90,7 @@ def _choose(
     if want.node_id in present and (not must or (holder is not None and want.fits(holder))):
         return None
     if want.node_id in present:
-        whose = f"the device {holder}" if holder is not None else "a device that does not tell its identity"
+        whose = f"the device {holder}" if holder is not None else "a device without a complete identity (1018h)"
         raise NodeError(want.node_id, f"({want.name}) the id is busy: {whose} on {channel} has it")
     fits = [Assignment(address, want.node_id) for address in unconfigured if want.fits(address)]
     if want.numbers[3] is not None:  # a device named by its serial number may have another id already
@@ -114,9 +108,10 @@ def _choose(
         )
     if not fits and must:
         there = ", ".join(map(str, unconfigured)) or "none"
+        identity = ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
         raise NodeError(
             want.node_id,
-            f"({want.name}) no device on {channel} is {_spelled(want)}; without an id:"
+            f"({want.name}) no device on {channel} is {identity}; without an id:"
             f" {there}; check its power, bit rate and whether it supports LSS",
         )
     return fits[0] if fits else None
@@ -128,14 +123,14 @@ def _spelled(want: Wanted) -> str:
 
 # Ask nodes for their ids and tell them new ones over the bus.
 #
-# Source: CiA 305; canopen's LSS client does the asking.
+# Source: CiA 305.
 
 BOOT_UP_S = 2.0
 MOST_NODES = 127
 
 
 class FoundTwiceError(BusError):
-    """A device that was found answers the search again: nobody of a higher address can be found beside it.
+    """A device that was found answers the search again and hides those of higher addresses.
 
     Attributes:
         found: every device that was found, that one last.
@@ -158,15 +153,14 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
         BusError: two devices have one address, or answers do not agree.
         InterfaceError: the interface failed.
     """
-    lss = _lss(network)
-    lss.send_switch_state_global(lss.WAITING_STATE)
+    lss = Lss(network)
+    lss.release()
     found: list[LssAddress] = []
     try:
         for _ in range(MOST_NODES):
-            is_there, numbers = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
-            if not is_there or numbers is None:
+            address = lss.fast_scan()  # those found stay in configuration, where they no longer answer it
+            if address is None:
                 return found
-            address = LssAddress(*numbers)
             if address in found:
                 raise FoundTwiceError(network.port.channel, [*(one for one in found if one != address), address])
             found.append(address)
@@ -176,10 +170,8 @@ def find_unconfigured(network: PumpedNetwork) -> list[LssAddress]:
                     " (vendor:product:revision:serial); connect them one at a time"
                 )
         return found
-    except LssError as error:
-        raise BusError(f"{network.port.channel}: {error}") from error
     finally:
-        lss.send_switch_state_global(lss.WAITING_STATE)
+        lss.release()
 
 
 def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True) -> bool:
@@ -197,45 +189,31 @@ def assign(network: PumpedNetwork, assignment: Assignment, *, store: bool = True
         NodeError: the device does not answer, refuses, or does not boot with its new id.
         InterfaceError: the interface failed.
     """
-    lss, node_id = _lss(network), assignment.node_id
-    booted: list[bytes] = []
-    take = lambda can_id, data, t_s: booted.append(bytes(data)) if bytes(data) == b"\0" else None  # noqa: E731
+    lss, node_id, address = Lss(network), assignment.node_id, assignment.address
+    booted: list[int] = []
+
+    def take(_id: int, data: bytes, t_ns: int) -> None:
+        if data == b"\0":
+            booted.append(t_ns)
+
     network.subscribe(HEARTBEAT_BASE + node_id, take)
     try:
-        kept = _configure(lss, assignment, store)
-        lss.send_switch_state_global(lss.WAITING_STATE)
+        lss.release()
+        if not lss.select(address):
+            raise LssAnswerError("no answer to switch state selective")
+        lss.configure_node_id(node_id)
+        kept = store and lss.store()
+        lss.release()
         if assignment.before is not None:
             network.port.send_batch([pack_nmt(NmtCommand.RESET_COMMUNICATION, assignment.before)])
         if not network.pump_until(lambda: bool(booted), BOOT_UP_S):
-            raise NodeError(
-                node_id, f"the device {assignment.address} took the id but sent no boot-up within {BOOT_UP_S:g} s"
-            )
+            raise NodeError(node_id, f"the device {address} took the id but sent no boot-up within {BOOT_UP_S:g} s")
         return kept
-    except LssError as error:
-        lss.send_switch_state_global(lss.WAITING_STATE)
-        raise NodeError(node_id, f"the device {assignment.address} did not take the id: {error}") from error
+    except LssAnswerError as error:
+        lss.release()
+        raise NodeError(node_id, f"the device {address} did not take the id: {error}") from error
     finally:
         network.unsubscribe(HEARTBEAT_BASE + node_id, take)
-
-
-def _configure(lss: Any, assignment: Assignment, store: bool) -> bool:
-    lss.send_switch_state_global(lss.WAITING_STATE)
-    if not lss.send_switch_state_selective(*assignment.address.numbers):
-        raise LssError("no answer to switch state selective")
-    lss.configure_node_id(assignment.node_id)
-    if not store:
-        return False
-    try:
-        lss.store_configuration()
-    except LssError as error:
-        if str(error) != f"LSS Error: {ERROR_STORE_NOT_SUPPORTED}":
-            raise LssError(f"it could not store it: {error}") from error
-        return False
-    return True
-
-
-def _lss(network: PumpedNetwork) -> Any:  # canopen has no types here
-    return network.lss
 
 
 # List the nodes on a bus with their identity, without knowing any of them.
@@ -254,30 +232,27 @@ def scan_nodes(port: Port, timeout_s: float) -> list[dict[str, Any]]:
         InterfaceError: the interface failed.
     """
     network = PumpedNetwork(port)
-    nodes = []
+    nodes: list[dict[str, Any]] = []
     for node_id in answering_nodes(port, range(1, 128), timeout_s):
-        node = network.add_node(node_id, ObjectDictionary())  # type: ignore[no-untyped-call]
-        node.sdo.RESPONSE_TIMEOUT = timeout_s
-        numbers = {name: _number(node, subindex) for name, subindex in NUMBERS.items()}
-        nodes.append({"node_id": node_id, **numbers, "device_name": _name(node)})
+        nodes.append({"node_id": node_id})
+        hold_dialogues(network, {node_id: _identify(nodes[-1])}, timeout_s=timeout_s)
     return nodes
 
 
-def _upload(node: PumpedNode, index: int, subindex: int) -> bytes | None:
+def _identify(node: dict[str, Any]) -> Generator[bytes | None, bytes, None]:
+    """Ask one node what it is; each answer goes into ``node``."""
+    for name, subindex in NUMBERS.items():
+        data = yield from _upload(0x1018, subindex)
+        node[name] = None if data is None else int.from_bytes(data[:4], "little")
+    data = yield from _upload(0x1008, 0)
+    node["device_name"] = None if data is None else data.decode("ascii", errors="replace").rstrip("\0")
+
+
+def _upload(index: int, subindex: int) -> Generator[bytes | None, bytes, bytes | None]:
     try:
-        return bytes(node.sdo.upload(index, subindex))
+        return (yield from upload(index, subindex))
     except (SdoAbortedError, SdoCommunicationError):
         return None
-
-
-def _number(node: PumpedNode, subindex: int) -> int | None:
-    data = _upload(node, 0x1018, subindex)
-    return None if data is None else int.from_bytes(data[:4], "little")
-
-
-def _name(node: PumpedNode) -> str | None:
-    data = _upload(node, 0x1008, 0)
-    return None if data is None else data.decode("ascii", errors="replace").rstrip("\0")
 
 
 # What `canprobe scan --lss` does: look who is there, give ids to those that are to have one, look again.
@@ -288,7 +263,7 @@ class Commissioned:
     """What was found and done.
 
     Attributes:
-        nodes: those with an id, as `scan_nodes` tells them, at the end.
+        nodes: those with an id at the end, as `scan_nodes` returns them.
         unconfigured: devices that still have none.
         assigned: devices that got an id, and whether each keeps it when its power goes.
     """
@@ -322,8 +297,8 @@ def commission(
         timeout_s: for an SDO answer.
 
     Raises:
-        BusError: nobody without an id is there though ids are wanted, it is not clear who is meant, or a device hides
-            others from the search; nothing was changed.
+        BusError: no device without an id answers though ids are wanted, it is not clear which one is meant, or a device
+            hides others from the search; nothing was changed.
         NodeError: one device did not take its id; those before it have theirs.
         InterfaceError: the interface failed.
     """
@@ -333,7 +308,7 @@ def commission(
         unconfigured = find_unconfigured(network)
     except FoundTwiceError as error:
         if not wanted or any(want.numbers[3] is None for want in wanted):
-            raise  # who else could be meant is not known
+            raise  # which others could be meant is not known
         unconfigured = error.found
     present = {int(node["node_id"]): _address(node) for node in nodes}
     chosen = choose_assignments(wanted, unconfigured, present, channel=port.channel, must=must)
@@ -359,8 +334,8 @@ def _check_all_placed(
     if strangers := sorted(set(unconfigured) - {one.address for one in chosen}):
         ids = ", ".join(f"{want.node_id} ({want.name})" for want in wanted)
         raise BusError(
-            f"the device {strangers[0]} (vendor:product:revision:serial) on {channel} has no id, and is none of the"
-            f" scene's nodes that are missing, of {ids}; name it, as in --assign"
+            f"the device {strangers[0]} (vendor:product:revision:serial) on {channel} has no id, and is not one of"
+            f" the scene's missing nodes, of {ids}; name it, as in --assign"
             f" {strangers[0].serial_number:#x}=ID"
         )
 

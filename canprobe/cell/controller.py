@@ -42,7 +42,7 @@ class Measurement:
         cycle: number of the cycle, from 0.
         t_ns: time of its SYNC, ns since the first one.
         q: joint angles at this SYNC (6,), rad; None in a scene without an arm.
-        q_age: cycles since each joint was last heard (6,); 0 everywhere when all TPDOs came.
+        q_age: cycles since the last position report of each joint (6,); 0 everywhere when all TPDOs came.
         torque_permille: motor torque as reported (6,), NaN for a drive that does not report it; empty where none does.
         statuswords: CiA 402 statuswords (6,).
         enabled: every drive is in operation enabled.

@@ -1,6 +1,4 @@
-"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs → observers. It knows a port and a clock,
-nothing else.
-"""
+"""The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs → observers."""
 
 from __future__ import annotations
 
@@ -10,9 +8,11 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from canprobe.bus.port import Port, TimedFrame, elapsed_ns
+from canprobe.cell.array import TactileReceiver
 from canprobe.cell.controller import Command, Measurement
-from canprobe.cell.drives import DriveGroup, TactileReceiver
+from canprobe.cell.drives import DriveGroup
 from canprobe.cell.watch import NodeWatch
+from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.protocol.frames import NmtState, SyncCounter, pack_heartbeat, pack_sync
 
 # What arrives within one cycle → Measurement. The same for a bus and for a recorded log: no clock, no port.
@@ -25,8 +25,7 @@ class Intake:
     """Routes the PDOs of one cycle to the drives and the sensor, and says what they know together.
 
     Args:
-        drives: the arm's drives; None in a scene without an arm.
-        tactile: the sensor's receiver; None in a scene without a sensor.
+        drives, tactile: of the arm and the array; None in a scene without one.
         sync_overflow: of the SYNC counter (1019h); so many SYNCs are remembered.
     """
 
@@ -101,33 +100,9 @@ class Intake:
         )
 
 
-# The cycle: SYNC → collect TPDOs → Measurement → controller → RPDOs. It knows a port and a clock, nothing else.
-
 TIMED_CYCLES = 5
 """The computing time of every fifth cycle is taken: in a virtual machine reading a clock costs as much as sending. What
 comes back every 2, 4 or 16 cycles, as images and answers do, then has its share in the sample."""
-
-
-@dataclass(frozen=True, slots=True)
-class CycleSettings:
-    """Times of the cycle.
-
-    Attributes:
-        period_ns: from SYNC to SYNC.
-        sync_overflow: of the SYNC counter (1019h).
-        heartbeat_ns: between two heartbeats of the master, however late its cycles are.
-        master_id: node id of the master's heartbeat.
-        looks_ns: times after SYNC went out at which TPDOs are looked for, until all are in; then they are late.
-        on_arrival: on a clock that goes on by itself: do not wait for the next look once all are in. Before the first
-            look nobody is woken by them: a real bus brings one after the other, and most are in by then.
-    """
-
-    period_ns: int
-    sync_overflow: int
-    heartbeat_ns: int
-    master_id: int
-    looks_ns: tuple[int, ...]
-    on_arrival: bool
 
 
 @dataclass(slots=True)
@@ -159,38 +134,42 @@ class Cycle:
 
     Args:
         port: the bus.
-        settings: times.
-        drives: the arm's drives; None in a scene without an arm.
-        tactile: the sensor's receiver; None in a scene without a sensor.
+        plan: its times: SYNC, and when TPDOs are looked for until all are in; then they are late.
+        drives, tactile: of the arm and the array; None in a scene without one.
         watch: sees heartbeats and EMCYs.
-        other: takes what nobody here expects (SDO answers).
+        other: takes all other frames, such as SDO answers.
+        on_arrival: on a clock that goes on by itself: do not wait for the next look once all are in. Before the first
+            look they wake nobody: a real bus brings one after the other, and most are in by then.
         kept: cycles whose times are kept; None for all.
     """
 
     def __init__(
         self,
         port: Port,
-        settings: CycleSettings,
+        plan: Plan,
         *,
         drives: DriveGroup | None,
         tactile: TactileReceiver | None,
         watch: NodeWatch,
         other: Callable[[list[TimedFrame]], None],
+        on_arrival: bool,
         kept: int | None = None,
     ) -> None:
         self.number = -1
         self.statistics = CycleStatistics.of_last(kept)
-        self.t_first_ns = port.clock.now_ns() + settings.period_ns
+        self.t_first_ns = port.clock.now_ns() + plan.sync.period_ns
         self.t_ns = 0
         self.sync_ns = 0
         self._heartbeat_ns = 0
         self._port = port
-        self._s = settings
+        self._period_ns = plan.sync.period_ns
+        self._looks_ns = plan.traffic.budget.looks_ns
+        self._on_arrival = on_arrival
         self._drives = drives
-        self._intake = Intake(drives, tactile, settings.sync_overflow or SYNCS_REMEMBERED)
+        self._intake = Intake(drives, tactile, plan.sync.overflow or SYNCS_REMEMBERED)
         self._watch = watch
         self._other = other
-        self._sync = SyncCounter(settings.sync_overflow)
+        self._sync = SyncCounter(plan.sync.overflow)
         self._deadline = self.t_first_ns
         self._started_ns = self._sent_ns = 0
 
@@ -198,12 +177,16 @@ class Cycle:
         """Sleep to the deadline, send SYNC, collect the answers."""
         port = self._port
         port.clock.sleep_until_ns(self._deadline)
-        if not port.stamps_arrival:  # the only way to tell what came before the SYNC from what came after it
+        if not port.stamps_arrival:  # the only way to separate what came before the SYNC from what came after it
             self._route(port.drain())
         counter = self._sync.next()
         self.sync_ns = port.clock.now_ns()
         port.send_batch([pack_sync(counter)], self.sync_ns)
-        self._count_lateness()
+        late_ns = self.sync_ns - self._deadline
+        self.statistics.period_error_ns.append(late_ns)
+        if late_ns > self._period_ns // 2:
+            self.statistics.overruns += 1
+            self._deadline += late_ns // self._period_ns * self._period_ns
         self.number += 1
         self.t_ns = self._deadline - self.t_first_ns
         self._intake.begin(self.number, self.t_ns, self.sync_ns)
@@ -211,16 +194,9 @@ class Cycle:
         self._started_ns = elapsed_ns() if self.number % TIMED_CYCLES == 0 else 0
         return self._intake.measure(counter or 0)
 
-    def _count_lateness(self) -> None:
-        error = self.sync_ns - self._deadline
-        self.statistics.period_error_ns.append(error)
-        if error > self._s.period_ns // 2:
-            self.statistics.overruns += 1
-            self._deadline += error // self._s.period_ns * self._s.period_ns
-
     def _collect(self) -> None:
-        port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._s.looks_ns
-        if self._s.on_arrival and self._drives is not None:
+        port, clock, intake, looks_ns = self._port, self._port.clock, self._intake, self._looks_ns
+        if self._on_arrival and self._drives is not None:
             self._route(port.drain())  # nodes that go first on this processor have answered by now
             if not intake.complete:
                 self._collect_on_arrival(self.sync_ns + looks_ns[0], self.sync_ns + looks_ns[-1])
@@ -249,7 +225,7 @@ class Cycle:
 
     def skip(self) -> None:
         """Let this cycle be: wait for the end of its period."""
-        self._deadline += self._s.period_ns
+        self._deadline += self._period_ns
         self._port.clock.sleep_until_ns(self._deadline)
 
     def end(self, command: Command | None) -> None:
@@ -260,12 +236,12 @@ class Cycle:
                 self._drives.set_target(command.q_target)
             frames = self._drives.frames()
         if self.sync_ns >= self._heartbeat_ns:
-            self._heartbeat_ns = self._deadline + self._s.heartbeat_ns
-            frames.append(pack_heartbeat(self._s.master_id, NmtState.OPERATIONAL))
+            self._heartbeat_ns = self._deadline + HEARTBEAT_PRODUCED_MS * 1_000_000
+            frames.append(pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL))
         if frames:
             self._port.send_batch(frames)
         self._sent_ns = elapsed_ns() if self._started_ns else 0
-        self._deadline += self._s.period_ns
+        self._deadline += self._period_ns
 
     def count_work(self) -> None:
         """The controller has done all that it does in this cycle."""
@@ -278,10 +254,8 @@ class Cycle:
 
 MOST_FRAMES = 100_000
 """Frames that are kept for the next observation: bring-up has a few thousand and no cycle."""
-
-
 COSTS_KEPT = 100_000
-"""Costs that are kept: a cell may be left up for days."""
+"""Costs that are kept: a cell may stay up for days."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,5 +1,4 @@
-"""The drives as one thing, TPDOs in and joint angles out, targets in and RPDOs out; and the sensor's frames, placed
-in time.
+"""The drives as one: TPDOs in and joint angles out, targets in and RPDOs out.
 
 The drives hold *motor* positions; the wrist's coupling is undone here and nowhere else.
 """
@@ -7,23 +6,21 @@ The drives hold *motor* positions; the wrist's coupling is undone here and nowhe
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import copysign
-from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.controller import TactileSample
 from canprobe.errors import ProtocolError
+from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
-from canprobe.protocol.tactile import FrameAssembler, TactileFrame
 from canprobe.robot.kinematics import PumaModel, counts_to_joints, joints_to_counts
 
-# The position of one motor as its TPDOs tell it: what it can have reached, and where it is when one is missing.
+# The position of one motor as its TPDOs report it: what it can have reached, and where it is when one is missing.
 
 STEADY = 5
 """Equal reports after which a motor is at rest."""
@@ -40,7 +37,7 @@ class PositionTrack:
 
     A drive cannot change its speed within a cycle by more than its own speed and what its target asks for together, and
     an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
-    tell of a motion that grows from nothing.
+    make up a motion that grows from nothing.
 
     Attributes:
         counts: the last position that was believed.
@@ -106,10 +103,11 @@ class PositionTrack:
 Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
+COMMAND_REPEAT_NS = 100_000_000
 _COMMAND_OBJECTS = (0x6040, 0x607A)
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
-"""Of a statusword that tells operation enabled; see `known_state` for the other states."""
+"""Of a statusword of operation enabled; see `known_state` for the other states."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +166,7 @@ class DriveGroup:
         torque_permille: of each drive, NaN for one whose TPDO has no torque; empty where none has.
         late, missed, malformed: TPDOs that were not used, or not there.
         answer_ns: from the SYNC to the last TPDO that was used.
-        stopped: node ids of drives that are told to stop while the others go on.
+        stopped: node ids of drives that stop while the others go on.
     """
 
     def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
@@ -176,7 +174,7 @@ class DriveGroup:
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
         with_torque = [len(axis.feedback.entries) > 2 for axis in axes]
-        self.torque_permille = [0 if told else math.nan for told in with_torque] if any(with_torque) else []
+        self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
         self.late = 0
         self.missed = 0
         self.malformed = 0
@@ -196,7 +194,7 @@ class DriveGroup:
             (
                 frame.cob_id,
                 frame.every_cycle,
-                [(layout.pack, _picker(axis, picks, len(axes))) for axis, layout, picks in frame.parts],
+                [(layout.pack, [axis + pick * len(axes) for pick in picks]) for axis, layout, picks in frame.parts],
             )
             for frame in command_frames(axes)
         ]
@@ -248,7 +246,7 @@ class DriveGroup:
         self._heard[i] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
-        guarded = enabled and self._aimed is not None  # of a log without targets nobody knows where it was to go
+        guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
         if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
             self.implausible += 1
 
@@ -263,17 +261,12 @@ class DriveGroup:
         return min(self._heard) >= 0
 
     def ages(self) -> tuple[int, ...]:
-        """Cycles since each drive last told a position that can be believed."""
+        """Cycles since each drive last reported a position that can be believed."""
         return tuple([self._cycle - track.cycle for track in self._tracks])
 
     @property
-    def at_rest(self) -> bool:
-        """Every drive has told the same position for a while."""
-        return all(self.rests)
-
-    @property
     def rests(self) -> tuple[bool, ...]:
-        """Whether each drive has told the same position for a while."""
+        """Whether each drive has reported the same position for a while."""
         return tuple([track.steady >= STEADY for track in self._tracks])
 
     def joints(self) -> Vector:
@@ -295,18 +288,18 @@ class DriveGroup:
 
     @property
     def enabled(self) -> bool:
-        """Every drive tells operation enabled."""
+        """Every drive reports operation enabled."""
         if all([word & _STATE_BITS == _ENABLED for word in self.statuswords]):
             return True  # as in every cycle of operation
         return self.all_in(DriveState.OPERATION_ENABLED)
 
     def enabled_ones(self) -> tuple[bool, ...]:
-        """Whether each drive told operation enabled last."""
+        """Whether each drive reported operation enabled last."""
         return tuple([word & _STATE_BITS == _ENABLED for word in self.statuswords])
 
     @property
     def disbelieved(self) -> bool:
-        """A drive was heard last with a position that it cannot have reached."""
+        """A drive reported last a position that it cannot have reached."""
         return any(heard > track.cycle for heard, track in zip(self._heard, self._tracks, strict=True))
 
     def all_in(self, *states: DriveState) -> bool:
@@ -324,14 +317,14 @@ class DriveGroup:
         return np.array(targets, dtype=float)
 
     def aim(self, targets: Sequence[int]) -> None:
-        """The drives are told ``targets`` (counts) in this cycle: what they may do next follows from it."""
+        """The drives get `targets` (counts) in this cycle, which bound what they may do next."""
         before = self._aimed if self._aimed is not None else [track.counts for track in self._tracks]
         for track, target, last in zip(self._tracks, targets, before, strict=True):
             track.aim(abs(target - last))
         self._aimed = tuple(targets)
 
     def frames(self) -> list[Frame]:
-        """The RPDOs of this cycle; until a target is set, a drive is told to stay where it reported to be."""
+        """The RPDOs of this cycle; until a target is set, the target of a drive is its reported position."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         self.aim(targets)
         key = (self.goal, self.stopped, *self.statuswords)
@@ -340,12 +333,12 @@ class DriveGroup:
             words = list(map(_controlword, self.states, goals, self._words))
             self._steady = key if words == self._words else None
             self._words = words
-        values = [*self._words, *targets]
+        values = [*self._words, *targets]  # an axis and its pick name the place
         frames = []
         for cob_id, every_cycle, parts in self._plan:
             data = b""
-            for pack, picks in parts:
-                part = pack(*picks(values))
+            for pack, places in parts:
+                part = pack(*[values[place] for place in places])
                 data = _overlaid(data, part) if data else part
             if every_cycle or self._due(cob_id, data):
                 frames.append((cob_id, data))
@@ -365,98 +358,24 @@ class DriveGroup:
 
 
 def _controlword(state: DriveState | None, goal: DriveState, previous: int) -> int:
-    """What a drive is told; one whose state nobody knows is stopped, which is right in every state."""
+    """The controlword for a drive; one in an unknown state is stopped, which is right in every state."""
     if state is None:
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
     return controlword_toward(state, goal, previous)
 
 
-def _picker(axis: int, picks: tuple[int, ...], axes: int) -> Callable[[Sequence[int]], Sequence[int]]:
-    """What takes an axis's picks of (controlword, target) from all controlwords and, after them, all targets."""
-    places = [axis + pick * axes for pick in picks]
-    if len(places) == 1:
-        return lambda values: (values[places[0]],)
-    return itemgetter(*places) if places else lambda _: ()
-
-
 def _overlaid(data: bytes, part: bytes) -> bytes:
-    """What two drives of one frame are told: each leaves zeros where the other's values are."""
+    """One frame for two drives: each leaves zeros where the other's values are."""
     return (int.from_bytes(data, "little") | int.from_bytes(part, "little")).to_bytes(len(data), "little")
 
 
-# The sensor as the cell sees it: whole frames, placed in time.
-
-JITTER_NS = 300_000
-"""By how much the stamps of a SYNC and a header may contradict each other: other loggers do not keep order."""
-LATEST_CYCLES = 4
-"""SYNCs after its trigger up to which a header is believed; the bus is planned for two."""
-
-
-class TactileReceiver:
-    """Collects tactile PDOs into frames and hands each out one cycle after its trigger.
-
-    Args:
-        assembler: puts the frames together.
-        cob_ids: of its PDOs.
-        sync_overflow: at which the SYNC counter starts again.
-
-    Attributes:
-        newest_cycle: trigger of the newest sample.
-        stale: frames dropped because they name no SYNC that they can have followed.
-    """
-
-    def __init__(self, assembler: FrameAssembler, cob_ids: Sequence[int], sync_overflow: int) -> None:
-        self.assembler = assembler
-        self.cob_ids = tuple(cob_ids)
-        self.newest_cycle: int | None = None
-        self.stale = 0
-        self._overflow = sync_overflow
-        self._complete: list[TactileFrame] = []
-
-    def push(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Take one tactile PDO."""
-        frame = self.assembler.push(can_id, data, t_ns)
-        if frame is not None:
-            self._complete.append(frame)
-
-    def take(
-        self, cycle: int, sync_counter: int, sync_times: Sequence[int], sync_stamps: Sequence[int] = ()
-    ) -> TactileSample | None:
-        """The frame that becomes usable in ``cycle``, or None.
-
-        Args:
-            cycle: the present cycle; its SYNC has not been answered by this frame.
-            sync_counter: counter of the present cycle's SYNC; 0 where it has none.
-            sync_times: times of the last SYNCs (ns), the present one last.
-            sync_stamps: when they went out, on the clock of the frames. Without a counter a frame belongs to the last
-                SYNC before its header.
-        """
-        if not self._complete:
-            return None
-        sample, early = None, []
-        for frame in self._complete:
-            cycles_ago = self._cycles_ago(frame, sync_counter, sync_stamps)
-            if cycles_ago == 0 and not self._misplaced(frame, 0, sync_stamps):
-                early.append(frame)
-            elif cycles_ago >= len(sync_times) or self._misplaced(frame, cycles_ago, sync_stamps):
-                self.stale += 1
-            else:
-                t_sample = sync_times[-1 - cycles_ago] - frame.header.sample_age_us * 1000
-                sample = TactileSample(frame, t_sample, cycle - cycles_ago)
-                self.newest_cycle = sample.cycle
-        self._complete = early
-        return sample
-
-    def _misplaced(self, frame: TactileFrame, cycles_ago: int, sync_stamps: Sequence[int]) -> bool:
-        """The frame names a SYNC that it did not follow: one after its header, or one too long before it."""
-        if not sync_stamps:
-            return False
-        if frame.t_ns + JITTER_NS < sync_stamps[-1 - cycles_ago]:
-            return True
-        later = cycles_ago - LATEST_CYCLES
-        return later > 0 and sync_stamps[-later] <= frame.t_ns
-
-    def _cycles_ago(self, frame: TactileFrame, sync_counter: int, sync_stamps: Sequence[int]) -> int:
-        if sync_counter and frame.header.sync_counter:
-            return (sync_counter - frame.header.sync_counter) % self._overflow
-        return next((i for i, stamp in enumerate(reversed(sync_stamps)) if stamp <= frame.t_ns), len(sync_stamps))
+def make_drives(plan: Plan) -> DriveGroup | None:
+    """The plan's drives as one; None without an arm."""
+    arm = plan.setup.arm
+    if arm is None:
+        return None
+    axes = tuple(
+        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, tuple(pdo.layout for pdo in plan.pdos_of(n, "rpdo")))
+        for n in arm.node_ids
+    )
+    return DriveGroup(axes, arm.model, max(1, COMMAND_REPEAT_NS // plan.sync.period_ns))

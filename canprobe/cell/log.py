@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterable, MutableSequence, Sequence
 from copy import copy
 from dataclasses import dataclass, field
-from itertools import chain, count, groupby
+from itertools import count, groupby
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from canprobe.errors import CanprobeError, NodeError
 
-# The run's log: one row a cycle in memory, columns with units as arrays; all of them, or the last ones.
-
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
+_Part = tuple[list[int], Sequence[Any] | NDArray[np.float64]]
+"""Rows of a column and their values."""
 
 
 class _RowKind:
@@ -96,64 +96,51 @@ class RunLog:
 
         A value of another shape than its column's first, or none, is NaN, with a warning: one must not cost the others.
         """
-        packed: dict[_RowKind, tuple[list[int], list[bytes]]] = {}
-        loose: list[tuple[int, dict[str, Any]]] = []
-        kinds: dict[_RowKind, None] = {}
+        kinds = dict.fromkeys(kind for kind, _ in self._rows)
+        columns: dict[str, list[_Part]] = {name: [] for kind in kinds for name in kind.names}
+        blocks: dict[_RowKind, tuple[list[int], list[bytes]]] = {}
         for i, (kind, values) in enumerate(self._rows):
-            kinds[kind] = None
             if isinstance(values, bytes):
-                rows, blocks = packed.setdefault(kind, ([], []))
+                rows, packed = blocks.setdefault(kind, ([], []))
                 rows.append(i)
-                blocks.append(values)
+                packed.append(values)
             else:
-                loose.append((i, dict(zip(kind.names, values, strict=True))))
-        tables = [
-            (kind, np.array(rows), np.frombuffer(b"".join(blocks)).reshape(len(rows), kind.width))
-            for kind, (rows, blocks) in packed.items()
-        ]
-        return {
-            name: self._column(
-                name,
-                [(rows, kind.column(name, table)) for kind, rows, table in tables if name in kind.names],
-                [(i, row[name]) for i, row in loose if row.get(name) is not None],
-            )
-            for name in dict.fromkeys(chain.from_iterable(kind.names for kind in kinds))
-        }
+                for name, value in zip(kind.names, values, strict=True):
+                    if value is not None:
+                        columns[name].append(([i], [value]))
+        for kind, (rows, packed) in blocks.items():
+            table = np.frombuffer(b"".join(packed)).reshape(len(rows), kind.width)
+            for name in kind.names:
+                columns[name].append((rows, kind.column(name, table)))
+        return {name: self._column(name, parts) for name, parts in columns.items()}
 
-    def _column(
-        self,
-        name: str,
-        parts: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]],
-        loose: list[tuple[int, Any]],
-    ) -> NDArray[np.float64]:
-        """A column of rows and their values (n, ...), and of single values."""
-        firsts = [(int(rows[0]), values.shape[1:]) for rows, values in parts]
-        firsts += [(i, np.shape(value)) for i, value in loose[:1]]
-        shape = min(firsts)[1] if firsts else ()
+    def _column(self, name: str, parts: list[_Part]) -> NDArray[np.float64]:
+        """A column of its parts; the first value of all decides the shape."""
+        parts = sorted(parts, key=lambda part: part[0][0])
+        shape = np.shape(parts[0][1][0]) if parts else ()
         out = np.full((len(self._rows), *shape), np.nan)
-        for rows, values in parts:
-            if values.shape[1:] == shape:
-                out[rows] = values
-            else:
-                loose = [*loose, *zip(rows.tolist(), values, strict=True)]
         misfits = 0
-        for i, value in loose:
-            try:
-                out[i] = value
-            except _NO_NUMBERS:
-                misfits += 1
+        for rows, values in parts:
+            if isinstance(values, np.ndarray) and values.shape[1:] == shape:
+                out[rows] = values
+                continue
+            for i, value in zip(rows, values, strict=True):
+                try:
+                    out[i] = value
+                except _NO_NUMBERS:
+                    misfits += 1
         if misfits:
-            told = (
+            text = (
                 f"log: {misfits} values of column {name!r} are no numbers of shape {shape}, as its first is: left NaN"
             )
-            warnings.warn(told, stacklevel=3)
+            warnings.warn(text, stacklevel=3)
         return out
 
 
 # What went wrong in a run and was lived with: one line a kind, however often it happened.
 
 KINDS_KEPT = 100
-"""Kinds that are told apart; a node that says something else each time must not fill the memory."""
+"""Kinds that are distinguished; a node that sends another EMCY each time must not fill the memory."""
 OTHERS = "more of other kinds"
 
 
@@ -169,22 +156,16 @@ class _NoteKind:
 
     def __str__(self) -> str:
         who = f"{nodes_text(self.nodes)}: " if self.nodes else ""
-        return f"{who}{self.what}" + self._how_often() + self._when()
-
-    def _how_often(self) -> str:
-        return f", {self.times} times" if self.times > 1 else ""
-
-    def _when(self) -> str:
-        if self.first_s is None or self.last_s is None:
-            return ""
-        if self.times == 1:
-            return f", at {self.first_s:.2f} s"
-        return f", first at {self.first_s:.2f} s, last at {self.last_s:.2f} s"
+        how_often = f", {self.times} times" if self.times > 1 else ""
+        when = ""
+        if self.first_s is not None and self.last_s is not None:
+            first, last = f"at {self.first_s:.2f} s", f", last at {self.last_s:.2f} s"
+            when = f", {first}" if self.times == 1 else f", first {first}{last}"
+        return f"{who}{self.what}{how_often}{when}"
 
 
 class Notes:
-    """Counts what it is told by kind, in the order of the first of each. What is counted here in short stands frame by
-    frame in ``bus.log``."""
+    """Counts faults by kind, in the order of the first of each. ``bus.log`` has them frame by frame."""
 
     def __init__(self) -> None:
         self._kinds: dict[str, _NoteKind] = {}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import make_tactile, patch_from
+from canprobe.cell.array import make_tactile, patch_from
 from canprobe.cell.controller import TactileSample
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
@@ -26,7 +26,7 @@ CLASSIC_BYTES = 8
 
 @dataclass(slots=True)
 class NodeView:
-    """One node as it is heard.
+    """One node as its frames show it.
 
     Attributes:
         node_id, role: which.
@@ -46,7 +46,7 @@ class NodeView:
 
 @dataclass(slots=True, eq=False)
 class CellView:
-    """The cell at one instant; what was not heard is None.
+    """The cell at one instant; what was not received is None.
 
     Attributes:
         channel: of the bus, or buses.

@@ -1,61 +1,25 @@
-"""Runs the table of conditions over a cell, guards its joints, and lifts the probe off where the task cannot."""
+"""Runs the table of conditions over a cell and guards its joints. Pure: no clock, no port."""
 
 from __future__ import annotations
 
 import math
 from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.port import ControllerState, PortCounters
-from canprobe.cell.conditions import COUNTED, CYCLE_CHECKS, TOUCH_CHECKS
+from canprobe.cell.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_finding
 from canprobe.cell.controller import Command, Measurement, TactileSample
-from canprobe.cell.drives import DriveGroup
-from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Limits, Reaction, Seen
-from canprobe.errors import CanprobeError
-from canprobe.robot.inverse import lifting_step
-from canprobe.robot.kinematics import PumaModel, forward_jacobian
+from canprobe.cell.supervision import TOUCH_FORCE, Contact, Finding, Reaction, Seen
+from canprobe.planning.model import Plan
+from canprobe.robot.kinematics import forward
 
 if TYPE_CHECKING:
     from canprobe.touch.patch.image import Patch
-
-
-# How long the force has been more than what the array tells.
-
-
-class HiddenForce:
-    """Times an unbroken run of samples whose force is only a lower bound.
-
-    Attributes:
-        hidden_s: how long the run is, s; 0 outside one.
-    """
-
-    __slots__ = ("_since_ns", "hidden_s")
-
-    def __init__(self) -> None:
-        self.hidden_s = 0.0
-        self._since_ns: int | None = None
-
-    def add(self, hidden: bool, t_ns: int) -> None:
-        """Take one sample.
-
-        Args:
-            hidden: its force is only a lower bound, and nothing else tells the true one.
-            t_ns: when it was taken.
-        """
-        if not hidden:
-            self._since_ns, self.hidden_s = None, 0.0
-        elif self._since_ns is None:
-            self._since_ns = t_ns
-        else:
-            self.hidden_s = (t_ns - self._since_ns) * 1e-9
-
-
-# What the joints may be told, and what they can have done.
 
 Vector = NDArray[np.float64]
 MEASURED_SHARE = 1.5
@@ -89,46 +53,59 @@ class JointGuard:
     """Range, speed and workspace of the joint targets; speed of the measured joints.
 
     Args:
-        limits: of the plan; without an arm nothing is guarded.
+        plan: of a cell with an arm.
 
     Attributes:
+        low, high: range of the joint targets (6,), rad.
+        count: joint angle of one encoder count (6,), rad.
         slowed: targets that were too far away for one cycle.
     """
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, plan: Plan) -> None:
+        arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
+        assert arm is not None
+        model, margin = arm.model, safety.joint_margin - _ROUNDING
+        self.low, self.high = model.q_min + margin, model.q_max - margin
+        self.count = np.abs(model.joints_per_count).sum(axis=1)
         self.slowed = 0
-        self._limits = limits
-        self._speed, self._count = _numbers(limits.joint_speed), _numbers(limits.count)
-        self._range = list(zip(_numbers(limits.joint_low), _numbers(limits.joint_high), strict=True))
+        self._model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
+        self._T_flange_tip = probe.T_flange_probe.copy()
+        self._T_flange_tip[:3, 3] += probe.radius * self._T_flange_tip[:3, 2]
+        # plain floats: six of them are compared before numpy has begun
+        self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
+        self._counts: list[float] = self.count.tolist()
+        self._range: list[tuple[float, float]] = list(zip(self.low.tolist(), self.high.tolist(), strict=True))
         self._target: list[float] | None = None
         self._q: list[float] | None = None
         self._t_ns = 0
 
+    def T_base_tip(self, q: Vector) -> Vector:
+        """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joint angles (6,), rad."""
+        return forward(self._model, q) @ self._T_flange_tip
+
+    def outside(self, q: Vector) -> str | None:
+        """How the probe's tip leaves the workspace at joint angles (6,), rad; None where it does not."""
+        return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
+
     def measure(self, measurement: Measurement) -> str | None:
-        """What a joint did since the last cycle that none can do; None where all is well or nothing new is known."""
-        if measurement.q is None or not self._speed or not self._count or any(measurement.q_age):
+        """A motion since the last cycle that no joint can make; None without one, or where nothing new is known."""
+        if measurement.q is None or any(measurement.q_age):
             return None
         before, self._q = self._q, measurement.q.tolist()
-        passed_s = (measurement.t_ns - self._t_ns + self._limits.period_ns) * 1e-9
+        share = MEASURED_SHARE * (measurement.t_ns - self._t_ns + self._period_ns) * 1e-9
         self._t_ns = measurement.t_ns
         if before is None:
             return None
-        moved = [abs(q - was) for q, was in zip(self._q, before, strict=True)]
-        share = MEASURED_SHARE * passed_s
-        beyond = [
-            m - share * speed - COUNTS * count for m, speed, count in zip(moved, self._speed, self._count, strict=True)
-        ]
+        joints = zip(self._q, before, self._speed, self._counts, strict=True)
+        beyond = [abs(q - was) - share * speed - COUNTS * count for q, was, speed, count in joints]
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
-        degrees = math.degrees(moved[joint])
+        degrees = math.degrees(abs(self._q[joint] - before[joint]))
         return f"joint {joint + 1} reports a motion of {degrees:.1f} deg in one cycle, more than it can make"
 
     def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
-        """The target that may be sent for ``q_target`` (6,), rad."""
-        limits = self._limits
-        if not self._range or not self._speed:
-            return GuardedTarget(q_target)
+        """The target that may be sent for `q_target` (6,), rad."""
         try:
             given = np.asanyarray(q_target)
         except (TypeError, ValueError):
@@ -143,20 +120,15 @@ class JointGuard:
         if not all(inside):
             joint = inside.index(False)
             return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
-        if limits.workspace is not None and limits.T_base_tip_of is not None:
-            left = outside_workspace(limits.T_base_tip_of(target)[:3, 3], limits.workspace)
-            if left is not None:
-                return GuardedTarget(None, left)
-        return self._within_speed(q_target, wanted, measurement)
-
-    def _within_speed(self, q_target: Vector, wanted: list[float], measurement: Measurement) -> GuardedTarget:
+        if (left := self.outside(target)) is not None:
+            return GuardedTarget(None, left)
         last = self._target
         if last is None and measurement.q is not None:
             last = measurement.q.tolist()
         if last is not None:
             steps = [q - was for q, was in zip(wanted, last, strict=True)]
             share = max([abs(step) / speed for step, speed in zip(steps, self._speed, strict=True)])
-            share /= self._limits.period_ns * 1e-9
+            share /= self._period_ns * 1e-9
             if share > 1.0 + _ROUNDING:
                 self.slowed += 1
                 self._target = [was + step / share for was, step in zip(last, steps, strict=True)]
@@ -165,15 +137,8 @@ class JointGuard:
         return GuardedTarget(q_target)
 
 
-def _numbers(values: Vector | None) -> list[float]:
-    """As plain floats: six of them are done with before numpy has begun."""
-    return [] if values is None else [float(v) for v in values]
-
-
-# Runs the table of conditions over a cell, cycle by cycle. Pure: no clock, no port, so a log can be supervised too.
-
 NOTED_ONCE = ("error_frames", "frames_dropped", "estimator")
-"""Conditions that the cell lives with and tells once; the others are told by the summary's figures."""
+"""Conditions that the cell lives with and notes once; the others are figures of the summary."""
 SECOND_NS = 1_000_000_000
 LOOK_NS = 20_000_000
 """Between two looks at where the probe presses: less than a millimetre of a retreat."""
@@ -216,19 +181,12 @@ class Press:
         return back > CLEAR and float(np.linalg.norm(way + back * pole)) < back
 
 
-@dataclass(frozen=True, slots=True)
-class Finding:
-    """A condition that holds, and the error that names what is wrong."""
-
-    condition: Condition
-    error: CanprobeError
-
-
 class Supervisor:
     """The checks of the table and what they have to remember.
 
     Args:
         seen: the cell; brought up to date by :meth:`step`.
+        guard: of the joints; None without an arm.
         patch_from: the patch of a tactile sample, for controllers that do not guard their contact; None without touch.
 
     Attributes:
@@ -236,25 +194,24 @@ class Supervisor:
         first: cycle in which each condition was seen first.
     """
 
-    def __init__(self, seen: Seen, patch_from: Callable[[TactileSample], Patch] | None = None) -> None:
+    def __init__(
+        self, seen: Seen, guard: JointGuard | None, patch_from: Callable[[TactileSample], Patch] | None
+    ) -> None:
         self.seen = seen
-        self.counts: dict[str, int] = {condition.key: 0 for condition in COUNTED}
+        self.counts: dict[str, int] = dict.fromkeys((key for key, _ in COUNTERS), 0)
         self.first: dict[str, int] = {}
         self._patch_from = patch_from
-        self._force = 0.0
+        self._guard = guard
+        self._contact = Contact(seen.limits)
         self._sample: TactileSample | None = None
         self._press = Press()
         self._look_ns = 0
-        self._hidden, self._off_pad = HiddenForce(), HiddenForce()
-        self._untouched = math.isfinite(seen.limits.preload_max)
-        self._joints = JointGuard(seen.limits)
+        self._untouched = seen.limits.tares
         period_ns = seen.limits.period_ns
         self._late = deque((t_ns, 0) for t_ns in range(-SECOND_NS, 0, period_ns))  # before its first it was in time
         self._late_sum = 0
         self._active_ns = 0
         self._enabling = tuple(condition for condition in CYCLE_CHECKS if condition.enabling)
-        self._counters = [condition.count for condition in COUNTED if condition.count is not None]
-        self._counted = [0] * len(COUNTED)
 
     def step(
         self,
@@ -276,7 +233,7 @@ class Supervisor:
             self._active_ns = measurement.t_ns
         seen.passive_ns = measurement.t_ns - self._active_ns
         seen.controller_state, seen.log_failure = controller_state, log_failure
-        seen.speeding = self._joints.measure(measurement)
+        seen.speeding = self._guard.measure(measurement) if self._guard is not None else None
         self._sample = measurement.tactile or self._sample
         if self._untouched:
             self._untouched = not measurement.enabled
@@ -285,9 +242,10 @@ class Supervisor:
         if measurement.t_ns >= self._look_ns:
             self._look_ns = measurement.t_ns + LOOK_NS
             self._look()
-        counts = [count(seen) for count in self._counters]
-        if counts != self._counted:
-            self._note(counts, measurement.cycle)
+        for key, count in COUNTERS:
+            if (number := count(seen)) != self.counts[key]:
+                self.counts[key] = number
+                self.first.setdefault(key, measurement.cycle)
 
     def _count_late(self, late: int, t_ns: int) -> None:
         """Late cycles are longer than others: the last second has fewer of them."""
@@ -297,13 +255,6 @@ class Supervisor:
         while cycles[0][0] <= t_ns - SECOND_NS:
             self._late_sum -= cycles.popleft()[1]
         self.seen.late_share = self._late_sum / len(cycles)
-
-    def _note(self, counts: list[int], cycle: int) -> None:
-        self._counted = counts
-        for condition, count in zip(COUNTED, counts, strict=True):
-            if count != self.counts[condition.key]:
-                self.counts[condition.key] = count
-                self.first.setdefault(condition.key, cycle)
 
     def finding(self, *, enabling: bool = False) -> Finding | None:
         """The first condition of the table that holds now; a hold only where nothing worse is found."""
@@ -335,185 +286,31 @@ class Supervisor:
         return force if self._press.holds(force) else 0.0
 
     def _look(self) -> None:
-        q, T_base_tip_of = self.seen.measurement.q, self.seen.limits.T_base_tip_of
-        if self._sample is not None and q is not None and T_base_tip_of is not None:
-            self._press.look(self.felt(), T_base_tip_of(q))
+        q = self.seen.measurement.q
+        if self._sample is not None and q is not None and self._guard is not None:
+            self._press.look(self.felt(), self._guard.T_base_tip(q))
 
     def guard_contact(self, measurement: Measurement) -> Finding | None:
-        """What must not go on in a touch, whatever the controller thinks of it."""
+        """What must not go on in a touch, for a controller that does not guard its contact itself."""
         if self._patch_from is not None and measurement.tactile is not None:
-            patch = self._patch_from(measurement.tactile)
-            self._force = patch.force
-            self._hidden.add(patch.saturated, measurement.tactile.t_sample_ns)
-            self._off_pad.add(patch.off_pad and patch.force > TOUCH_FORCE / 2, measurement.tactile.t_sample_ns)
-        return touch_finding(
-            Contact(
-                self.seen.limits,
-                self._force,
-                measurement.tactile_age,
-                hidden_s=self._hidden.hidden_s,
-                off_pad_s=self._off_pad.hidden_s,
-            )
-        )
+            self._contact.feel(self._patch_from(measurement.tactile), measurement.tactile.t_sample_ns)
+        self._contact.tactile_age = measurement.tactile_age
+        return touch_finding(self._contact)
 
     def guard_target(self, command: Command) -> tuple[Command, Finding | None]:
         """The command that may be sent: a target too far away is approached, one out of bounds is left out."""
-        if command.q_target is None:
+        if command.q_target is None or self._guard is None:
             return command, None
-        guarded = self._joints.command(command.q_target, self.seen.measurement)
-        self.seen.slowed = self._joints.slowed
+        guarded = self._guard.command(command.q_target, self.seen.measurement)
+        self.seen.slowed = self._guard.slowed
         if guarded.limit is not None:
-            held = Command(None, command.done, command.stop_reason, command.columns)
-            return held, touch_finding(Contact(self.seen.limits, 0.0, None, limit=guarded.limit))
-        if guarded.q is command.q_target:
-            return command, None
-        return Command(guarded.q, command.done, command.stop_reason, command.columns), None
+            return replace(command, q_target=None), touch_finding(Contact(self.seen.limits, limit=guarded.limit))
+        return (command if guarded.q is command.q_target else replace(command, q_target=guarded.q)), None
 
     def notes(self) -> list[str]:
         """What happened and was lived with, a line each."""
         return [
-            f"{condition.what}: {self.counts[condition.key]}, the first in cycle {self.first[condition.key]}"
-            for condition in COUNTED
-            if condition.key in NOTED_ONCE and self.counts[condition.key]
+            f"{BY_KEY[key].what}: {self.counts[key]}, the first in cycle {self.first[key]}"
+            for key in NOTED_ONCE
+            if self.counts[key]
         ]
-
-
-def touch_finding(contact: Contact) -> Finding | None:
-    """The first condition of a touch that holds."""
-    for condition in TOUCH_CHECKS:
-        error = condition.check(contact)  # type: ignore[misc]  # TOUCH_CHECKS have one
-        if error is not None:
-            return Finding(condition, error)
-    return None
-
-
-# Taking the probe off the object without its task: with the drives that still obey, a short way, back along the pole.
-#
-# A lost drive stands still, by its own quick stop or because nobody tells it anything else, and where it stands is
-# known. The others carry the tool's point away from the object on a straight line, its orientation left open. A drive
-# that tells a position it cannot have reached may be moving: then nothing is moved.
-
-WAY = 6e-3
-"""m: as far as a touch retreats, and further than the softest pad is pressed in."""
-SPEED = 20e-3
-"""m/s, the mean; it begins with twice as much, which then falls to zero."""
-ARRIVE_S = 0.02
-"""For the drives' lag at the end."""
-
-
-class WayBack:
-    """The way of the tool's point off the object, cycle by cycle: what the motors are told, of what the joints are.
-
-    Args:
-        model: the arm's geometry.
-        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
-        period_s: of the cycle.
-        free: motors (6,) that may turn.
-        targets: where the motors were sent last (6,), counts.
-    """
-
-    def __init__(
-        self, model: PumaModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
-    ) -> None:
-        self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
-        self._free, self._targets = free, targets
-        self._away: Vector | None = None
-        self._t = 0.0
-
-    def step(self, measured: Vector) -> Vector | None:
-        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on.
-
-        Args:
-            measured: joint angles (6,), rad.
-        """
-        T, J = forward_jacobian(self._model, measured, self._flange_probe)
-        if self._away is None:
-            self._away = -T[:3, 2]
-        before, self._t = self._gone(self._t), self._t + self._period_s
-        if before >= WAY and self._t > WAY / SPEED + ARRIVE_S:
-            return None
-        move = self._away * (self._gone(self._t) - before)
-        if move.any():
-            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
-            if counts is None:
-                return None
-            self._targets = self._targets + counts
-        q: Vector = self._model.joints_per_count @ self._targets
-        return q
-
-    @staticmethod
-    def cycles(period_s: float) -> int:
-        """How many there are at most."""
-        return math.ceil((WAY / SPEED + ARRIVE_S) / period_s) + 1
-
-    @staticmethod
-    def _gone(t: float) -> float:
-        """Way after ``t`` seconds, m."""
-        return WAY * (1.0 - max(1.0 - t * SPEED / WAY, 0.0) ** 2)
-
-
-class LiftOff:
-    """One way back, cycle by cycle.
-
-    Args:
-        drives: the arm; those that do not obey are told to stop from now on.
-        model: the arm's geometry.
-        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
-        period_s: of the cycle.
-        obeys: whether the node of a drive does what it is told, as far as NMT and EMCY tell.
-    """
-
-    def __init__(
-        self,
-        drives: DriveGroup,
-        model: PumaModel,
-        flange_probe: Vector,
-        period_s: float,
-        obeys: Callable[[int], bool],
-    ) -> None:
-        self._drives, self._obeys = drives, obeys
-        self._free = self._obeying()
-        self._way = WayBack(model, flange_probe, period_s, self._free, drives.targets())
-        self._force_known_from: int | None = None
-        self._highest = 0.0
-
-    def _obeying(self) -> NDArray[np.bool_]:
-        """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
-        drives = self._drives
-        heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
-        return np.array([age == 0 and enabled and self._obeys(axis.node_id) for axis, age, enabled in heard])
-
-    @property
-    def possible(self) -> bool:
-        """Some drives obey, and none tells what cannot be."""
-        return bool(self._free.any()) and not self._drives.disbelieved
-
-    def begin(self) -> None:
-        """Tell the drives that do not obey to stop."""
-        axes = zip(self._drives.axes, self._free, strict=True)
-        self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
-
-    def step(self, measurement: Measurement) -> Vector | None:
-        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on."""
-        if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
-            return None
-        return self._way.step(measurement.q)
-
-    def command(self, supervisor: Supervisor) -> Command | None:
-        """What the drives are told in this cycle; None at the end, and where the force grows on the way back."""
-        measurement, force = supervisor.seen.measurement, supervisor.felt()
-        q = self.step(measurement)
-        if q is None:
-            return None
-        command, finding = supervisor.guard_target(Command(q))
-        if self._force_known_from is None:
-            self._force_known_from = measurement.cycle + supervisor.seen.limits.cycles_to_feel
-        if measurement.cycle < self._force_known_from:  # what is felt is from before the way back
-            self._highest = max(self._highest, force)
-        return None if finding is not None or supervisor.must_stop() or force > self._highest else command
-
-    def _still_obeyed(self) -> bool:
-        """A TPDO may be missing now and then; who has left operation does not come back."""
-        enabled = np.array(self._drives.enabled_ones())
-        late = np.array(self._drives.ages()) >= 3
-        return not bool((self._free & (~enabled | late)).any())

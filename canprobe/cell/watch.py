@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass
 
-from canprobe.errors import NodeError, ProtocolError
+from canprobe.errors import ProtocolError
+from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID
 from canprobe.protocol.frames import (
     EMCY_BASE,
     HEARTBEAT_BASE,
@@ -19,7 +20,7 @@ from canprobe.protocol.frames import (
 )
 
 UNTOLD = 64
-"""Alarms that are kept until somebody asks for the news."""
+"""Alarms that are kept until `NodeWatch.news` is called."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,20 +50,18 @@ class NodeWatch:
 
     Args:
         node_ids: the nodes that are watched.
-        master_id: our own node id; its heartbeat from anybody else is foreign.
-        heartbeat_timeout_ns: silence after which a node is lost.
 
     Attributes:
-        states: NMT state that each node told last.
+        states: NMT state in each node's last heartbeat.
         boot_ups: boot-up messages of each node.
         last_emcy: the last EMCY of each node, the end of an error too.
         last_alarm: the last EMCY of each node that reports an error, not its end.
-        device_alarm: the first one since the start that is about a device rather than frames; None where there is none.
+        device_alarm: the first one since the start that is about a device rather than frames; None without one.
         communication: how many were about frames.
         foreign: what another master sent first.
     """
 
-    def __init__(self, node_ids: tuple[int, ...], master_id: int, heartbeat_timeout_ns: int) -> None:
+    def __init__(self, node_ids: tuple[int, ...]) -> None:
         self.node_ids = node_ids
         self.states: dict[int, NmtState] = {}
         self.boot_ups: dict[int, int] = dict.fromkeys(node_ids, 0)
@@ -72,15 +71,13 @@ class NodeWatch:
         self.communication = 0
         self.foreign: str | None = None
         self._untold: deque[EmcyEvent] = deque(maxlen=UNTOLD)
-        self._master_id = master_id
-        self._timeout_ns = heartbeat_timeout_ns
         self._heard: dict[int, int] = {}
 
     def push(self, can_id: int, data: bytes, t_ns: int) -> bool:
         """Take a frame that is no PDO; True where it was one of those watched."""
         node_id = can_id & 0x7F
-        if can_id == HEARTBEAT_BASE + self._master_id:
-            self.foreign = self.foreign or f"a heartbeat of node {self._master_id}, our own id"
+        if can_id == HEARTBEAT_BASE + MASTER_NODE_ID:
+            self.foreign = self.foreign or f"a heartbeat of node {MASTER_NODE_ID}, our own id"
         elif can_id in (SYNC_ID, NMT_ID):
             what = "SYNC" if can_id == SYNC_ID else "an NMT command"
             self.foreign = self.foreign or f"{what} from another master"
@@ -126,12 +123,12 @@ class NodeWatch:
         return news
 
     def last_words(self, node_id: int) -> str:
-        """The node's last alarm, to be put behind an error; empty where there is none."""
+        """The node's last alarm, to be put behind an error; empty without one."""
         event = self.last_alarm.get(node_id)
         return "" if event is None else f"; {event}"
 
     def forget(self) -> None:
-        """Start the heartbeat supervision afresh: nobody has been heard yet."""
+        """Start the heartbeat supervision afresh: no heartbeat has been received yet."""
         self._heard.clear()
         self.states.clear()
 
@@ -142,18 +139,9 @@ class NodeWatch:
 
     def silent(self, t_ns: int) -> int | None:
         """A node that has been silent for longer than the time-out, or None."""
-        limit = t_ns - self._timeout_ns
+        limit = t_ns - HEARTBEAT_CONSUMED_MS * 1_000_000
         return next((node_id for node_id, heard in self._heard.items() if heard < limit), None)
 
     def not_in(self, state: NmtState) -> int | None:
-        """A node whose last heartbeat told another state than ``state``, or None."""
+        """A node whose last heartbeat has another state than `state`, or None."""
         return next((node_id for node_id, seen in self.states.items() if seen is not state), None)
-
-
-def obeys(watch: NodeWatch, node_id: int, error: BaseException) -> bool:
-    """Whether a node does what it is told, as far as NMT and EMCY tell: not the one that the cell is stopped for."""
-    if isinstance(error, NodeError) and error.node_id == node_id:
-        return False
-    alarm = watch.device_alarm
-    operational = watch.states.get(node_id) is NmtState.OPERATIONAL
-    return operational and (alarm is None or alarm.node_id != node_id)

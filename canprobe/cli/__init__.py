@@ -1,7 +1,7 @@
 """The command line: parse, call, print. One module a command, imported only when it is used.
 
-A command module has `add_parser(commands)`, which adds its parser and sets `run=run`, and `run(args) -> int`. What it
-needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
+A command module has `HELP`, `EXAMPLE`, `add_arguments(parser)` and `run(args) -> int`; its docstring is the description
+in its help. What it needs beyond argparse it imports inside `run`: `canprobe --help` stays quick.
 """
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def main(argv: Sequence[str] | None = None) -> int:  # noqa: PLR0911 - one per w
 
     Returns:
         The exit status: 0, 1, 2, 3, 130 or 143 as `--help` says; 141 when the reader of our output went away; 70 after
-        an error that nobody foresaw.
+        an unexpected error.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     _prepare_streams()
     try:
-        args = _parser(arguments).parse_args(arguments)
+        args = parser_of(arguments).parse_args(arguments)
         with termination_interrupts():
             status = int(args.run(args))
         sys.stdout.flush()
@@ -109,7 +109,7 @@ def _forget_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _parser(arguments: Sequence[str]) -> Parser:
+def parser_of(arguments: Sequence[str]) -> Parser:
     """The parser with the named command only, or with all of them when none is named."""
     parser = Parser(
         prog="canprobe", description="Bring up, run, emulate and watch a robot cell on a CAN bus.", epilog=_EXAMPLE
@@ -122,7 +122,10 @@ def _parser(arguments: Sequence[str]) -> Parser:
         parser.error(f"unknown command {named!r}{did_you_mean(named, COMMANDS)}; commands: {', '.join(COMMANDS)}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True, parser_class=Parser)
     for name in (named,) if named else COMMANDS:
-        importlib.import_module(f"canprobe.cli.{name}").add_parser(commands)
+        command = importlib.import_module(f"canprobe.cli.{name}")
+        one = commands.add_parser(name, help=command.HELP, description=command.__doc__, epilog=command.EXAMPLE)
+        one.set_defaults(run=command.run)
+        command.add_arguments(one)
     return parser
 
 

@@ -6,20 +6,21 @@ import argparse
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json
-from canprobe.cli.parser import Commands, Parser, add_json, whole
+from canprobe.cli.parser import Parser, add_options, whole
 
 if TYPE_CHECKING:
     from canprobe.eds.reading import Reading
     from canprobe.eds.sections import Fault
 
-_EXAMPLE = """\
+HELP = "list, locate or check EDS files"
+EXAMPLE = """\
 examples:
   canprobe eds list
   canprobe eds path puma260_joint
   canprobe eds check drive.eds
 """
 _CHECK = """\
-A fault means that the file does not say how the device answers: it cannot be served. A warning names what was corrected
+A fault means that the file leaves open how the device answers: it cannot be served. A warning names what was corrected
 or ignored.
 
 exit status: 0 without faults, 2 with faults
@@ -30,9 +31,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("eds", help="list, locate or check EDS files", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     actions = parser.add_subparsers(metavar="ACTION", required=True, parser_class=Parser)
     listing = actions.add_parser(
         "list",
@@ -40,7 +40,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         description="List the packaged EDS files.",
         epilog="examples:\n  canprobe eds list\n  canprobe eds list --json\n",
     )
-    add_json(listing)
+    add_options(listing, "--json")
     listing.set_defaults(run=run, action="list")
     path = actions.add_parser(
         "path",
@@ -60,7 +60,7 @@ def add_parser(commands: Commands[Parser]) -> None:
     check.add_argument(
         "--node-id", metavar="N", type=whole(1, 127), help="node id that replaces $NODEID [that of the DCF, or 1]"
     )
-    add_json(check)
+    add_options(check, "--json")
     check.set_defaults(run=run_check)
 
 

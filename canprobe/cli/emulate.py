@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import left_by_ctrl_c, say
 from canprobe.cli.parser import (
-    Commands,
+    BUS,
     Parser,
-    Target,
-    add_bus,
-    add_realtime,
+    add_options,
     add_scene,
     node_id,
     node_ids,
@@ -31,8 +30,10 @@ from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.scene.model import Scene
+    from canprobe.session.target import Target
 
-_EXAMPLE = """\
+HELP = "serve emulated nodes on a bus"
+EXAMPLE = """\
 examples:
   canprobe emulate cylinder --channel vcan0
   canprobe emulate cylinder --channel vcan0 --nodes 1-6
@@ -43,16 +44,12 @@ examples:
   canprobe emulate --eds drive.eds --node-id 255 --serial 0x4711 --channel vcan0
   canprobe emulate --bus-yml config/bus.yml --channel vcan0
 """
-_BITRATE = 1_000_000
-_NO_CHANNEL = "emulate: --channel is missing: say which bus the nodes are to appear on, such as vcan0"
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("emulate", help="serve emulated nodes on a bus", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser, optional=True)
-    add_bus(parser)
-    add_realtime(parser)
+    add_options(parser, *BUS, "--realtime", "--seed")
     parser.add_argument(
         "--eds",
         metavar="FILE",
@@ -88,9 +85,6 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--nodes", metavar="IDS", type=node_ids, help="nodes to serve, such as 1-6,16 [those with emulated = true]"
     )
     parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of all random numbers [the scene's]"
-    )
-    parser.add_argument(
         "--truth", metavar="FILE", type=Path, help="at the end write the true values of the model to this npz file"
     )
     parser.add_argument(
@@ -101,7 +95,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--parent", metavar="PID", type=whole(1, 2**31 - 1), help=argparse.SUPPRESS)  # ends with it
     parser.add_argument("--origin", metavar="NS", type=whole(0, 2**63 - 1), help=argparse.SUPPRESS)  # of its times
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -127,10 +120,8 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
             name = option.replace("_", "-")
             raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
     scene = with_realtime(load_scene(args.scene), args.realtime)
-    _name_bus(args, scene.bus.channel)
-    target = target_of(args, scene)
     wanted = _nodes(args.nodes, scene)
-    channel = _channel_of(wanted, args, scene, target)
+    target = _scene_target(args, scene, wanted)
     if absent := sorted(set(args.without_id) - set(wanted)):
         raise UsageError(f"--without-id: {absent} is not among the nodes to serve, {list(wanted)}")
 
@@ -138,9 +129,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
 
     return lambda: api.emulate(
         scene,
-        interface=target.interface,
-        channel=channel,
-        bitrate=target.bitrate,
+        target,
         node_ids=wanted,
         seed=args.seed,
         truth_path=args.truth,
@@ -160,17 +149,13 @@ def _eds_server(args: argparse.Namespace) -> Callable[[], None]:
     channels = [channel for _, channel in args.channel or [(None, None)]]
     if len(channels) > 1 or (args.channel and args.channel[0][0] is not None):
         raise UsageError(f"emulate: with {source} there is one channel, without a name: --channel CH")
-    interface, channel, bitrate = real_target(args.bus, channels[0], args.bitrate)
-    if channel is None:
-        raise UsageError(_NO_CHANNEL)
+    target = real_target(args.bus, channels[0], args.bitrate)
 
     from canprobe import api
 
     return lambda: api.emulate_eds(
         files,
-        interface=interface,
-        channel=channel,
-        bitrate=bitrate or _BITRATE,
+        target,
         store_folder=args.store,
         serial_numbers=args.serial,
         in_realtime=args.realtime,
@@ -185,7 +170,7 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
 
         if args.node_id or args.serial:
             raise UsageError("emulate: --node-id and --serial belong to --eds; a bus.yml has its own")
-        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml).nodes]
+        return [(node.eds, node.node_id) for node in read_bus_yml(args.bus_yml)]
     if len(args.eds) != len(args.node_id):
         raise UsageError(f"emulate: {len(args.eds)} --eds, but {len(args.node_id)} --node-id; each file needs its own")
     if len(args.serial) > len(args.eds):
@@ -193,23 +178,21 @@ def _eds_files(args: argparse.Namespace) -> list[tuple[str | Path, int]]:
     return list(zip(args.eds, args.node_id, strict=True))
 
 
-def _name_bus(args: argparse.Namespace, of_scene: str) -> None:
-    """Put what python-can's configuration says where the command line is silent: emulated nodes need a real bus."""
-    given = args.channel[0][1] if args.channel else None
-    args.bus, found, bitrate = real_target(args.bus, given, args.bitrate)
-    if found is None:
-        raise UsageError(_NO_CHANNEL)
-    args.bitrate = args.bitrate or bitrate
-    args.channel = args.channel or [(of_scene, found)]
-
-
-def _channel_of(node_ids: tuple[int, ...], args: argparse.Namespace, scene: Scene, target: Target) -> str:
-    """The bus of these nodes: one without a name is for all of them, else each is on its own of the scene."""
-    if target.sensor_channel in (None, target.channel) or args.channel[0][0] is None:
-        return target.channel
+def _scene_target(args: argparse.Namespace, scene: Scene, node_ids: tuple[int, ...]) -> Target:
+    """The bus of these nodes: a channel without a name is for all of them, else each is on its own of the scene."""
+    given = args.channel or []
+    real = real_target(args.bus, given[0][1] if given else None, args.bitrate, bitrate_else=scene.bus.bitrate)
+    given = given or [(scene.bus.channel, real.channel)]
+    args = argparse.Namespace(bus=real.interface, channel=given, bitrate=real.bitrate)
+    target = target_of(args, scene)
+    alone = replace(target, sensor_channel=None)
+    if target.sensor_channel in (None, target.channel) or given[0][0] is None:
+        return alone
     sensors = [node_id for node_id in node_ids if scene.sensor is not None and node_id == scene.sensor.node_id]
-    if len(sensors) in (0, len(node_ids)):
-        return target.sensor_channel if sensors else target.channel
+    if not sensors:
+        return alone
+    if len(sensors) == len(node_ids):
+        return replace(alone, channel=target.sensor_channel)
     raise UsageError(
         f"emulate: the scene has these nodes on two buses, {target.channel} and {target.sensor_channel}, and emulated"
         " nodes share one plant: serve all of them on one, by --channel CH without a name, or those of one with --nodes"

@@ -10,9 +10,10 @@ import sys
 
 from canprobe.bus.scheduling import Terminated
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_json, add_scene, seconds, target_of
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, seconds, target_of
 
-_EXAMPLE = """\
+HELP = "watch a running cell"
+EXAMPLE = """\
 examples:
   canprobe monitor cylinder --bus socketcan --channel can0
   canprobe monitor cylinder --bus socketcan --channel can0 --duration 2 --json
@@ -20,16 +21,14 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("monitor", help="watch a running cell", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
-    add_bus(parser)
+    add_options(parser, *BUS)
     parser.add_argument(
         "--duration", metavar="S", type=seconds, help="end after S seconds [at Ctrl-C on a terminal, else 1]"
     )
-    add_json(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -37,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     from canprobe.scene.load import load_scene
 
     scene = load_scene(args.scene)
-    target = target_of(args, scene)
+    scene = target_of(args, scene).applied_to(scene)
 
     from canprobe import api
     from canprobe.cell.monitor import lines, screen
@@ -46,15 +45,7 @@ def run(args: argparse.Namespace) -> int:
     duration_s = args.duration if args.duration is not None or on_terminal else 1.0
     view, ended = None, None
     try:
-        for view in api.monitor(
-            scene,
-            interface=target.interface,
-            channel=target.channel,
-            sensor_channel=target.sensor_channel,
-            bitrate=target.bitrate,
-            duration_s=duration_s,
-            say=say,
-        ):
+        for view in api.monitor(scene, duration_s=duration_s, say=say):
             if on_terminal:
                 sys.stdout.write(screen(view))
                 sys.stdout.flush()

@@ -31,12 +31,12 @@ def print_table(rows: Sequence[Sequence[str]]) -> None:
 
 
 def say(line: str) -> None:
-    """One step of what is going on, on stderr."""
+    """Report one step, on stderr."""
     print(line, file=sys.stderr, flush=True)
 
 
 def say_on_terminal(line: str) -> None:
-    """One step, where somebody is there to read it."""
+    """Report one step, if stderr is a terminal."""
     if sys.stderr.isatty():
         say(line)
 
@@ -72,7 +72,7 @@ def progress_bar(stream: TextIO | None = None, width: int = 40, unit: str = ".1f
     return show
 
 
-# SIGTERM and SIGHUP as interrupts: every way of being told to stop takes the same safe way out.
+# SIGTERM and SIGHUP as interrupts: whatever stops a command, it leaves by the same safe way.
 
 
 @contextlib.contextmanager

@@ -6,21 +6,20 @@ import argparse
 import difflib
 import math
 import re
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.bus.interfaces import ConfiguredBus
     from canprobe.scene.model import Scene
+    from canprobe.session.target import Target
 
 
-# argparse as the commands use it: one clear line for a wrong command line, and the arguments that commands share.
-
-Commands = argparse._SubParsersAction
+# One clear line for a wrong command line.
 
 
 class Parser(argparse.ArgumentParser):
@@ -42,53 +41,7 @@ def did_you_mean(got: str, known: Iterable[str]) -> str:
     return f"; did you mean {close[0]}?" if close else ""
 
 
-def add_scene(parser: argparse.ArgumentParser, optional: bool = False) -> None:
-    """SCENE, which most commands take; optional where another argument can stand for it."""
-    parser.add_argument(
-        "scene",
-        metavar="SCENE",
-        nargs="?" if optional else None,
-        help="a packaged scene (`canprobe scenes` lists them) or the path of a TOML file",
-    )
-
-
-def add_bus(parser: argparse.ArgumentParser) -> None:
-    """Where the nodes are, in place of what the scene says."""
-    parser.add_argument(
-        "--bus",
-        metavar="B",
-        type=word,
-        help="lockstep, socketcan or another python-can interface; config: the one that CAN_INTERFACE or python-can's"
-        " configuration files name [the scene's]",
-    )
-    parser.add_argument(
-        "--channel",
-        metavar="[NAME=]CH",
-        action="append",
-        type=channel,
-        help="channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
-    )
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate [the scene's]")
-
-
-def add_bridge(parser: argparse.ArgumentParser) -> None:
-    """Other tools to feed, besides those of the scene."""
-    parser.add_argument(
-        "--bridge",
-        metavar="NAME",
-        action="append",
-        help="send the data to another tool: mcap, foxglove, ros2 or view; may be repeated",
-    )
-
-
-def add_force(parser: argparse.ArgumentParser) -> None:
-    """--force, of what writes results into a folder."""
-    parser.add_argument("--force", action="store_true", help="replace the results of an earlier run in DIR")
-
-
-def add_json(parser: argparse.ArgumentParser) -> None:
-    """--json: one document on stdout."""
-    parser.add_argument("--json", action="store_true", help="print one JSON document on stdout")
+# Types of arguments.
 
 
 def word(text: str) -> str:
@@ -165,23 +118,97 @@ def node_ids(text: str) -> tuple[int, ...]:
     return tuple(sorted(found))
 
 
+# Arguments that commands share.
+
+PATIENT_SYNCS = 40
+"""100 ms at 400 Hz: a virtual machine may stand still as long."""
+seed = whole(0, 2**63 - 1)
+
+OPTIONS: Mapping[str, dict[str, Any]] = {
+    "--bus": {
+        "metavar": "B",
+        "type": word,
+        "help": "lockstep, socketcan or another python-can interface; config: the one that CAN_INTERFACE or"
+        " python-can's configuration files name [the scene's]",
+    },
+    "--channel": {
+        "metavar": "[NAME=]CH",
+        "action": "append",
+        "type": channel,
+        "help": "channel of the interface; NAME=CH replaces the scene's channel NAME and may be repeated [the scene's]",
+    },
+    "--bitrate": {"metavar": "BIT/S", "type": whole(10_000, 1_000_000), "help": "bit rate [the scene's]"},
+    "--realtime": {
+        "action": "store_true",
+        "help": "request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
+        " reported [the scene's cycle.realtime]",
+    },
+    "--patient": {
+        "action": "store_true",
+        "help": f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop"
+        " nothing",
+    },
+    "--bridge": {
+        "metavar": "NAME",
+        "action": "append",
+        "default": [],
+        "help": "send the data to another tool: mcap, foxglove, ros2 or view; may be repeated",
+    },
+    "--out": {"metavar": "DIR", "type": folder_path, "help": "folder of the results [runs/<scene>-<time>]"},
+    "--force": {"action": "store_true", "help": "replace the results of an earlier run in DIR"},
+    "--seed": {"metavar": "N", "type": seed, "help": "seed of all random numbers [the scene's]"},
+    "--duration": {
+        "metavar": "S",
+        "type": seconds,
+        "help": "length of the scan, press, listen or free phase in seconds [the scene's]",
+    },
+    "--json": {"action": "store_true", "help": "print one JSON document on stdout"},
+}
+BUS = ("--bus", "--channel", "--bitrate")
+
+
+def add_scene(parser: Parser, optional: bool = False) -> None:
+    """SCENE, which most commands take; optional where another argument can stand for it."""
+    parser.add_argument(
+        "scene",
+        metavar="SCENE",
+        nargs="?" if optional else None,
+        help="a packaged scene (`canprobe scenes` lists them) or the path of a TOML file",
+    )
+
+
+def add_options(parser: argparse._ActionsContainer, *names: str) -> None:
+    """Options of `OPTIONS`, in this order."""
+    for name in names:
+        parser.add_argument(name, **OPTIONS[name])
+
+
 # Where a command goes: what the command line says, else the scene, else python-can's configuration.
 
 CONFIG = "config"
 """Stands for the interface where python-can's configuration is to name it."""
-PATIENT_SYNCS = 40
-"""100 ms at 400 Hz: a virtual machine may stand still as long."""
-_LOCKSTEP = "lockstep"
 
 
-@dataclass(frozen=True, slots=True)
-class Target:
-    """An interface, its channel and bit rate; and the sensor's channel where the scene gives it one of its own."""
+def scene_of(args: argparse.Namespace) -> Scene:
+    """The scene of `run` and `up`, as their options change it.
 
-    interface: str
-    channel: str
-    bitrate: int
-    sensor_channel: str | None = None
+    Raises:
+        UsageError: --patient is given and a node is real, or as `target_of`.
+    """
+    from canprobe.scene.load import load_scene
+
+    scene = with_realtime(load_scene(args.scene), args.realtime)
+    if args.patient:
+        if _has_real_nodes(scene):
+            raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
+        arm = scene.arm and replace(scene.arm, missed_syncs=PATIENT_SYNCS)
+        scene = replace(scene, arm=arm, limits=replace(scene.limits, late_cycles_max_percent=100.0))
+    return target_of(args, scene).applied_to(scene)
+
+
+def with_realtime(scene: Scene, wanted: bool) -> Scene:
+    """The scene, in real time where the command line wants it."""
+    return replace(scene, cycle=replace(scene.cycle, realtime=True)) if wanted else scene
 
 
 def target_of(args: argparse.Namespace, scene: Scene) -> Target:
@@ -192,69 +219,43 @@ def target_of(args: argparse.Namespace, scene: Scene) -> Target:
     Raises:
         UsageError: when `--channel NAME=CH` names no channel of the scene, or nothing is configured.
     """
+    from canprobe.session.target import LOCKSTEP, Target
+
+    main, bitrate = scene.bus.channel, args.bitrate
     sensors = scene.sensor.channel if scene.sensor is not None and scene.sensor.channel != "auto" else None
-    channels = _channels(args.channel or [], scene.bus.channel, sensors)
-    open_to_configuration = args.bus is None and scene.bus.interface == _LOCKSTEP and _has_real_nodes(scene)
-    found = _configured(args.bus) if args.bus == CONFIG or open_to_configuration else None
-    sensor_channel = None if sensors is None else channels.get(sensors, sensors)
-    if found is None:
-        channel = channels.get(scene.bus.channel, scene.bus.channel)
-        return Target(args.bus or scene.bus.interface, channel, args.bitrate or scene.bus.bitrate, sensor_channel)
-    channel = channels.get(scene.bus.channel) or found.channel or scene.bus.channel
-    return Target(found.interface, channel, args.bitrate or found.bitrate or scene.bus.bitrate, sensor_channel)
+    channels = _channels(args.channel or [], main, sensors)
+    interface, channel = args.bus, channels.get(main)
+    open_to_configuration = args.bus is None and scene.bus.interface == LOCKSTEP and _has_real_nodes(scene)
+    if (args.bus == CONFIG or open_to_configuration) and (found := _configured(args.bus)) is not None:
+        interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
+    return Target.over(scene, interface, channel, bitrate, sensors and channels.get(sensors, sensors))
 
 
-def add_realtime(parser: argparse.ArgumentParser) -> None:
-    """The option of commands that keep time on a real interface."""
-    parser.add_argument(
-        "--realtime",
-        action="store_true",
-        help="request SCHED_FIFO, a processor for the cycle and locked memory; what the system does not permit is"
-        " reported [the scene's cycle.realtime]",
-    )
+def real_target(
+    bus: str | None,
+    channel: str | None,
+    bitrate: int | None,
+    *,
+    channel_else: str | None = None,
+    bitrate_else: int = 1_000_000,
+) -> Target:
+    """The bus of a command that needs one between processes: the command line's, else python-can's configuration's.
 
-
-def add_patient(parser: argparse.ArgumentParser) -> None:
-    """The option of commands that run emulated nodes on a machine that is too slow for what hardware needs."""
-    parser.add_argument(
-        "--patient",
-        action="store_true",
-        help=f"emulated nodes on a slow machine: drives wait for {PATIENT_SYNCS} SYNCs, and late cycles stop nothing",
-    )
-
-
-def with_patience(scene: Scene, wanted: bool) -> Scene:
-    """The scene with drives that wait for their master and a master that is never too late, where it is wanted.
+    Args:
+        bus, channel, bitrate: of the command line.
+        channel_else, bitrate_else: where neither says anything.
 
     Raises:
-        UsageError: it is wanted of real nodes.
+        UsageError: nothing names a channel, or nothing is configured and the command line asks for what is.
     """
-    if not wanted:
-        return scene
-    if _has_real_nodes(scene):
-        raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")
-    arm = scene.arm and replace(scene.arm, missed_syncs=PATIENT_SYNCS)
-    return replace(scene, arm=arm, limits=replace(scene.limits, late_cycles_max_percent=100.0))
+    from canprobe.session.target import Target
 
-
-def with_realtime(scene: Scene, wanted: bool) -> Scene:
-    """The scene, in real time where the command line wants it."""
-    return replace(scene, cycle=replace(scene.cycle, realtime=True)) if wanted else scene
-
-
-def real_target(bus: str | None, channel: str | None, bitrate: int | None) -> tuple[str, str | None, int | None]:
-    """Interface, channel and bit rate of a command without a scene that needs a bus between processes.
-
-    Returns:
-        What the command line says, else python-can's configuration; channel and bit rate None where nobody says.
-
-    Raises:
-        UsageError: nothing is configured, and the command line asks for what is.
-    """
-    found = _configured(bus) if bus in (None, CONFIG) else None
-    if found is None:
-        return bus or "socketcan", channel, bitrate
-    return found.interface, channel or found.channel, bitrate or found.bitrate
+    interface = bus or "socketcan"
+    if bus in (None, CONFIG) and (found := _configured(bus)) is not None:
+        interface, channel, bitrate = found.interface, channel or found.channel, bitrate or found.bitrate
+    if (channel := channel or channel_else) is None:
+        raise UsageError("--channel is missing: name the bus, such as --channel vcan0")
+    return Target(interface, channel, bitrate or bitrate_else)
 
 
 def _configured(bus: str | None) -> ConfiguredBus | None:

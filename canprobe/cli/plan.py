@@ -10,13 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_json, add_scene
+from canprobe.cli.parser import Parser, add_options, add_scene
 from canprobe.errors import CanprobeError, PlanError, UsageError
 
 if TYPE_CHECKING:
     from canprobe.planning.model import Plan
 
-_EXAMPLE = """\
+HELP = "show what a scene sends, needs and leaves out"
+EXAMPLE = """\
 files of --export:
   dcf      a device configuration file for each node
   dbc, kcd every frame with its signals (extra `can`)
@@ -34,11 +35,8 @@ examples:
 EXPORTS = ("dcf", "dbc", "kcd", "bus.yml")
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "plan", help="show what a scene sends, needs and leaves out", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
     parser.add_argument(
         "--measured", metavar="LOG", type=Path, help="compare a candump log or the folder of a run with the plan"
@@ -60,8 +58,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         "--figure", metavar="FILE.png", type=Path, help="draw the cycles and the response times (extra `study`)"
     )
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of the exported files [.]")
-    add_json(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "--json")
 
 
 def _draw(plan: Plan, path: Path) -> Path:
@@ -70,7 +67,7 @@ def _draw(plan: Plan, path: Path) -> Path:
     except ImportError as error:
         raise UsageError("--figure needs matplotlib: pip install 'canprobe[study]'") from error
     if not path.suffix:
-        path = path.with_suffix(".png")  # as matplotlib would do by itself, and tell nobody
+        path = path.with_suffix(".png")  # as matplotlib would do without a message
     try:
         draw_plan(plan, path)
     except ValueError as error:  # matplotlib knows no such form

@@ -9,10 +9,11 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, say
-from canprobe.cli.parser import Commands, Parser, add_bridge, add_json
+from canprobe.cli.parser import Parser, add_options
 from canprobe.errors import ResultsError
 
-_EXAMPLE = """\
+HELP = "estimate the shape again from a recorded bus"
+EXAMPLE = """\
 examples:
   canprobe replay runs/cylinder-20260101-120000-000
   canprobe replay runs/cylinder-20260101-120000-000 --method ml --method chen1996 --out estimates.npz
@@ -21,11 +22,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "replay", help="estimate the shape again from a recorded bus", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("log", metavar="LOG", type=Path, help="folder of a run, or a candump log")
     parser.add_argument(
         "--scene", metavar="SCENE", help="packaged scene or path of a TOML file [the scene.toml of the run]"
@@ -37,13 +35,11 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="recursive, ml, chord or chen1996; may be repeated [those of the scene]",
     )
     parser.add_argument("--out", metavar="FILE", type=Path, help="write all estimates to this npz file")
-    add_bridge(parser)
-    add_json(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "--bridge", "--json")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay the log and print what the estimators say."""
+    """Replay the log and print the estimates."""
     from canprobe.recorded import reestimate as recorded
 
     if args.bridge:
@@ -59,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run_into(args: argparse.Namespace) -> int:
-    """Feed the log to bridges, and print what the estimators and the bridges say."""
+    """Feed the log to bridges; print the estimates and the state of the bridges."""
     from canprobe.recorded.into_bridges import replay_into
     from canprobe.results.summary import bridge_lines
 

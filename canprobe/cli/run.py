@@ -10,26 +10,11 @@ import argparse
 from pathlib import Path
 
 from canprobe.cli.output import print_json, progress_bar, say, say_on_terminal
-from canprobe.cli.parser import (
-    Commands,
-    Parser,
-    add_bridge,
-    add_bus,
-    add_force,
-    add_json,
-    add_patient,
-    add_realtime,
-    add_scene,
-    folder_path,
-    seconds,
-    target_of,
-    whole,
-    with_patience,
-    with_realtime,
-)
+from canprobe.cli.parser import BUS, Parser, add_options, add_scene, scene_of
 from canprobe.errors import CanprobeError
 
-_EXAMPLE = """\
+HELP = "run a scene and write the results"
+EXAMPLE = """\
 examples:
   canprobe run cylinder
   canprobe run cylinder --seed 3 --out runs/third --json
@@ -38,43 +23,23 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("run", help="run a scene and write the results", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser)
-    add_bus(parser)
-    add_realtime(parser)
-    add_patient(parser)
-    add_bridge(parser)
-    parser.add_argument("--out", metavar="DIR", type=folder_path, help="folder of the results [runs/<scene>-<time>]")
-    add_force(parser)
+    add_options(parser, *BUS, "--realtime", "--patient", "--bridge", "--out", "--force", "--seed", "--duration")
     parser.add_argument(
         "--tool", metavar="FILE", type=Path, help="centre of the probe, from the tool.toml of a calibration"
     )
-    parser.add_argument(
-        "--seed", metavar="N", type=whole(0, 2**63 - 1), help="seed of all random numbers [the scene's]"
-    )
-    parser.add_argument(
-        "--duration",
-        metavar="S",
-        type=seconds,
-        help="length of the scan, press, listen or free phase in seconds [the scene's]",
-    )
-    parser.add_argument("--blf", action="store_true", help="also write the bus log as bus.blf at the end")
-    add_json(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the scene; the summary goes to stdout, the progress to stderr. A run that was stopped raises."""
-    from canprobe.scene.load import load_scene
-
-    scene = with_patience(with_realtime(load_scene(args.scene), args.realtime), args.patient)
+    scene = scene_of(args)
     if args.tool is not None:
         from canprobe.scene.geometry import with_tool
 
         scene = with_tool(scene, args.tool)
-    target = target_of(args, scene)
 
     from canprobe import api
 
@@ -82,42 +47,24 @@ def run(args: argparse.Namespace) -> int:
     try:
         result = api.run(
             scene,
-            interface=target.interface,
-            channel=target.channel,
-            sensor_channel=target.sensor_channel,
-            bitrate=target.bitrate,
             out=folder,
             seed=args.seed,
             duration_s=args.duration,
             force=args.force,
             progress=progress_bar(),
             say=say_on_terminal,
-            bridge=args.bridge or (),
+            bridge=args.bridge,
         )
     except CanprobeError as error:
         if args.json and error.summary is not None:
             print_json(error.summary)
-        try:
-            _write_blf(folder, wanted=args.blf and error.summary is not None)
-        except CanprobeError as unwritten:  # what stopped the run counts for more
-            error.add_note(str(unwritten))
         raise
     except KeyboardInterrupt:
         where = f"; what was measured until then: {folder}" if folder.exists() else ""
         say(f"canprobe: interrupted, the cell is stopped{where}")
-        _write_blf(folder, wanted=args.blf)
         raise
-    _write_blf(folder, wanted=args.blf)
     if args.json:
         print_json(result.summary)
     else:
         print(result.text())
     return 0
-
-
-def _write_blf(folder: Path, *, wanted: bool) -> None:
-    """The bus in the other form, where it was recorded."""
-    if wanted and (folder / "bus.log").is_file():
-        from canprobe.bus.disk import convert_log
-
-        convert_log(folder / "bus.log", folder / "bus.blf")

@@ -1,7 +1,7 @@
 """List the nodes on a bus with their identities; with --lss also assign ids to nodes that have none.
 
 LSS (CiA 305) finds nodes without an id by vendor, product, revision and serial number (1018h). --assign gives an id to
-one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers say which device is which. A device
+one device. With a SCENE, its nodes get their ids; EDS files and serial_numbers identify the devices. A device
 boots with its new id at once and keeps it, unless --no-store is given.
 """
 
@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 
 from canprobe.cli.output import print_json, print_table, say
 from canprobe.cli.parser import (
-    Commands,
+    OPTIONS,
     Parser,
-    add_json,
+    add_options,
     add_scene,
     channel,
     number_of_32_bits,
     real_target,
     whole,
-    word,
 )
 from canprobe.errors import UsageError
 
 if TYPE_CHECKING:
     from canprobe.cell.commission import Commissioned
 
-_EXAMPLE = """\
+HELP = "list the nodes on a bus"
+EXAMPLE = """\
 examples:
   canprobe scan --bus socketcan --channel can0
   canprobe scan --lss --channel can0                   # also the nodes without an id
@@ -40,20 +40,18 @@ _NUMBERS = 4
 Assignment = tuple[tuple[int | None, int | None, int | None, int | None], int]
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("scan", help="list the nodes on a bus", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_scene(parser, optional=True)
     parser.add_argument(
         "--bus",
-        metavar="B",
-        type=word,
-        help="python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]",
+        **OPTIONS["--bus"]
+        | {"help": "python-can interface [that of CAN_INTERFACE or python-can's configuration files, else socketcan]"},
     )
     parser.add_argument(
         "--channel", metavar="CH", type=channel, default=(None, None), help="channel of the interface [can0]"
     )
-    parser.add_argument("--bitrate", metavar="BIT/S", type=whole(10_000, 1_000_000), help="bit rate [1000000]")
+    parser.add_argument("--bitrate", **OPTIONS["--bitrate"] | {"help": "bit rate [1000000]"})
     parser.add_argument("--lss", action="store_true", help="also find nodes without an id")
     parser.add_argument(
         "--assign",
@@ -64,8 +62,7 @@ def add_parser(commands: Commands[Parser]) -> None:
         help="assign this id to the device with this serial number or VENDOR:PRODUCT:REVISION:SERIAL; may be repeated",
     )
     parser.add_argument("--no-store", action="store_true", help="the devices lose their new ids when they lose power")
-    add_json(parser)
-    parser.set_defaults(run=run)
+    add_options(parser, "--json")
 
 
 def assignment(text: str) -> Assignment:
@@ -81,30 +78,29 @@ def assignment(text: str) -> Assignment:
 def run(args: argparse.Namespace) -> int:
     """Print one row a node."""
     if args.bus == "lockstep":
-        raise UsageError("scan: a lockstep bus lives inside one run and has nobody on it; name a real interface")
+        raise UsageError("scan: a lockstep bus lives inside one run; name a real interface with --bus")
     _check(args)
 
     from canprobe import api
 
-    interface, name, bitrate = real_target(args.bus, args.channel[1], args.bitrate)
-    where, rate = name or "can0", bitrate or 1_000_000
+    target = real_target(args.bus, args.channel[1], args.bitrate, channel_else="can0")
     if not args.lss:
-        nodes = api.scan(interface, where, rate, say=say)
+        nodes = api.scan(target, say=say)
         if args.json:
             print_json(nodes)
         else:
-            _print_nodes(nodes, where)
+            _print_nodes(nodes, target.channel)
         return 0
     scene = None
     if args.scene is not None:
         from canprobe.scene.load import load_scene
 
         scene = load_scene(args.scene)
-    done = api.commission(interface, where, rate, scene=scene, assign=args.assign, store=not args.no_store, say=say)
+    done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=say)
     if args.json:
         print_json(done.as_document())
     else:
-        _print_commissioned(done, where)
+        _print_commissioned(done, target.channel)
     return 0
 
 

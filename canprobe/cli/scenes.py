@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Commands, Parser, add_json
+from canprobe.cli.parser import Parser, add_options
 
-_EXAMPLE = """\
+HELP = "list the packaged scenes"
+EXAMPLE = """\
 examples:
   canprobe scenes
   canprobe scenes --json
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("scenes", help="list the packaged scenes", description=__doc__, epilog=_EXAMPLE)
-    add_json(parser)
-    parser.set_defaults(run=run)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    add_options(parser, "--json")
 
 
 def run(args: argparse.Namespace) -> int:

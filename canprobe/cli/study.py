@@ -11,9 +11,10 @@ from pathlib import Path
 
 from canprobe.bus.scheduling import interrupts_repeated
 from canprobe.cli.output import print_json, print_table, progress_bar, say
-from canprobe.cli.parser import Commands, Parser, add_json, did_you_mean, whole
+from canprobe.cli.parser import Parser, add_options, did_you_mean, whole
 
-_EXAMPLE = """\
+HELP = "measure accuracy, limits, faults and timing"
+EXAMPLE = """\
 examples:
   canprobe study --list
   canprobe study estimators --quick --out runs/estimators
@@ -23,11 +24,8 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "study", help="measure accuracy, limits, faults and timing", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("name", metavar="NAME", nargs="?", help="study to run; --list lists them")
     parser.add_argument("--list", action="store_true", help="list the studies, and end")
     parser.add_argument("--out", metavar="DIR", type=Path, help="folder of the files [runs/study-NAME]")
@@ -41,8 +39,8 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument("--workers", metavar="N", type=whole(1, 1024), help="number of processes [one for each core]")
     parser.add_argument("--dask", metavar="ADDRESS", help="compute on the Dask cluster with this scheduler")
     parser.add_argument("--fresh", action="store_true", help="ignore finished cells in DIR")
-    add_json(parser)
-    parser.set_defaults(run=run, complain=parser.error)
+    add_options(parser, "--json")
+    parser.set_defaults(complain=parser.error)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,9 +58,9 @@ def run(args: argparse.Namespace) -> int:
         wrong = f"unknown study {args.name!r}{did_you_mean(args.name, STUDIES)}" if args.name else "expected NAME"
         args.complain(f"{wrong}; studies: {known}")
     if args.vcan and args.name != "faults":
-        args.complain(f"--vcan: study {args.name} has no form of its own on vcan0; faults has")
+        args.complain(f"--vcan: study {args.name} does not run on vcan0; only faults does")
     if args.vcan and args.seed is not None:
-        args.complain("--seed: the runs on vcan0 hang on the machine's own time too and cannot be told again")
+        args.complain("--seed: the runs on vcan0 depend on the machine's timing and cannot be repeated from a seed")
     if args.seed is not None:
         return _replay(args)
     from canprobe.studies.harness import as_document, text_of, write_study
@@ -74,7 +72,7 @@ def run(args: argparse.Namespace) -> int:
         with open_sweep(out, say=say, progress=progress_bar(unit=".0f cells"), **options) as sweep:
             result = run_study(args.name, quick=args.quick, sweep=sweep, vcan=args.vcan)
     except KeyboardInterrupt:
-        say(f"canprobe: interrupted; what is finished is kept in {out}, the same command again computes the rest")
+        say(f"canprobe: interrupted; finished cells are kept in {out}, the same command computes the rest")
         raise
     with interrupts_repeated():
         paths = write_study(result, out)
@@ -89,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
 def _replay(args: argparse.Namespace) -> int:
     """Carry out one numbered run of a study again; status 1 where it fails."""
     if args.name != "faults":
-        args.complain(f"--seed: the runs of study {args.name} are not numbered; those of faults are")
+        args.complain(f"--seed: expected study faults, got {args.name}")
     from canprobe.studies.faults import replay
 
     outcome = replay(args.seed, say)

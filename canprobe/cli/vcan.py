@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.parser import Commands, Parser, seconds
+from canprobe.cli.parser import Parser, seconds
 from canprobe.errors import UsageError
 
-_EXAMPLE = """\
+HELP = "run a command where a vcan0 exists"
+EXAMPLE = """\
 exit status: that of the command, 128 + n after signal n; 124 time-out, 125 no vcan0 possible here, 123 the virtual
 machine ended early
 
@@ -22,15 +23,9 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "vcan",
-        help="run a command where a vcan0 exists",
-        usage="canprobe vcan [--install] [--timeout S] [--realtime] -- COMMAND...",
-        description=__doc__,
-        epilog=_EXAMPLE,
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
+    parser.usage = "canprobe vcan [--install] [--timeout S] [--realtime] -- COMMAND..."
     parser.add_argument(
         "--install", action="store_true", help="install the Debian package user-mode-linux if it is needed (as root)"
     )
@@ -41,7 +36,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "command", metavar="COMMAND", nargs=argparse.REMAINDER, help="command to run, with its arguments"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

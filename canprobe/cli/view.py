@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING
 
 from canprobe.bus.scheduling import interrupts_held, interrupts_repeated
 from canprobe.cli.output import left_by_ctrl_c, say
-from canprobe.cli.parser import Commands, Parser, add_bus, add_force, seconds, target_of, whole
+from canprobe.cli.parser import BUS, Parser, add_options, target_of, whole
 
 if TYPE_CHECKING:
     from canprobe.api import AnyObserver
 
-_EXAMPLE = """\
+HELP = "show a scene or a run in a browser"
+EXAMPLE = """\
 examples:
   canprobe view cylinder
   canprobe view runs/cylinder-20260101-120000-000 --port 9000 --no-open
@@ -28,13 +29,9 @@ examples:
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "view", help="show a scene or a run in a browser", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("what", metavar="SCENE|RUN_DIR", help="scene to run, or folder of a recorded run")
-    add_bus(parser)
     parser.add_argument(
         "--host",
         metavar="H",
@@ -46,11 +43,8 @@ def add_parser(commands: Commands[Parser]) -> None:
     )
     parser.add_argument("--no-open", action="store_true", help="print the address and open no browser")
     parser.add_argument("--html", metavar="FILE", type=Path, help="write the replay to one HTML file, and end")
-    parser.add_argument("--out", metavar="DIR", type=Path, help="of a scene: folder of the results")
-    add_force(parser)
-    parser.add_argument("--seed", metavar="N", type=whole(0, 2**63 - 1), help="of a scene: seed of all random numbers")
-    parser.add_argument("--duration", metavar="S", type=seconds, help="of a scene: length of its phase in seconds")
-    parser.set_defaults(run=run)
+    of_scene = parser.add_argument_group("options of a SCENE")
+    add_options(of_scene, *BUS, "--out", "--force", "--seed", "--duration")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -59,7 +53,8 @@ def run(args: argparse.Namespace) -> int:
 
     check_bridges(["view"])
     folder, browser = Path(args.what), _Browser(args.port, quiet=args.no_open)
-    with contextlib.nullcontext() if args.html is not None else left_by_ctrl_c():  # a page is left, a file is not
+    leave = left_by_ctrl_c() if args.html is None else contextlib.nullcontext()  # the normal end of a page only
+    with leave:
         if _is_scene(args.what):
             folder = _run_scene(args, browser)
         from canprobe.bridge.view.browser import serve_run, write_page
@@ -91,32 +86,29 @@ def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:
     from canprobe.scene.model import BridgeSettings
 
     scene = load_scene(args.what)
-    target = target_of(args, scene)
     settings = replace(scene.bridge or BridgeSettings(), view_port=args.port, view_host=args.host)
+    scene = target_of(args, scene).applied_to(replace(scene, bridge=settings))
     live = args.html is None
     folder = api.results_folder(scene, args.out)
     api.run(
-        replace(scene, bridge=settings),
-        interface=target.interface,
-        channel=target.channel,
-        bitrate=target.bitrate,
+        scene,
         out=folder,
         seed=args.seed,
         duration_s=args.duration,
         force=args.force,
         bridge=("view",) if live else (),
-        observers=[_paced()] if live and target.interface == "lockstep" else [],
+        observers=[_paced()] if live and scene.bus.interface == "lockstep" else [],
         say=browser.say,
     )
     return folder
 
 
 class _Browser:
-    """Says where it is to be seen, and opens that in the user's browser, once.
+    """Prints the address of the page and opens it in the user's browser, once.
 
     Args:
         port: that was asked for.
-        quiet: only say it.
+        quiet: only print the address.
 
     Attributes:
         port: where it was last, so that a page that is open finds the next one there.
@@ -135,7 +127,7 @@ class _Browser:
             webbrowser.open(address)
 
     def say(self, line: str) -> None:
-        """A step of the run; the bridge's own is its address."""
+        """Report a step of the run; the bridge's step is its address."""
         where = line.removeprefix("bridge view: ")
         if where != line:
             self.show(where)

@@ -1,7 +1,7 @@
 """The tactile node: 16×16 taxels as window, full image or features, one whole frame a trigger.
 
 A trigger is a SYNC at which the header's TPDO is due. The array is sampled there; what goes out is the image of an
-earlier trigger, because a real sensor needs a frame to process it. The header's sample age says so.
+earlier trigger, because a real sensor needs a frame to process it. The header carries the sample's age.
 Source: objects 2000h–2130h of `tactile_array.eds`; wire form in `protocol.tactile`.
 """
 
@@ -18,9 +18,8 @@ from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
 from canprobe.eds.packaged import WINDOW_SIZE, WINDOW_SIZE_NAME
-from canprobe.emulator.node.core import Application
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
-from canprobe.emulator.node.slave_node import OdOf, SlaveNode
+from canprobe.emulator.node.slave_node import Application, OdOf, SlaveNode
 from canprobe.errors import UsageError
 from canprobe.protocol.frames import NmtState
 from canprobe.protocol.tactile import SIDE, WINDOW, WINDOWS, Features, TactileHeader, TactileMode, pack_whole
@@ -47,10 +46,8 @@ def is_overloaded(raw: Raw) -> bool:
 
 def correct(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int) -> Image:
     """Raw counts (16, 16) → whole counts, tare subtracted, times the gain, saturated, zero below the threshold."""
-    if tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8:
-        return _kept(threshold).take(raw.astype(np.intp))
-    counts = _scaled(raw, tare, gain_permille)
-    np.rint(counts, out=counts)
+    as_sampled = tare is None and gain_permille == GAIN_ONE and raw.dtype == np.uint8
+    counts = raw if as_sampled else np.rint(_scaled(raw, tare, gain_permille))
     return _kept(threshold).take(counts.astype(np.intp), mode="clip")
 
 
@@ -66,7 +63,9 @@ def correct_finely(
     raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int, threshold: int
 ) -> NDArray[np.float64]:
     """As ``correct``, with the parts of counts that a finer ADC sees and an image on the bus cannot carry."""
-    return _limited(_scaled(raw, tare, gain_permille), threshold)
+    counts = np.minimum(_scaled(raw, tare, gain_permille), FULL_SCALE)
+    counts[counts < max(threshold, 0)] = 0.0
+    return counts
 
 
 def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> NDArray[np.float64]:
@@ -75,12 +74,6 @@ def _scaled(raw: Raw, tare: NDArray[np.float64] | None, gain_permille: int) -> N
         counts -= tare
     if gain_permille != GAIN_ONE:
         counts *= gain_permille / GAIN_ONE
-    return counts
-
-
-def _limited(counts: NDArray[np.float64], threshold: int) -> NDArray[np.float64]:
-    np.minimum(counts, FULL_SCALE, out=counts)
-    counts[counts < max(threshold, 0)] = 0.0
     return counts
 
 
@@ -186,18 +179,16 @@ class TactileApplication(Application):
             node.pdos.on_trigger(index, self._trigger)
         node.dictionary.on_check(TARE_COMMAND, _check_tare)
         node.dictionary.on_write(TARE_COMMAND, self._begin_tare)
-        for index in (MODE, THRESHOLD, GAIN, FULL_SCALE_PA):
-            node.dictionary.on_write(index, lambda _sub, _value: self._read_settings())
+        node.dictionary.on_change(self._read_settings, MODE, THRESHOLD, GAIN, FULL_SCALE_PA)
         self._content = {mode: _members(node.dictionary, index) for mode, index in _CONTENT.items()}
-        entry = node.dictionary.entries.get(key_of(WINDOW_SIZE, 0))
-        self._sized = entry is not None and entry.name == WINDOW_SIZE_NAME
+        self._sized = node.dictionary.has_named(WINDOW_SIZE, WINDOW_SIZE_NAME)
         if self._sized:
             node.dictionary.on_check(WINDOW_SIZE, self._check_window)
             node.dictionary.on_write(WINDOW_SIZE, self._begin_window)
         self._read_settings()
 
     def _read_settings(self) -> None:
-        """Take what the dictionary says now; an array without a window size has 8 taxels along the window."""
+        """Take the present values of the dictionary; an array without a window size has 8 taxels along the window."""
         number = self._node.dictionary.number
         self._mode = TactileMode(number(MODE, 0, TactileMode.WINDOW))
         self._gain, self._threshold = number(GAIN, 0, 1000), number(THRESHOLD)
@@ -298,19 +289,16 @@ def _members(dictionary: Dictionary, index: int) -> tuple[int, ...]:
     return tuple(takewhile(dictionary.__contains__, (key_of(index, subindex) for subindex in count(1))))
 
 
-def make_tactile_node(
-    od: ObjectDictionary, node_id: int, plant: TactilePlant, latency_frames: int = 1, od_of: OdOf | None = None
-) -> SlaveNode:
+def make_tactile_node(od: ObjectDictionary, node_id: int, plant: TactilePlant, od_of: OdOf | None = None) -> SlaveNode:
     """A tactile node on the plant.
 
     Args:
         od: of `tactile_array.eds`, for this node id.
         node_id: 1–127, or 255 for none.
         plant: shared by all nodes.
-        latency_frames: triggers between sampling an image and sending it.
         od_of: the EDS for another node id, where LSS may give the node one.
     """
-    return SlaveNode(od, node_id, TactileApplication(plant, latency_frames), od_of=od_of)
+    return SlaveNode(od, node_id, TactileApplication(plant), od_of=od_of)
 
 
 def _check_tare(subindex: int, value: Value) -> None:

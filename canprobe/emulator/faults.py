@@ -8,6 +8,7 @@ from enum import Enum
 from heapq import heappop, heappush
 from random import Random
 
+from canprobe.bus.lockstep import Participant
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.errors import ProtocolError
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, Emcy, Frame
@@ -85,7 +86,7 @@ def flip_bit(data: bytes, rng: Random) -> bytes:
 # The base of what stands between a node and a lockstep bus: it is attached in the node's place.
 
 
-class WrappedNode:
+class WrappedNode(Participant):
     """Passes on what the bus asks of a node; what is done to its frames is the derived class's.
 
     Args:
@@ -94,6 +95,11 @@ class WrappedNode:
 
     def __init__(self, node: SlaveNode) -> None:
         self.node = node
+
+    @property
+    def node_id(self) -> int:
+        """As the node."""
+        return self.node.node_id
 
     @property
     def name(self) -> str:
@@ -106,13 +112,18 @@ class WrappedNode:
         return self.node.listens
 
     @property
-    def rerouted(self) -> Callable[[], None]:
-        """As the node's."""
-        return self.node.rerouted
+    def kind(self) -> type:
+        """As the node."""
+        return self.node.kind
 
-    @rerouted.setter
-    def rerouted(self, function: Callable[[], None]) -> None:
-        self.node.rerouted = function
+    @property
+    def patient(self) -> frozenset[int]:
+        """As the node."""
+        return self.node.patient
+
+    def connect(self, rerouted: Callable[[], None]) -> None:
+        """Of the node."""
+        self.node.connect(rerouted)
 
 
 # A node with faults, between the node and a lockstep bus: it is attached in the node's place.

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from canopen.objectdictionary import ObjectDictionary
 from numpy.typing import NDArray
 
+from canprobe.bus.lockstep import Participant
 from canprobe.eds.packaged import FULL_SCALE, has_full_scale, load_eds
 from canprobe.eds.reading import is_drive
 from canprobe.emulator.array import make_tactile_node
@@ -28,24 +29,9 @@ from canprobe.robot.inverse import start_posture
 from canprobe.robot.kinematics import Array, PumaModel, forward
 from canprobe.scene.setup import Arm, Setup
 
-# Records what is true in the plant at every SYNC, beside what the nodes measure.
 
-
-class TruePlant(Protocol):
-    """A plant that tells its present true values."""
-
-    def advance(self, t_ns: int) -> None:
-        """Bring the plant to `t_ns`; idempotent."""
-
-    def state(self) -> Any:
-        """The present state, all that the truth follows from."""
-
-    def truth(self, state: Any) -> Mapping[str, Any]:
-        """True values of a state: numbers and arrays, always under the same names."""
-
-
-class TruthRecorder:
-    """A silent participant of the bus that writes down the plant's state at every SYNC.
+class TruthRecorder(Participant):
+    """A silent participant of the bus that notes the plant's state at every SYNC, beside what the nodes measure.
 
     What is true in that state is computed afterwards: in real time it would make the nodes' next answers late.
 
@@ -57,26 +43,13 @@ class TruthRecorder:
     """
 
     name = "truth recorder"
-    witness = True
+    hears_every_sync = True
     listens = frozenset((SYNC_ID,))
 
-    def __init__(self, plant: TruePlant) -> None:
+    def __init__(self, plant: Plant) -> None:
         self._plant = plant
         self.origin_ns = 0
         self._rows: list[tuple[int, int, Any]] = []
-
-    @property
-    def next_deadline_ns(self) -> None:
-        """Only a SYNC wakes it."""
-        return None
-
-    def start(self, t_ns: int) -> list[Frame]:
-        """Nothing to say."""
-        return []
-
-    def advance(self, t_ns: int) -> list[Frame]:
-        """Nothing is ever due."""
-        return []
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
         """On a SYNC, take the state."""
@@ -99,7 +72,7 @@ class TruthRecorder:
 
 
 def set_serial_number(node: SlaveNode, serial: int) -> None:
-    """Tell two devices of one EDS apart; a device without 1018h:04 has none."""
+    """Give a device its serial number, by which two of one EDS differ; a device without 1018h:04 has none."""
     if key_of(0x1018, 4) in node.dictionary:
         node.dictionary.set_default(0x1018, 4, serial)
 
@@ -118,16 +91,18 @@ class World:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
         recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
+            recorder, which listens only.
     """
 
     nodes: tuple[SlaveNode, ...]
     plant: Plant
     recorder: TruthRecorder | None
+    participants: list[Any] = field(init=False)
 
-    @property
-    def participants(self) -> tuple[SlaveNode | TruthRecorder, ...]:
-        """Everything that lives on the bus; the recorder listens only."""
-        return self.nodes if self.recorder is None else (*self.nodes, self.recorder)
+    def __post_init__(self) -> None:
+        recorders = () if self.recorder is None else (self.recorder,)
+        object.__setattr__(self, "participants", [*self.nodes, *recorders])
 
 
 def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
@@ -199,7 +174,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
 def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe: Array) -> Array:
     """Where the real arm's base stands in the controller's base frame, (3,), m.
 
-    An experimenter moves the arm to the object and takes that place for what the encoders say: both arms hold the
+    An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
     probe at one place in the first posture.
     """
     offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
@@ -207,7 +182,7 @@ def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe:
 
 
 def _first_posture(setup: Setup, arm: Arm) -> Array:
-    """Joint angles (n,), rad, at power on: above the start point of a touch, else as the scene says."""
+    """Joint angles (n,), rad, at power on: above the start point of a touch, else as in the scene."""
     touch = setup.touch
     if touch is None:
         return arm.q_start
@@ -228,7 +203,7 @@ def _first_posture(setup: Setup, arm: Arm) -> Array:
 def make_eds_node(
     od: ObjectDictionary, node_id: int, *, eds: str | Path | None = None, serial: int | None = None
 ) -> SlaveNode:
-    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis of its own.
+    """A conforming CiA 301 node with the values of its EDS; a CiA 402 drive moves an ideal axis.
 
     Args:
         od: of any EDS, for this node id.

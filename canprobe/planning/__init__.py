@@ -5,9 +5,10 @@ changes that would fit. Nothing is opened or sent here.
 
 1. `devices` reads each device's EDS file: which objects, PDOs, mappings and bit rates it really has. What it lacks
    and what cannot be done without is a reason; what can be done without is listed as not available.
-2. `choices` lists what the setup leaves open ("auto"), the cheapest first. For each candidate `make` plans SYNC, PDOs
-   and identifiers, and `traffic` checks load, the peak behind one SYNC and the worst-case response time of every
-   message.
+2. `choices` has every decision with its reason: what the setup leaves open ("auto"), the cheapest first; what would
+   make it fit; what is left out; warnings. For each candidate `make` plans PDOs and identifiers, and `traffic` checks
+   SYNC, load, the peak behind one SYNC and the worst-case response time of every message. `window` compares the window
+   of the array with the contact patch.
 3. `motion` follows the task's path with the arm: reach, stops, speeds, the shape under the probe.
 4. `make.make_plan` puts the answer together: `model.Plan` carries the closed setup, nodes, PDOs, buses, choices, what
    is left out, warnings. Bring-up, cycle, emulator and command line work from it alone.

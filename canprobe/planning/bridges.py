@@ -83,15 +83,13 @@ def check_bridges(names: Iterable[str]) -> None:
 
 def unavailable_bridges(setup: Setup) -> tuple[tuple[str, str], ...]:
     """Bridges that the scene asks for and cannot have here, as (what, why)."""
-    used = setup.bridge.use if setup.bridge is not None else ()
     return tuple(
         (f"bridge {name}", f"{', '.join(BRIDGES[name].missing)} not installed: {BRIDGES[name].pip}")
-        for name in used
+        for name in setup.bridge.use
         if BRIDGES[name].missing
     )
 
 
 def bridge_outputs(setup: Setup) -> tuple[str, ...]:
     """The files that the scene's bridges write."""
-    used = setup.bridge.use if setup.bridge is not None else ()
-    return tuple(output for name in used if (output := BRIDGES[name].output) is not None)
+    return tuple(output for name in setup.bridge.use if (output := BRIDGES[name].output) is not None)

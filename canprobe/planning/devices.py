@@ -9,7 +9,6 @@ from typing import Any
 from canprobe.eds.packaged import has_long_pdos, has_window_size, load_eds
 from canprobe.planning.model import Direction, Identity, NodeKind, PlannedPdo, SyncPlan
 from canprobe.planning.traffic import frame_bits
-from canprobe.protocol.frame_bits import worst_case_bits
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import WINDOW, window_words
@@ -20,7 +19,6 @@ from canprobe.scene.setup import Array, Setup
 _COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
 _MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
 _SIGNED_TYPES = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
-_INVALID_BIT = 1 << 31
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +48,8 @@ class Abilities:
         return Identity(*(self._default(0x1018, subindex) for subindex in (1, 2, 3)))
 
     @property
-    def has_long_pdos(self) -> bool:
-        """Whether it can send PDOs of up to 64 bytes."""
-        return has_long_pdos(self.od)
-
-    @property
     def bitrates(self) -> tuple[int, ...]:
-        """Bit rates that it has, bit/s; empty where its EDS tells none."""
+        """Bit rates that it has, bit/s; empty where its EDS lists none."""
         return tuple(sorted(self.od.device_information.allowed_baudrates))
 
     def has(self, index: int, subindex: int = 0) -> bool:
@@ -85,7 +78,7 @@ class Abilities:
     def mapping_problem(self, direction: Direction, number: int, words: tuple[int, ...]) -> str | None:
         """Why this PDO cannot carry this mapping, None where it can."""
         index = _MAPPING[direction] + number - 1
-        if number not in self.pdo_numbers(direction) or not self.has(index):
+        if _COMMUNICATION[direction] + number - 1 not in self.od or not self.has(index):
             return f"has no {direction.upper()}{number}"
         if self._variable(index, 0).access_type == "rw":
             capacity = self._highest(index)
@@ -99,11 +92,6 @@ class Abilities:
         """The mapping that the EDS gives as default."""
         index = _MAPPING[direction] + number - 1
         return tuple(self._default(index, sub) or 0 for sub in range(1, (self._default(index, 0) or 0) + 1))
-
-    def active_by_default(self, direction: Direction, number: int) -> bool:
-        """Whether the PDO is valid when the device boots."""
-        cob_id = self._default(_COMMUNICATION[direction] + number - 1, 1)
-        return cob_id is None or not cob_id & _INVALID_BIT
 
     def _default(self, index: int, subindex: int) -> int | None:
         variable = self._variable(index, subindex)
@@ -147,8 +135,6 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
     },
     "tactile": {0x2000: "tactile mode"},
 }
-MOST_BITRATE = 1_000_000
-"""Of classical CAN, bit/s: the most that an EDS file can list."""
 
 
 def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
@@ -163,9 +149,8 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
 
 
 def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
-    """That the device does not have the bus's bit rate, where its EDS tells which it has."""
-    beyond = setup.bus.bitrate > MOST_BITRATE  # no scene file may say so: a study's bus that no CAN is
-    if not device.bitrates or setup.bus.bitrate in device.bitrates or beyond:
+    """That the device does not have the bus's bit rate, where its EDS lists them."""
+    if not device.bitrates or setup.bus.bitrate in device.bitrates:
         return []
     section = "arm" if kind == "drive" else "sensor"
     has = ", ".join(map(str, device.bitrates))
@@ -184,19 +169,17 @@ _POOL = range(0x181, 0x580)
 def order_by_deadline(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
     """The same PDOs with identifiers in the order of their deadlines.
 
-    At one deadline feedback goes before commands, then as before. An RPDO that several drives read
+    At equal deadlines feedback has priority over commands; otherwise the order stays. An RPDO that several drives read
     keeps one identifier.
     """
     free = (cob_id for cob_id in _POOL if not is_restricted(cob_id))
     first = {pdo.cob_id: pdo for pdo in reversed(pdos)}
     ordered = sorted(first.values(), key=lambda pdo: (pdo.deadline_ns, pdo.direction == "rpdo", pdo.cob_id))
     chosen = {pdo.cob_id: cob_id for pdo, cob_id in zip(ordered, free, strict=False)}
-    return [_with_id(pdo, chosen[pdo.cob_id]) for pdo in pdos]
-
-
-def _with_id(pdo: PlannedPdo, cob_id: int) -> PlannedPdo:
-    layout = pdo.layout
-    return replace(pdo, layout=PdoLayout(cob_id, layout.entries, layout.transmission_type, fd=layout.fd))
+    return [
+        replace(pdo, layout=PdoLayout(chosen[pdo.cob_id], pdo.entries, pdo.transmission_type, fd=pdo.layout.fd))
+        for pdo in pdos
+    ]
 
 
 def identifier_problems(pdos: Iterable[PlannedPdo]) -> list[str]:
@@ -228,8 +211,8 @@ DUMMY_INTEGER32 = 0x0004
 DRIVE_TPDO1, DRIVE_RPDO1, DRIVE_RPDO2 = 0x180, 0x200, 0x300
 TACTILE_TPDO1 = 0x511  # 180h + 16 would beat every RPDO; below them all it waits for none of the drives' frames
 TACTILE_DEADLINE_CYCLES = 2
-CONTROLWORD_RESENT_MS = 100
-CONTROLWORD_LOST_MS = 250
+RESENT_MS, LOST_MS = 100, 250
+"""How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
 EVERY_SYNC = 1
 ON_EVENT = 255
 
@@ -241,28 +224,24 @@ FD_WORDS = (8, 6, 4, 3, 2, 1)
 
 @dataclass(slots=True)
 class PdoPlanning:
-    """PDOs found so far, with what was wrong and what a device could not give."""
+    """PDOs found so far, with what was wrong and what a device could not give.
 
+    Attributes:
+        setup: of the scene.
+        sync: the cycle.
+        devices: what each node can.
+    """
+
+    setup: Setup
+    sync: SyncPlan
+    devices: Mapping[int, Abilities]
     pdos: list[PlannedPdo] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     not_available: list[tuple[str, str]] = field(default_factory=list)
 
-    def add(self, device: Abilities, pdo: PlannedPdo) -> None:
-        """Take a PDO if the device can have it."""
-        problem = device.mapping_problem(pdo.direction, pdo.number, pdo.layout.mapping_words())
-        if problem is not None:
-            wanted = ", ".join(f"{entry.index:04X}h:{entry.subindex:02X}" for entry in pdo.entries)
-            self.problems.append(
-                f"node {pdo.node_id}: {device.eds} {problem}; needed: {wanted}; use a device or an EDS that can map it"
-            )
-        else:
-            self.pdos.append(pdo)
-
-    def entries(
-        self, device: Abilities, node_id: int, direction: Direction, objects: Iterable[tuple[int, int]]
-    ) -> list[PdoEntry]:
+    def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
         """The objects as entries; what the device cannot map becomes a problem."""
-        found = []
+        device, found = self.devices[node_id], []
         for index, subindex in objects:
             entry = device.entry(index, subindex, direction)
             if entry is None:
@@ -272,33 +251,72 @@ class PdoPlanning:
                 found.append(entry)
         return found
 
+    def add(
+        self,
+        node_id: int,
+        direction: Direction,
+        number: int,
+        layout: PdoLayout,
+        *,
+        kind: NodeKind = "drive",
+        cycles: int = 1,
+    ) -> None:
+        """Take a PDO if the device can have it; one that SYNC triggers has `cycles` cycles to get through."""
+        device = self.devices[node_id]
+        problem = device.mapping_problem(direction, number, layout.mapping_words())
+        if problem is not None:
+            wanted = ", ".join(f"{entry.index:04X}h:{entry.subindex:02X}" for entry in layout.entries)
+            self.problems.append(
+                f"node {node_id}: {device.eds} {problem}; needed: {wanted}; use a device or an EDS that can map it"
+            )
+            return
+        on_event = layout.transmission_type == ON_EVENT
+        self.pdos.append(
+            PlannedPdo(
+                node_id=node_id,
+                direction=direction,
+                number=number,
+                layout=layout,
+                rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
+                bits_worst=frame_bits(layout.length, self.setup.bus),
+                deadline_ns=RESENT_MS * 1_000_000 if on_event else cycles * self.sync.period_ns,
+                event_timer_ms=LOST_MS if on_event else 0,
+                kind=kind,
+            )
+        )
 
-def plan_drive_pdos(planning: PdoPlanning, setup: Setup, sync: SyncPlan, devices: Mapping[int, Abilities]) -> None:
-    """Feedback and targets of six drives: one PDO each way, or two targets sharing one RPDO."""
-    arm = setup.arm
+
+def plan_drive_pdos(planning: PdoPlanning) -> None:
+    """Feedback and targets of the drives: one PDO each way, or two targets sharing one RPDO."""
+    arm, devices = planning.setup.arm, planning.devices
     if arm is None:
         return
     for node_id in arm.node_ids:
-        _plan_feedback(planning, node_id, sync, devices[node_id])
-    grouped = arm.grouped and all(devices[node_id].dummy(DUMMY_INTEGER32, 32) for node_id in arm.node_ids)
-    if arm.grouped and not grouped:
-        eds = arm.drives[0].eds
-        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps a target RPDO of its own"
+        _plan_feedback(planning, node_id)
+    without = [devices[node_id].eds for node_id in arm.node_ids if devices[node_id].dummy(DUMMY_INTEGER32, 32) is None]
+    for eds in without if arm.grouped else ():
+        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps its own target RPDO"
         planning.not_available.append(("two targets in one RPDO", why))
     for axis, node_id in enumerate(arm.node_ids):
-        if grouped:
-            _plan_controlword(planning, node_id, devices[node_id])
-            first = arm.node_ids[axis - axis % 2]
-            _plan_shared_target(planning, node_id, first, sync, devices[node_id])
-        else:
-            objects = (CONTROLWORD, TARGET_POSITION)
-            entries = planning.entries(devices[node_id], node_id, "rpdo", objects)
-            layout = PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), EVERY_SYNC)
-            planning.add(devices[node_id], _synchronous(node_id, "rpdo", 1, layout, sync))
+        if not arm.grouped or without:
+            entries = planning.entries(node_id, "rpdo", CONTROLWORD, TARGET_POSITION)
+            planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), EVERY_SYNC))
+            continue
+        # the controlword alone on change and again every 100 ms; the target in this drive's half of its pair's RPDO, a
+        # dummy in the half of the other, whose first drive owns the identifier
+        entries = planning.entries(node_id, "rpdo", CONTROLWORD)
+        planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), ON_EVENT))
+        first = arm.node_ids[axis - axis % 2]
+        entries, dummy = planning.entries(node_id, "rpdo", TARGET_POSITION), devices[node_id].dummy(DUMMY_INTEGER32, 32)
+        if entries and dummy is not None:
+            halves = (*entries, dummy) if node_id == first else (dummy, *entries)
+            planning.add(node_id, "rpdo", 2, PdoLayout(DRIVE_RPDO2 + first, halves, EVERY_SYNC))
 
 
-def _plan_feedback(planning: PdoPlanning, node_id: int, sync: SyncPlan, device: Abilities) -> None:
-    entries = planning.entries(device, node_id, "tpdo", (STATUSWORD, POSITION))
+def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
+    """Statusword and position, and the torque where the device can send it too."""
+    device = planning.devices[node_id]
+    entries = planning.entries(node_id, "tpdo", STATUSWORD, POSITION)
     torque = device.entry(*TORQUE, "tpdo")
     problem: str | None = f"6077h is {'not mappable to a TPDO' if device.has(*TORQUE) else 'missing'}"
     if torque is not None:
@@ -307,106 +325,41 @@ def _plan_feedback(planning: PdoPlanning, node_id: int, sync: SyncPlan, device: 
         planning.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
     elif torque is not None:
         entries.append(torque)
-    layout = PdoLayout(DRIVE_TPDO1 + node_id, tuple(entries), EVERY_SYNC)
-    planning.add(device, _synchronous(node_id, "tpdo", 1, layout, sync))
+    planning.add(node_id, "tpdo", 1, PdoLayout(DRIVE_TPDO1 + node_id, tuple(entries), EVERY_SYNC))
 
 
-def _plan_controlword(planning: PdoPlanning, node_id: int, device: Abilities) -> None:
-    """The controlword alone, on change and again every 100 ms."""
-    entries = planning.entries(device, node_id, "rpdo", (CONTROLWORD,))
-    layout = PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), ON_EVENT)
-    planning.add(
-        device,
-        PlannedPdo(
-            node_id=node_id,
-            direction="rpdo",
-            number=1,
-            layout=layout,
-            rate_hz=1000 / CONTROLWORD_RESENT_MS,
-            bits_worst=worst_case_bits(layout.length),
-            deadline_ns=CONTROLWORD_RESENT_MS * 1_000_000,
-            event_timer_ms=CONTROLWORD_LOST_MS,
-        ),
-    )
-
-
-def _plan_shared_target(planning: PdoPlanning, node_id: int, first: int, sync: SyncPlan, device: Abilities) -> None:
-    """The target in this drive's half of its pair's RPDO, a dummy in the half of the other; `first` owns the id."""
-    entries = planning.entries(device, node_id, "rpdo", (TARGET_POSITION,))
-    dummy = device.dummy(DUMMY_INTEGER32, 32)
-    if entries and dummy is not None:
-        halves = (*entries, dummy) if node_id == first else (dummy, *entries)
-        layout = PdoLayout(DRIVE_RPDO2 + first, halves, EVERY_SYNC)
-        planning.add(device, _synchronous(node_id, "rpdo", 2, layout, sync))
-
-
-def plan_tactile_pdos(planning: PdoPlanning, setup: Setup, sync: SyncPlan, ratio: int, device: Abilities) -> None:
+def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
     """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
-    sensor = setup.array
-    if sensor is None:
+    array, fd = planning.setup.array, planning.setup.bus.fd
+    if array is None:
         return
-    cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
-    long = setup.bus.fd and device.has_long_pdos
-    if setup.bus.fd and not long:
+    device = planning.devices[array.node_id]
+    long = fd and has_long_pdos(device.od)
+    if fd and not long:
         why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
         planning.not_available.append(("CAN FD frames from the sensor", why))
-    _plan_window(planning, sensor, device)
-    for number, found in enumerate(_parcels(tactile_objects(sensor), long), start=1):
-        entries = planning.entries(device, sensor.node_id, "tpdo", found)
-        if entries:
-            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
-            bits = frame_bits(layout.length, setup.bus)
-            pdo = _synchronous(sensor.node_id, "tpdo", number, layout, sync, cycles=cycles, bits=bits)
-            planning.add(device, replace(pdo, kind="tactile"))
-
-
-def tactile_objects(sensor: Array) -> tuple[tuple[int, int], ...]:
-    """The objects of a tactile frame, its header first."""
-    if sensor.mode == "features":
-        return (FEATURES, 1), (FEATURES, 2)
-    if sensor.mode == "image":
-        return HEADER, *((IMAGE_TAXELS, half) for half in range(1, IMAGE_WORDS + 1))
-    return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(sensor.window)) + 1))
-
-
-def _plan_window(planning: PdoPlanning, sensor: Array, device: Abilities) -> None:
-    """A sensor whose window cannot be set has one of 8×8 taxels."""
-    if sensor.mode != "window" or has_window_size(device.od):
-        return
-    why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
-    planning.not_available.append(("another window", why))
-    if sensor.window != WINDOW:
-        planning.problems.append(f"node {sensor.node_id}: {why}: sensor.window = {WINDOW}, not {sensor.window}")
-
-
-def _parcels(objects: Sequence[tuple[int, int]], long: bool) -> list[Sequence[tuple[int, int]]]:
-    """Which objects go together into a PDO: the header alone, then one each, or as many as 64 bytes hold."""
-    header, *rest = objects
-    parcels: list[Sequence[tuple[int, int]]] = [(header,)]
+    if array.mode == "window" and not has_window_size(device.od):
+        why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
+        planning.not_available.append(("another window", why))
+        if array.window != WINDOW:
+            planning.problems.append(f"node {array.node_id}: {why}: sensor.window = {WINDOW}, not {array.window}")
+    header, *rest = tactile_objects(array)
+    parcels = [[header]]  # the header alone, then an object each, or as many as 64 bytes hold
     while rest:
         size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
         parcels.append(rest[:size])
         rest = rest[size:]
-    return parcels
+    for number, objects in enumerate(parcels, start=1):
+        if entries := planning.entries(array.node_id, "tpdo", *objects):
+            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
+            cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
+            planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
 
 
-def _synchronous(
-    node_id: int,
-    direction: Direction,
-    number: int,
-    layout: PdoLayout,
-    sync: SyncPlan,
-    *,
-    cycles: int = 1,
-    bits: int | None = None,
-) -> PlannedPdo:
-    """A PDO on every n-th SYNC, n its transmission type, that has `cycles` cycles to get through."""
-    return PlannedPdo(
-        node_id=node_id,
-        direction=direction,
-        number=number,
-        layout=layout,
-        rate_hz=sync.rate_hz / layout.transmission_type,
-        bits_worst=worst_case_bits(layout.length) if bits is None else bits,
-        deadline_ns=cycles * sync.period_ns,
-    )
+def tactile_objects(array: Array) -> tuple[tuple[int, int], ...]:
+    """The objects of a tactile frame, its header first."""
+    if array.mode == "features":
+        return (FEATURES, 1), (FEATURES, 2)
+    if array.mode == "image":
+        return HEADER, *((IMAGE_TAXELS, half) for half in range(1, IMAGE_WORDS + 1))
+    return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(array.window)) + 1))

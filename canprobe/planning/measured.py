@@ -6,16 +6,23 @@ Counted from the first SYNC to the last one, while the cell runs: bring-up and t
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, SYNC_OVERFLOW, Plan, PlannedBus, PlannedPdo
-from canprobe.planning.traffic import SYNCHRONOUS, exact_frame_bits, on_the_wire, unstuffed_frame_bits
-from canprobe.protocol.frame_bits import FD_LENGTHS, best_case_bits, worst_case_bits
+from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan, PlannedBus, PlannedPdo
+from canprobe.planning.traffic import (
+    SYNC_BITS,
+    SYNC_BITS_LEAST,
+    SYNCHRONOUS,
+    exact_frame_bits,
+    on_the_wire,
+    unstuffed_frame_bits,
+)
+from canprobe.protocol.frame_bits import FD_LENGTHS, worst_case_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 
 Kind = Literal["SYNC", "drive TPDO", "drive RPDO", "tactile PDO", "event PDO", "heartbeat", "NMT", "EMCY", "SDO"]
@@ -35,7 +42,7 @@ class ClassTraffic:
         bits: counted, exact where the meter measured them, else without stuff bits.
         planned_bits: in the same time at most; None for services.
         late: frames that came later behind their SYNC than the plan's worst case.
-        slowest: the largest share of its worst case behind SYNC that a frame took; None where there is none.
+        slowest: the largest share of its worst case behind SYNC that a frame took; None where no time was measured.
     """
 
     kind: Kind
@@ -59,6 +66,19 @@ class ClassTraffic:
         if self.kind == "event PDO":
             return self.frames >= self.planned_frames - allowed
         return abs(self.frames - self.planned_frames) <= allowed and self.bits <= self.planned_bits
+
+    def add(self, expected: Expected, count: _Count, seconds: float) -> None:
+        """Take one message, counted for so long."""
+        self.messages += 1
+        self.frames += count.frames
+        self.bits += count.bits
+        self.late += count.late
+        if expected.rate_hz is not None and expected.bits_worst is not None:
+            planned = expected.rate_hz * seconds
+            self.planned_frames = (self.planned_frames or 0.0) + planned
+            self.planned_bits = (self.planned_bits or 0.0) + planned * expected.bits_worst
+        if expected.latest_ns and count.slowest_ns:
+            self.slowest = max(self.slowest or 0.0, count.slowest_ns / expected.latest_ns)
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +108,11 @@ class MeasuredTraffic:
     @property
     def load(self) -> float:
         """Share of the bit rate that was used."""
-        bits = sum(one.bits for one in self.classes)
-        return bits / (self.bitrate * self.duration_s) if self.duration_s > 0 else 0.0
+        return self.share(sum(one.bits for one in self.classes)) or 0.0
+
+    def share(self, bits: float | None) -> float | None:
+        """Share of the bit rate that so many bits are; None where nothing was measured."""
+        return None if bits is None or self.duration_s <= 0 else bits / (self.bitrate * self.duration_s)
 
     @property
     def as_planned(self) -> bool:
@@ -110,8 +133,8 @@ class MeasuredTraffic:
                     "messages": one.messages,
                     "frames": one.frames,
                     "planned_frames": one.planned_frames,
-                    "load": one.bits / (self.bitrate * self.duration_s) if self.duration_s > 0 else None,
-                    "planned_worst": _load(one.planned_bits, self.bitrate, self.duration_s),
+                    "load": self.share(one.bits),
+                    "planned_worst": self.share(one.planned_bits),
                     "late": one.late,
                     "slowest_share": one.slowest,
                     "as_planned": one.as_planned,
@@ -132,16 +155,15 @@ class MeasuredTraffic:
         yield f"  load {100 * self.load:.1f} %, planned at most {100 * self.planned_worst:.1f} %"
         yield f"  {'':<12} {'frames':>8} {'planned':>9} {'load %':>7} {'at most':>8}  latest of its worst case"
         for one in self.classes:
-            load = _load(one.bits, self.bitrate, self.duration_s)
-            worst = _load(one.planned_bits, self.bitrate, self.duration_s)
+            load, worst = (
+                "" if share is None else f"{100 * share:.1f}"
+                for share in (self.share(one.bits), self.share(one.planned_bits))
+            )
             least = "≥ " if one.kind == "event PDO" else ""
             planned = "" if one.planned_frames is None else f"{least}{one.planned_frames:.0f}"
             slowest = "" if one.slowest is None else f"{100 * one.slowest:.0f} %"
             note = "" if one.as_planned else "  not as planned"
-            yield (
-                f"  {one.kind:<12} {one.frames:>8} {planned:>9} {_percent(load):>7} {_percent(worst):>8}"
-                f"  {slowest}{note}"
-            ).rstrip()
+            yield (f"  {one.kind:<12} {one.frames:>8} {planned:>9} {load:>7} {worst:>8}  {slowest}{note}").rstrip()
         for cob_id, frames in sorted(self.unlisted.items()):
             yield f"  not in the plan: {cob_id:03X}h, {frames} frames"
         for cob_id in self.missing:
@@ -150,86 +172,12 @@ class MeasuredTraffic:
             yield f"  error frames: {self.error_frames}"
 
 
-def _load(bits: float | None, bitrate: int, duration_s: float) -> float | None:
-    return None if bits is None or duration_s <= 0 else bits / (bitrate * duration_s)
-
-
-def _percent(share: float | None) -> str:
-    return "" if share is None else f"{100 * share:.1f}"
-
-
-# How far behind their SYNC the frames of a bus come: those of a whole stretch of traffic at once.
+# Counts what is on a bus, thousands of frames at a time, which is quicker than cycle by cycle.
 
 Ints = NDArray[np.int64]
-NEVER = np.iinfo(np.int64).max
-"""Time of a SYNC that nobody saw."""
-HEADER_BYTES = 8
-
-
-@dataclass(frozen=True, slots=True)
-class Delay:
-    """Frames of one identifier.
-
-    Attributes:
-        cob_id: the identifier.
-        late: how many were later than the plan's worst case.
-        slowest_ns: the longest from the end of the SYNC's frame to the end of theirs.
-    """
-
-    cob_id: int
-    late: int
-    slowest_ns: int
-
-
-@dataclass(slots=True)
-class Lateness:
-    """Measures stretch after stretch, each from one SYNC to before another.
-
-    Attributes:
-        latest_ns: worst case of each identifier that is to be measured.
-        tactile_ids: those of them whose SYNC is the one that the header names.
-        header_id: the first of the tactile PDOs; None without.
-    """
-
-    latest_ns: Mapping[int, int]
-    tactile_ids: frozenset[int]
-    header_id: int | None
-    _by_counter: dict[int, int] = field(init=False, default_factory=dict)
-    _tactile_ns: int = field(init=False, default=NEVER)
-
-    def take(self, ids: Sequence[int], data: Sequence[bytes], times_ns: Sequence[int]) -> Iterator[Delay]:
-        """The delays in a stretch that begins with a SYNC."""
-        numbers, times = np.array(ids, np.int64), np.array(times_ns, np.int64)
-        syncs = np.flatnonzero(numbers == SYNC_ID)
-        triggers = times[syncs][np.cumsum(numbers == SYNC_ID) - 1]
-        of_tactile = self._tactile_triggers(numbers, data, times)
-        for cob_id, latest in self.latest_ns.items():
-            at = np.flatnonzero(numbers == cob_id)
-            trigger = (of_tactile if cob_id in self.tactile_ids else triggers)[at]
-            known = trigger != NEVER
-            took = (times[at] - trigger)[known]
-            if took.size:
-                yield Delay(cob_id, int(np.count_nonzero(took > latest)), int(took.max()))
-
-    def _tactile_triggers(self, numbers: Ints, data: Sequence[bytes], times: Ints) -> Ints:
-        """For each frame, when the SYNC was through that the last tactile header named."""
-        places, named = [0], [self._tactile_ns]
-        measured = self.header_id in self.latest_ns
-        for at in np.flatnonzero((numbers == SYNC_ID) | (numbers == (self.header_id or SYNC_ID))).tolist():
-            head = data[at]
-            if numbers[at] == SYNC_ID:
-                self._by_counter[head[0] if head else 0] = int(times[at])
-            elif measured:
-                places.append(at)
-                named.append(self._by_counter.get(head[1], NEVER) if len(head) == HEADER_BYTES else NEVER)
-        self._tactile_ns = named[-1]
-        return np.array(named, np.int64)[np.searchsorted(places, np.arange(len(numbers)), "right") - 1]
-
-
-# Counts what is on a bus, frame by frame, for `canprobe.planning.measured`.
-
+_NEVER = np.iinfo(np.int64).max
+_HEADER_BYTES = 8
 _AT_ONCE = 4096
-"""Frames that are counted together, which is quicker than cycle by cycle."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +189,7 @@ class Expected:
         kind: its class.
         rate_hz: planned; None for a service that has no rate.
         bits_worst: of one frame; None where its length is open.
-        latest_ns: worst case from the end of the SYNC's frame to the end of its own; None where it keeps its own time.
+        latest_ns: worst case from the end of the SYNC's frame to the end of this one; None where SYNC triggers none.
     """
 
     cob_id: int
@@ -252,10 +200,9 @@ class Expected:
 
 
 def expected_messages(plan: Plan, bus: PlannedBus) -> dict[int, Expected]:
-    """Every message that the plan lists for one of its buses, by identifier."""
-    sync_bytes = 1 if SYNC_OVERFLOW else 0
-    shortest_ns = best_case_bits(sync_bytes) * 1_000_000_000 // plan.setup.bus.bitrate
-    found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, worst_case_bits(sync_bytes)), Expected(NMT_ID, "NMT")]
+    """Every message that may be on one of the plan's buses, by identifier; anything else is foreign."""
+    shortest_ns = SYNC_BITS_LEAST * 1_000_000_000 // plan.setup.bus.bitrate
+    found = [Expected(SYNC_ID, "SYNC", plan.sync.rate_hz, SYNC_BITS), Expected(NMT_ID, "NMT")]
     for pdo in on_the_wire([pdo for pdo in plan.pdos if pdo.node_id in bus.node_ids]):
         triggered = pdo.transmission_type <= SYNCHRONOUS
         latest = pdo.response_ns - shortest_ns if triggered and pdo.response_ns is not None else None
@@ -279,46 +226,48 @@ def _kind(pdo: PlannedPdo) -> Kind:
 
 @dataclass(slots=True)
 class _Count:
+    """Of one identifier: frames, their bits, those later than planned, and the longest time behind SYNC."""
+
     frames: int = 0
     bits: int = 0
     late: int = 0
     slowest_ns: int = 0
 
 
-@dataclass(slots=True)
+_Frame = tuple[int, bytes, int]
+
+
 class TrafficMeter:
     """Counts frames in the order of the bus; `report` sets them beside the plan.
 
     Attributes:
-        plan: what to expect.
-        channel: of the bus, as the plan names it; None: its first one.
-        exact: count stuff bits too, which costs a few µs a frame.
         error_frames: to be counted by the reader.
     """
 
-    plan: Plan
-    channel: str | None = None
-    exact: bool = True
-    error_frames: int = 0
-    _bus: PlannedBus = field(init=False)
-    _expected: dict[int, Expected] = field(init=False)
-    _counts: dict[int, _Count] = field(init=False, default_factory=dict)
-    _before: dict[int, _Count] = field(init=False, default_factory=dict)
-    _taken: list[tuple[int, bytes, int]] = field(init=False, default_factory=list)
-    _enough: int = field(init=False, default=_AT_ONCE)
-    _first_ns: int | None = field(init=False, default=None)
-    _sync_ns: int = field(init=False, default=0)
-    _lateness: Lateness = field(init=False)
-    _unstuffed: dict[int, int] = field(init=False)
+    def __init__(self, plan: Plan, channel: str | None = None, exact: bool = True) -> None:
+        """Count nothing yet.
 
-    def __post_init__(self) -> None:
-        buses = self.plan.buses
-        self._bus = next((bus for bus in buses if bus.channel == self.channel), buses[0])
-        self._expected = expected_messages(self.plan, self._bus)
-        self._unstuffed = {n: unstuffed_frame_bits(n, self.plan.setup.bus) for n in FD_LENGTHS}
-        tactile = frozenset(e.cob_id for e in self._expected.values() if e.kind == "tactile PDO")
-        latest = {e.cob_id: e.latest_ns for e in self._expected.values() if e.latest_ns is not None}
-        self._lateness = Lateness(latest, tactile, min(tactile, default=None))
+        Args:
+            plan: what to expect.
+            channel: of the bus, as the plan names it; None: its first one.
+            exact: count stuff bits too, which costs a few µs a frame.
+        """
+        self.error_frames = 0
+        self._plan, self._exact = plan, exact
+        self._bus = next((bus for bus in plan.buses if bus.channel == channel), plan.buses[0])
+        self._expected = expected_messages(plan, self._bus)
+        self._unstuffed = {n: unstuffed_frame_bits(n, plan.setup.bus) for n in FD_LENGTHS}
+        self._counts: dict[int, _Count] = {}
+        self._before: dict[int, _Count] = {}
+        self._taken: list[_Frame] = []
+        self._enough = _AT_ONCE
+        self._first_ns: int | None = None
+        self._sync_ns = 0
+        # when the SYNC with each counter was through, and the one that the last tactile header named
+        self._tactile_ids = {one.cob_id for one in self._expected.values() if one.kind == "tactile PDO"}
+        self._header_id = min(self._tactile_ids, default=SYNC_ID)
+        self._by_counter: dict[int, int] = {}
+        self._named_ns = _NEVER
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
         """Take one frame; it is counted after the next SYNC, with many others."""
@@ -340,29 +289,47 @@ class TrafficMeter:
             self._tally(taken[:begin], self._before)
             self._first_ns = taken[begin][2]
         self._sync_ns = taken[end][2]
-        self._count_cycles(taken[begin:end])
+        self._tally(taken[begin:end], self._counts)
+        self._compare_times(taken[begin:end])
         self._taken = taken[end:]
 
-    def _count_cycles(self, frames: Sequence[tuple[int, bytes, int]]) -> None:
-        """Count frames from one SYNC to before another, and how far behind theirs they were."""
-        if not frames:
-            return
-        self._tally(frames, self._counts)
-        for delay in self._lateness.take(*zip(*frames, strict=True)):
-            count = self._counts[delay.cob_id]
-            count.late += delay.late
-            count.slowest_ns = max(count.slowest_ns, delay.slowest_ns)
-
-    def _tally(self, frames: Sequence[tuple[int, bytes, int]], counts: dict[int, _Count]) -> None:
+    def _tally(self, frames: Sequence[_Frame], counts: dict[int, _Count]) -> None:
         """Add frames and their bits."""
         for (can_id, n_data), frames_of in Counter([(can_id, len(data)) for can_id, data, _ in frames]).items():
             count = counts.setdefault(can_id, _Count())
             count.frames += frames_of
-            count.bits += 0 if self.exact else frames_of * self._unstuffed[n_data]
-        if self.exact:
-            bus = self.plan.setup.bus
+            count.bits += 0 if self._exact else frames_of * self._unstuffed[n_data]
+        if self._exact:
             for can_id, data, _ in frames:
-                counts[can_id].bits += exact_frame_bits(can_id, data, bus)
+                counts[can_id].bits += exact_frame_bits(can_id, data, self._plan.setup.bus)
+
+    def _compare_times(self, frames: Sequence[_Frame]) -> None:
+        """How far behind their SYNC frames came, from one SYNC to before another."""
+        ids, times = (np.array([frame[at] for frame in frames], np.int64) for at in (0, 2))
+        syncs = ids == SYNC_ID
+        triggers = times[syncs][np.cumsum(syncs) - 1] if len(frames) else times
+        of_tactile = self._tactile_triggers(ids, frames)
+        for cob_id, count in self._counts.items():
+            latest_ns = self._expected[cob_id].latest_ns if cob_id in self._expected else None
+            at = np.flatnonzero(ids == cob_id) if latest_ns is not None else ()
+            if latest_ns is not None and len(at):
+                trigger = (of_tactile if cob_id in self._tactile_ids else triggers)[at]
+                took = (times[at] - trigger)[trigger != _NEVER]
+                count.late += int(np.count_nonzero(took > latest_ns))
+                count.slowest_ns = max(count.slowest_ns, int(took.max(initial=0)))
+
+    def _tactile_triggers(self, ids: Ints, frames: Sequence[_Frame]) -> Ints:
+        """For each frame, when the SYNC was through that the last tactile header named."""
+        places, named = [0], [self._named_ns]
+        for at in np.flatnonzero((ids == SYNC_ID) | (ids == self._header_id)).tolist():
+            can_id, data, t_ns = frames[at]
+            if can_id == SYNC_ID:
+                self._by_counter[data[0] if data else 0] = t_ns
+            else:
+                places.append(at)
+                named.append(self._by_counter.get(data[1], _NEVER) if len(data) == _HEADER_BYTES else _NEVER)
+        self._named_ns = named[-1]
+        return np.array(named, np.int64)[np.searchsorted(places, np.arange(len(ids)), "right") - 1]
 
     @property
     def frames(self) -> int:
@@ -383,37 +350,22 @@ class TrafficMeter:
     def report(self) -> MeasuredTraffic:
         """What was counted so far, beside the plan."""
         self._count()
-        counts = self._counts if self._first_ns is not None else {}
-        ns = 0 if self._first_ns is None else self._sync_ns - self._first_ns
+        seconds = 0.0 if self._first_ns is None else (self._sync_ns - self._first_ns) * 1e-9
         seen = Counter(can_id for can_id, _, _ in self._taken)
         for part in (self._before, self._counts):
             seen.update({can_id: one.frames for can_id, one in part.items()})
+        classes: dict[Kind, ClassTraffic] = {}
+        for expected in self._expected.values():
+            one = classes.setdefault(expected.kind, ClassTraffic(expected.kind))
+            one.add(expected, self._counts.get(expected.cob_id, _Count()), seconds)
+        pdos = [one.cob_id for one in self._expected.values() if one.kind.endswith("PDO")]
         return MeasuredTraffic(
-            duration_s=ns * 1e-9,
-            bitrate=self.plan.setup.bus.bitrate,
-            exact=self.exact,
-            classes=tuple(self._classes(counts, ns * 1e-9)),
+            duration_s=seconds,
+            bitrate=self._plan.setup.bus.bitrate,
+            exact=self._exact,
+            classes=tuple(classes.values()),
             unlisted={can_id: n for can_id, n in seen.items() if can_id not in self._expected},
-            missing=tuple(
-                one.cob_id for one in self._expected.values() if one.kind.endswith("PDO") and one.cob_id not in seen
-            ),
+            missing=tuple(cob_id for cob_id in pdos if cob_id not in seen),
             error_frames=self.error_frames,
             planned_worst=self._bus.traffic.load,
         )
-
-    def _classes(self, counts: dict[int, _Count], seconds: float) -> Iterator[ClassTraffic]:
-        found: dict[Kind, ClassTraffic] = {}
-        for expected in self._expected.values():
-            one = found.setdefault(expected.kind, ClassTraffic(expected.kind))
-            count = counts.get(expected.cob_id, _Count())
-            one.messages += 1
-            one.frames += count.frames
-            one.bits += count.bits
-            one.late += count.late
-            if expected.rate_hz is not None and expected.bits_worst is not None:
-                planned = expected.rate_hz * seconds
-                one.planned_frames = (one.planned_frames or 0.0) + planned
-                one.planned_bits = (one.planned_bits or 0.0) + planned * expected.bits_worst
-            if expected.latest_ns and count.slowest_ns:
-                one.slowest = max(one.slowest or 0.0, count.slowest_ns / expected.latest_ns)
-        yield from found.values()

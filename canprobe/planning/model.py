@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NMT_ID, SDO_RX_BASE, SDO_TX_BASE, SYNC_ID
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import with_choices
@@ -235,7 +234,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion that the task asks for, (6,) each, deg/s."""
+    """Fastest joint motion of the task, and what is allowed, one value a joint, deg/s."""
 
     needed_deg_s: tuple[float, ...]
     limit_deg_s: tuple[float, ...]
@@ -258,10 +257,6 @@ class Plan:
         buses: that of the arm first, then one of the sensor's own where it has one.
         choices: what the scene left open; `setup` has the values.
         joint_speeds: None without an arm.
-        estimator: in the loop; None where no shape is estimated.
-        offline_estimators: on the same data after the run.
-        strategy: of the exploration; None without one.
-        fidelity: of the emulated plant; None where nothing is emulated.
         outputs: files that a run writes.
         left_out: what this scene does not bring up, and why.
         not_available: what the EDS files could not give.
@@ -275,10 +270,6 @@ class Plan:
     buses: tuple[PlannedBus, ...]
     choices: tuple[Choice, ...]
     joint_speeds: JointSpeeds | None
-    estimator: str | None
-    offline_estimators: tuple[str, ...]
-    strategy: str | None
-    fidelity: str | None
     outputs: tuple[str, ...]
     left_out: tuple[tuple[str, str], ...]
     not_available: tuple[tuple[str, str], ...]
@@ -308,13 +299,3 @@ class Plan:
         """PDOs of one node in one direction, by number."""
         found = [pdo for pdo in self.pdos if pdo.node_id == node_id and pdo.direction == direction]
         return tuple(sorted(found, key=lambda pdo: pdo.number))
-
-    @property
-    def frame_ids(self) -> frozenset[int]:
-        """Every identifier that may be on the bus; anything else is foreign."""
-        services = (EMCY_BASE, SDO_RX_BASE, SDO_TX_BASE, HEARTBEAT_BASE)
-        return frozenset(
-            {NMT_ID, SYNC_ID, HEARTBEAT_BASE + MASTER_NODE_ID}
-            | {base + node for base in services for node in self.node_ids}
-            | {pdo.cob_id for pdo in self.pdos}
-        )

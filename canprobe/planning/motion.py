@@ -10,21 +10,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.planning.choices import PITCH_M
 from canprobe.planning.model import JointSpeeds
+from canprobe.planning.window import PITCH_M
 from canprobe.protocol.tactile import SIDE
 from canprobe.robot.inverse import inverse_near, probe_pose
 from canprobe.robot.kinematics import forward
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.touch.shapes import PlacedShape
 
-# The path that a scan will take over the object as the scene describes it: points, normals, curvature.
-
 Array = NDArray[np.float64]
 
 SAMPLES = 240
 """Points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
+_BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
+_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
+
+
+# The path that a task will take over the object as the scene describes it: points, normals, curvature.
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,40 +45,46 @@ class SurfacePath:
     hollow_radius: float
 
 
-def surface_path(task: Touch, shape: PlacedShape | None) -> tuple[SurfacePath | None, list[str]]:
+def surface_path(task: Touch, shape: PlacedShape | None) -> SurfacePath:
     """Points of the object under the task's path; without a described object the plane that the approach expects.
 
     Args:
         task: a scan or a press.
         shape: the object.
+
+    Raises:
+        PlanError: the approach or the path misses the object, or the probe first meets it beside the array.
     """
     approach, down = task.approach, task.approach.normal
+    plane = approach.start[None, :]  # points in the scan plane; one for a press
+    if task.scan is not None:
+        flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
+        plane = approach.start + np.array(flat) @ approach.axes[:2]
     if shape is None:
-        points = _plane_points(task)
-        return SurfacePath(points, np.tile(down, (len(points), 1)), math.inf), []
-    miss = _along(shape, approach.start, down)
-    if miss is None or not -approach.search <= miss <= approach.clearance:
-        return None, [_missed(approach, miss)]
+        return SurfacePath(plane, np.tile(down, (len(plane), 1)), math.inf)
+    _check_approach(approach, _along(shape, approach.start, down))
     contacts = []
-    for point in _plane_points(task):
+    for point in plane:
         height = _along(shape, point, down)
         if height is None:
-            return None, [_left_object(point)]
+            raise PlanError(
+                [
+                    f"task: at {_mm(point)} mm the path leaves the object or meets it steeper than "
+                    f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn "
+                    "task.heading_deg"
+                ]
+            )
         contacts.append(shape.closest(point + height * down))
     points, normals = np.array([c.point for c in contacts]), np.array([c.normal for c in contacts])
     path = SurfacePath(points, normals, shape.tightest_concave_radius(points))
-    beside = _beside(task, shape, path)
-    return (path, []) if beside is None else (None, [beside])
+    if path.hollow_radius > task.probe.radius:  # a tighter hollow is refused as that
+        _check_first_touch(task, shape)
+    return path
 
 
-def _plane_points(task: Touch) -> Array:
-    """Points of the path in the scan plane, (n, 3) m; one point for a press."""
-    if task.scan is None:
-        return task.approach.start[None, :]
-    along, across, _ = task.approach.axes
-    flat = [task.scan.strategy.point(phase) for phase in np.linspace(0, 2 * math.pi, SAMPLES, endpoint=False)]
-    points: Array = task.approach.start + np.array([x * along + y * across for x, y in flat])
-    return points
+def _mm(point: Array) -> str:
+    x, y, z = (1e3 * point).tolist()
+    return f"({x:.1f}, {y:.1f}, {z:.1f})"
 
 
 def _along(shape: PlacedShape, point: Array, up: Array) -> float | None:
@@ -92,54 +101,38 @@ def _along(shape: PlacedShape, point: Array, up: Array) -> float | None:
     return None
 
 
-def _missed(approach: Approach, miss: float | None) -> str:
+def _check_approach(approach: Approach, miss: float | None) -> None:
+    """The approach finds the object, whose surface is `miss` above its end."""
     x, y, z = (1e3 * approach.start).tolist()
     where = f"task.start_mm = ({x:g}, {y:g}, {z:g})"
     if miss is None:
-        return f"{where}: the approach does not meet the object; move start_mm over it or the object under it"
-    return (
-        f"{where}: the object lies {abs(1e3 * miss):.1f} mm {'above' if miss > 0 else 'below'} along the approach, "
-        f"searched from {1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below; move one of them"
-    )
+        raise PlanError(
+            [f"{where}: the approach does not meet the object; move start_mm over it or the object under it"]
+        )
+    if not -approach.search <= miss <= approach.clearance:
+        side = "above" if miss > 0 else "below"
+        searched = f"{1e3 * approach.clearance:g} mm above to {1e3 * approach.search:g} mm below"
+        lies = f"the object lies {abs(1e3 * miss):.1f} mm {side} along the approach"
+        raise PlanError([f"{where}: {lies}, searched from {searched}; move one of them"])
 
 
-def _beside(task: Touch, shape: PlacedShape, path: SurfacePath) -> str | None:
-    """Why the probe, before or at its first touch, meets the object where there is no array; None where all is well.
-
-    A hollow that is tighter than the probe is refused as that.
-    """
+def _check_first_touch(task: Touch, shape: PlacedShape) -> None:
+    """The probe is not in the object before its approach, and first meets it where the array is."""
     approach, radius, up = task.approach, task.probe.radius, task.approach.normal
-    if path.hollow_radius <= radius:
-        return None
     nearest = shape.closest(approach.start + (approach.clearance + radius) * up)
     tilt = math.acos(min(max(float(nearest.normal @ up), -1.0), 1.0))
     mend = f"turn task.approach_normal by {math.degrees(tilt):.0f} deg to the object's normal, or move one of them"
     if nearest.distance <= radius:
         deep = 1e3 * (radius - nearest.distance)
-        return (
-            f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {deep:.1f} mm in the object before"
-            f" its approach, {math.degrees(tilt):.0f} deg beside it; {mend}"
-        )
+        what = f"{deep:.1f} mm in the object before its approach, {math.degrees(tilt):.0f} deg beside it"
+        raise PlanError([f"task.clearance_mm = {1e3 * approach.clearance:g}: the probe would be {what}; {mend}"])
     if radius * tilt > 0.5 * SIDE * PITCH_M:
-        return (
-            f"task.approach_normal: the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the"
-            f" array, which reaches {500 * SIDE * PITCH_M:.1f} mm and would not feel it; {mend}"
-        )
-    return None
-
-
-def _left_object(point: Array) -> str:
-    x, y, z = (1e3 * point).tolist()
-    return (
-        f"task: at ({x:.1f}, {y:.1f}, {z:.1f}) mm the path leaves the object or meets it steeper than "
-        f"{math.degrees(_STEEPEST):.0f} deg; shorten task.length_mm or task.width_mm, or turn task.heading_deg"
-    )
+        beside = f"the first touch would be {1e3 * radius * tilt:.1f} mm beside the middle of the array"
+        reach = f"which reaches {500 * SIDE * PITCH_M:.1f} mm and would not measure it"
+        raise PlanError([f"task.approach_normal: {beside}, {reach}; {mend}"])
 
 
 # Can the arm do it: reach, joint stops and joint speeds along the whole path.
-
-_BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
-_TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
 
 
 def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
@@ -148,14 +141,22 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
         return None, []
     stops = _Stops(setup.arm, setup.limits)
     problems = stops.start_problems()
-    match setup.task:
-        case Free() as task:
-            return _check_swing(task, stops, problems)
-        case Calibrate() as task:
-            return _check_ball(task, stops, problems)
-        case Touch() as task:
-            return _check_touch(task, setup, stops, problems)
-    return None, problems
+    try:
+        match setup.task:
+            case Free() as task:
+                speeds, found = _check_swing(task, stops, starts=not problems)
+            case Calibrate() as task:
+                joints = _follow(task.arm, task.probe, _over_ball(task))
+                speeds, found = stops.speeds(np.zeros_like(task.arm.q_start)), stops.problems(joints)
+            case Touch() as task:
+                path = surface_path(task, setup.truth.object)
+                problems += _hollow_problems(path, task.probe)
+                speeds, found = _check_touch(task, path, stops)
+            case _:
+                return None, problems
+    except PlanError as error:
+        return None, [*problems, *error.problems]
+    return speeds, problems + found
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,17 +213,9 @@ def _too_fast(speeds: JointSpeeds, way_out: str) -> list[str]:
     ]
 
 
-def _check_touch(task: Touch, setup: Setup, stops: _Stops, problems: list[str]) -> tuple[JointSpeeds | None, list[str]]:
-    path, found = surface_path(task, setup.truth.object)
-    problems += found
-    if path is None:
-        return None, problems
-    problems += _hollow_problems(path, task.probe)
-    joints, found = _follow(task.arm, task.probe, _along_path(task, path))
-    problems += found
-    if joints is None:
-        return None, problems
-    problems += stops.problems(joints)
+def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSpeeds, list[str]]:
+    joints = _follow(task.arm, task.probe, _along_path(task, path))
+    problems = stops.problems(joints)
     if task.scan is None:
         return stops.speeds(np.zeros_like(task.arm.q_start)), problems
     steps = np.linalg.norm(np.diff(path.points, axis=0), axis=1)
@@ -230,6 +223,15 @@ def _check_touch(task: Touch, setup: Setup, stops: _Stops, problems: list[str]) 
     speeds = stops.speeds(rates.max(axis=0))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
+    return speeds, problems + _too_fast(speeds, way_out)
+
+
+def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:
+    start, swing = task.arm.q_start, np.abs(task.swing)
+    speeds = stops.speeds(swing * 2 * math.pi / task.period_s)
+    problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
+    slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
+    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (task.swing_deg)"
     return speeds, problems + _too_fast(speeds, way_out)
 
 
@@ -267,9 +269,8 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     for point, normal in zip((lifted, *path.points), (path.normals[0], *path.normals), strict=True):
         pole = (1 - share) * normal + share * first
         pole /= np.linalg.norm(pole)
-        x, y, z = (1e3 * point).tolist()
         out_of_reach = (
-            f"task: contact at ({x:.1f}, {y:.1f}, {z:.1f}) mm out of reach: {{why}}; move the object, shorten the "
+            f"task: contact at {_mm(point)} mm out of reach: {{why}}; move the object, shorten the "
             "path, or set arm.start_deg to another branch"
         )
         yield _Pose(point + radius * normal, pole, _BRANCH_RAD, out_of_reach)
@@ -287,8 +288,12 @@ def _over_ball(task: Calibrate) -> Iterator[_Pose]:
             yield _Pose(centre, -touch.pole_base, _TOUCH_TO_TOUCH_RAD, out_of_reach)
 
 
-def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose]) -> tuple[Array | None, list[str]]:
-    """Joint angles at the poses (m, n), rad, each near the one before; or the first that is out of reach."""
+def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose]) -> Array:
+    """Joint angles at the poses (m, n), rad, each near the one before.
+
+    Raises:
+        PlanError: the first pose that is out of reach.
+    """
     to_flange, q = np.linalg.inv(probe.T_flange_probe), arm.q_start
     x_hint = (forward(arm.model, q) @ probe.T_flange_probe)[:3, 0]
     found: list[Array] = []
@@ -298,24 +303,6 @@ def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose]) -> tuple[Array | Non
             most_rad = pose.most_rad if found else math.inf
             q = inverse_near(arm.model, T_base_probe @ to_flange, q, max_move_rad=most_rad)
         except (PlanError, ValueError) as error:
-            return None, [pose.out_of_reach.format(why=error)]
+            raise PlanError([pose.out_of_reach.format(why=error)]) from error
         found.append(q)
-    return np.array(found), []
-
-
-def _check_ball(task: Calibrate, stops: _Stops, problems: list[str]) -> tuple[JointSpeeds | None, list[str]]:
-    joints, found = _follow(task.arm, task.probe, _over_ball(task))
-    problems += found
-    if joints is None:
-        return None, problems
-    return stops.speeds(np.zeros_like(task.arm.q_start)), problems + stops.problems(joints)
-
-
-def _check_swing(task: Free, stops: _Stops, problems: list[str]) -> tuple[JointSpeeds, list[str]]:
-    start, swing = task.arm.q_start, np.abs(task.swing)
-    speeds = stops.speeds(swing * 2 * math.pi / task.period_s)
-    if not problems:
-        problems = stops.problems(np.array((start - swing, start + swing)))
-    slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
-    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (task.swing_deg)"
-    return speeds, problems + _too_fast(speeds, way_out)
+    return np.array(found)

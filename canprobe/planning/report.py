@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from heapq import heappop, heappush
 from typing import Any, Literal
 
@@ -13,17 +13,14 @@ from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
-    SYNC_OVERFLOW,
     CycleBudget,
-    Demand,
+    JointSpeeds,
     Plan,
     PlannedBus,
-    PlannedNode,
     PlannedPdo,
     Traffic,
 )
-from canprobe.planning.traffic import on_the_wire
-from canprobe.protocol.frame_bits import worst_case_bits
+from canprobe.planning.traffic import SYNC_BITS, SYNCHRONOUS, on_the_wire, wire_ns
 from canprobe.protocol.frames import SYNC_ID
 from canprobe.protocol.pdo import PdoEntry
 
@@ -34,7 +31,6 @@ from canprobe.protocol.pdo import PdoEntry
 # response time of each message.
 
 Part = Literal["SYNC", "feedback", "controller", "command", "tactile"]
-_SYNCHRONOUS = 240
 _ROUNDS = 4
 
 
@@ -58,10 +54,6 @@ class Slot:
     end_ns: int
 
 
-_Release = tuple[int, int, int, Part, int]
-"""When, identifier, length (ns), what, cycle."""
-
-
 def timeline(plan: Plan) -> tuple[Slot, ...]:
     """As many cycles as the slowest frame behind SYNC has, two with a sensor as a rule.
 
@@ -71,17 +63,17 @@ def timeline(plan: Plan) -> tuple[Slot, ...]:
     Returns:
         Frames and controller by start; those of the last cycles may end behind it.
     """
-    cyclic = [pdo for pdo in plan.pdos if pdo.transmission_type <= _SYNCHRONOUS]
+    cyclic = [pdo for pdo in plan.pdos if pdo.transmission_type <= SYNCHRONOUS]
     cycles = max((pdo.transmission_type for pdo in cyclic), default=1)
     period, compute = plan.sync.period_ns, plan.traffic.budget.compute_ns
     starts: list[int | None] = [None] * cycles
     slots: list[Slot] = []
-    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may hold up
-        slots = [slot for bus in plan.buses for slot in _carry(bus, _releases(plan, bus, cyclic, starts))]
-        found = [_controller_start(plan, slots, cycle) for cycle in range(cycles)]
+    for _ in range(_ROUNDS):  # when the commands go depends on the feedback, which earlier commands may delay
+        slots = [slot for bus in plan.buses for slot in _carried(_released(plan, bus, cyclic, starts))]
+        found: list[int | None] = [_controller_start(plan, slots, cycle) for cycle in range(cycles)]
         if found == starts:
             break
-        starts = list(found)
+        starts = found
     thinking = [
         Slot("controller", "", None, cycle, start, start + compute)
         for cycle, start in enumerate(starts)
@@ -98,43 +90,42 @@ def _controller_start(plan: Plan, slots: Sequence[Slot], cycle: int) -> int:
     return next((look for look in looks if look >= last), looks[-1])
 
 
-def _releases(
+def _released(
     plan: Plan, bus: PlannedBus, cyclic: Sequence[PlannedPdo], starts: Sequence[int | None]
-) -> Iterator[_Release]:
-    period, bitrate = plan.sync.period_ns, plan.setup.bus.bitrate
-    sync_ns = _ns(worst_case_bits(1 if SYNC_OVERFLOW else 0), bitrate)
+) -> Iterator[Slot]:
+    """Every frame of one bus as if it were alone on it."""
+    bitrate = plan.setup.bus.bitrate
+    sync_ns = wire_ns(SYNC_BITS, bitrate)
     mine = on_the_wire([pdo for pdo in cyclic if pdo.channel == bus.channel])
     for cycle, start in enumerate(starts):
-        begin = cycle * period
-        yield begin, SYNC_ID, sync_ns, "SYNC", cycle
+        begin = cycle * plan.sync.period_ns
+        yield Slot("SYNC", bus.channel, SYNC_ID, cycle, begin, begin + sync_ns)
         for pdo in mine:
-            length = _ns(pdo.bits_worst, bitrate)
+            length = wire_ns(pdo.bits_worst, bitrate)
             if pdo.direction == "rpdo":
                 if start is not None:
-                    yield start + plan.traffic.budget.compute_ns, pdo.cob_id, length, "command", cycle
+                    out = start + plan.traffic.budget.compute_ns
+                    yield Slot("command", bus.channel, pdo.cob_id, cycle, out, out + length)
             elif cycle % pdo.transmission_type == 0:
                 part: Part = "tactile" if pdo.kind == "tactile" else "feedback"
-                yield begin + sync_ns, pdo.cob_id, length, part, cycle
+                yield Slot(part, bus.channel, pdo.cob_id, cycle, begin + sync_ns, begin + sync_ns + length)
 
 
-def _carry(bus: PlannedBus, releases: Iterator[_Release]) -> Iterator[Slot]:
+def _carried(released: Iterator[Slot]) -> Iterator[Slot]:
     """Frames one by one: of those that wait, the lowest identifier."""
-    coming = sorted(releases, reverse=True)
-    waiting: list[tuple[int, int, int, Part, int]] = []
+    coming = sorted(released, key=lambda slot: slot.start_ns, reverse=True)
+    waiting: list[tuple[int | None, int, Slot]] = []
     now = 0
     while coming or waiting:
         if not waiting:
-            now = max(now, coming[-1][0])
-        while coming and coming[-1][0] <= now:
-            release, cob_id, length, part, cycle = coming.pop()
-            heappush(waiting, (cob_id, release, length, part, cycle))
-        cob_id, _, length, part, cycle = heappop(waiting)
-        yield Slot(part, bus.channel, cob_id, cycle, now, now + length)
-        now += length
-
-
-def _ns(bits: int, bitrate: int) -> int:
-    return -(-bits * 1_000_000_000 // bitrate)
+            now = max(now, coming[-1].start_ns)
+        while coming and coming[-1].start_ns <= now:
+            slot = coming.pop()
+            heappush(waiting, (slot.cob_id, slot.start_ns, slot))
+        slot = heappop(waiting)[-1]
+        end = now + slot.end_ns - slot.start_ns
+        yield replace(slot, start_ns=now, end_ns=end)
+        now = end
 
 
 LETTERS: dict[Part, str] = {"SYNC": "S", "feedback": "f", "controller": "C", "command": "r", "tactile": "t"}
@@ -149,27 +140,20 @@ def timeline_rows(plan: Plan, width: int = 80) -> list[list[str]]:
         width: characters of a cycle.
     """
     slots, period = timeline(plan), plan.sync.period_ns
-    cycles = 1 + max(slot.cycle for slot in slots)
     rows = []
-    for cycle in range(cycles):
+    for cycle in range(1 + max(slot.cycle for slot in slots)):
         for channel in (*(bus.channel for bus in plan.buses), ""):
             cells = ["·"] * width
             for slot in slots:
-                if slot.channel == channel:
-                    _fill(cells, slot, cycle * period, period)
-            rows.append([f"cycle {cycle + 1}" if channel == plan.buses[0].channel else "", channel or "controller",
-                         "".join(cells)])  # fmt: skip
+                start, end = slot.start_ns - cycle * period, slot.end_ns - cycle * period
+                if slot.channel == channel and end >= 0 and start < period:
+                    # the characters in whose middle it is under way; what is shorter still has one
+                    first, last = ((2 * t_ns * width + period) // (2 * period) for t_ns in (start, end))
+                    for cell in range(max(first, 0), min(max(last, first + 1), width)):
+                        cells[cell] = LETTERS[slot.part]
+            title = f"cycle {cycle + 1}" if channel == plan.buses[0].channel else ""
+            rows.append([title, channel or "controller", "".join(cells)])
     return rows
-
-
-def _fill(cells: list[str], slot: Slot, begin_ns: int, period_ns: int) -> None:
-    """Mark the characters in whose middle something is under way; what is shorter still has one."""
-    width = len(cells)
-    first = (2 * (slot.start_ns - begin_ns) * width + period_ns) // (2 * period_ns)
-    last = (2 * (slot.end_ns - begin_ns) * width + period_ns) // (2 * period_ns)
-    for cell in range(max(first, 0), min(max(last, first + 1), width)):
-        if slot.end_ns - begin_ns >= 0 and slot.start_ns - begin_ns < period_ns:
-            cells[cell] = LETTERS[slot.part]
 
 
 # The plan as people read it on a terminal.
@@ -192,7 +176,7 @@ def _lines(plan: Plan) -> Iterator[str]:
         yield (
             f"CAN FD frames above 8 bytes, their data at {bus.data_bitrate} bit/s and counted in bits of "
             f"{bus.bitrate} bit/s; everything else classical; every controller on the bus must tolerate CAN FD, which "
-            "no EDS tells"
+            "no EDS states"
         )
     interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
     yield (
@@ -200,88 +184,65 @@ def _lines(plan: Plan) -> Iterator[str]:
         f"heartbeat every {HEARTBEAT_PRODUCED_MS} ms, lost after {HEARTBEAT_CONSUMED_MS} ms"
     )
     if bus.transmit_queue == "fifo":
-        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat holds up what follows it'
+        yield 'bus.transmit_queue = "fifo": nodes send their oldest frame first; a heartbeat delays what follows it'
     yield from (f"warning: {warning}" for warning in plan.warnings)
-    yield from _titled("nodes", _node_rows(plan.nodes))
-    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan.pdos))
+    yield from _titled("nodes", _node_rows(plan))
+    yield from _titled("PDOs, from the device's view, highest priority first", _pdo_rows(plan))
     for one in plan.buses:
-        yield from _titled(f"bus {one.channel}, worst case", list(_bus_rows(one.traffic)))
+        yield from _titled(f"bus {one.channel}, worst case", _bus_rows(one.traffic))
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
-    yield from _titled(title, list(_budget_rows(plan.traffic.budget)))
-    yield from _titled(_timeline_title(plan), timeline_rows(plan, TIMELINE_WIDTH))
-    if plan.choices:
-        rows = [[f"{choice.key} = {choice.value}", choice.why] for choice in plan.choices]
-        yield from _titled("chosen by the plan", rows)
-    if plan.joint_speeds is not None:
-        rows = [["joint", "needed deg/s", "allowed deg/s"]]
-        speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
-        rows += [[str(i), f"{needed:.1f}", f"{limit:g}"] for i, (needed, limit) in enumerate(speeds, start=1)]
-        yield from _titled("joint speeds", rows)
-    yield from _titled("uses", list(_use_rows(plan)))
-    yield from _titled("leaves out", [list(row) for row in plan.left_out])
-    if plan.not_available:
-        yield from _titled("could not have", [list(row) for row in plan.not_available])
+    yield from _titled(title, _budget_rows(plan.traffic.budget))
+    each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // TIMELINE_WIDTH)} µs"
+    parts = "(S SYNC, f feedback, C controller, r commands, t tactile)"
+    yield from _titled(f"{each} {parts}", timeline_rows(plan, TIMELINE_WIDTH))
+    yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices))
+    yield from _titled("joint speeds", _speed_rows(plan.joint_speeds))
+    yield from _titled("uses", _use_rows(plan))
+    yield from _titled("leaves out", plan.left_out)
+    yield from _titled("could not have", plan.not_available)
 
 
-def _timeline_title(plan: Plan) -> str:
-    return (
-        f"as it goes, worst-case lengths, one character {_us(plan.sync.period_ns // TIMELINE_WIDTH)} µs "
-        "(S SYNC, f feedback, C controller, r commands, t tactile)"
-    )
-
-
-def _titled(title: str, rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    yield ""
-    yield f"{title}:"
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    right = [_is_numeric(column[1:]) for column in zip(*rows, strict=True)]
+def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    """A table with its title; numbers, and a time without a bound, at the right; nothing without rows."""
+    if not (rows := list(rows)):
+        return
+    columns = list(zip(*rows, strict=True))
+    widths = [max(map(len, column)) for column in columns]
+    number = re.compile(r"-?[\d.]+( %)?|unbounded")
+    numeric = [len(rows) > 1 and all(map(number.fullmatch, column[1:])) for column in columns]
+    yield from ("", f"{title}:")
     for row in rows:
-        cells = (
-            cell.rjust(width) if numeric else cell.ljust(width)
-            for cell, width, numeric in zip(row, widths, right, strict=True)
-        )
-        yield "  " + "  ".join(cells).rstrip()
+        cells = zip(row, widths, numeric, strict=True)
+        yield "  " + "  ".join(f"{cell:{'>' if right else '<'}{width}}" for cell, width, right in cells).rstrip()
 
 
-def _is_numeric(cells: Sequence[str]) -> bool:
-    """Numbers belong to the right; a time without a bound is among them."""
-    return bool(cells) and all(re.fullmatch(r"-?[\d.]+( %)?|unbounded", cell) for cell in cells)
-
-
-def _node_rows(nodes: Sequence[PlannedNode]) -> list[list[str]]:
-    several = len({node.channel for node in nodes}) > 1
-    rows = [["id", "role", "identity (vendor product revision)", "EDS", "", *(["bus"] if several else [])]]
-    for node in nodes:
+def _node_rows(plan: Plan) -> Iterator[list[str]]:
+    several = len(plan.buses) > 1
+    yield ["id", "role", "identity (vendor product revision)", "EDS", "", *["bus"] * several]
+    for node in plan.nodes:
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in node.identity.numbers[:3])
         if node.identity.serial_number is not None:
             numbers += f" serial {node.identity.serial_number:08X}h"
         kind = "emulated" if node.emulated else "real"
-        rows.append([str(node.node_id), node.role, numbers, node.eds, kind, *([node.channel] if several else [])])
-    return rows
+        yield [str(node.node_id), node.role, numbers, node.eds, kind, *[node.channel] * several]
 
 
-def _pdo_rows(pdos: Sequence[PlannedPdo]) -> list[list[str]]:
-    several = len({pdo.channel for pdo in pdos}) > 1
+def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
+    several = len(plan.buses) > 1
     times = ["response µs", "deadline µs", "slack µs"]
-    rows = [[*(["bus"] * several), "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]]
-    for pdo in pdos:
-        rows.append(
-            [
-                *([pdo.channel] * several),
-                f"{pdo.cob_id:03X}h",
-                str(pdo.node_id),
-                f"{pdo.direction.upper()}{pdo.number}",
-                str(pdo.transmission_type),
-                f"{pdo.rate_hz:g}",
-                str(pdo.layout.length),
-                str(pdo.bits_worst),
-                _us(pdo.response_ns),
-                _us(pdo.deadline_ns),
-                _us(pdo.slack_ns),
-                _content(pdo.entries),
-            ]
-        )
-    return rows
+    yield [*["bus"] * several, "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]
+    for pdo in plan.pdos:
+        name = [f"{pdo.cob_id:03X}h", str(pdo.node_id), f"{pdo.direction.upper()}{pdo.number}"]
+        frame = [str(pdo.transmission_type), f"{pdo.rate_hz:g}", str(pdo.layout.length), str(pdo.bits_worst)]
+        times = [_us(pdo.response_ns), _us(pdo.deadline_ns), _us(pdo.slack_ns)]
+        yield [*[pdo.channel] * several, *name, *frame, *times, _content(pdo.entries)]
+
+
+def _speed_rows(speeds: JointSpeeds | None) -> Iterator[list[str]]:
+    if speeds is not None:
+        yield ["joint", "needed deg/s", "allowed deg/s"]
+        for joint, (needed, limit) in enumerate(zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True), start=1):
+            yield [str(joint), f"{needed:.1f}", f"{limit:g}"]
 
 
 def _content(entries: Sequence[PdoEntry]) -> str:
@@ -326,16 +287,17 @@ def _budget_rows(budget: CycleBudget) -> Iterator[list[str]]:
 
 
 def _use_rows(plan: Plan) -> Iterator[list[str]]:
-    yield ["task", plan.setup.kind]
-    if plan.strategy is not None:
-        yield ["strategy", plan.strategy]
-    if plan.estimator is not None:
-        also = f"; on the same data afterwards: {', '.join(plan.offline_estimators)}" if plan.offline_estimators else ""
-        yield ["estimator", plan.estimator + also]
-    if plan.fidelity is not None:
-        emulated = ", ".join(map(str, plan.setup.emulated_node_ids))
-        yield ["emulator", f"nodes {emulated}; arm {plan.fidelity}" if plan.setup.arm else f"nodes {emulated}"]
-    for name in plan.setup.bridge.use if plan.setup.bridge is not None else ():
+    setup = plan.setup
+    yield ["task", setup.kind]
+    if (scan := setup.scan) is not None:
+        yield ["strategy", scan.name]
+    if (shape := setup.shape) is not None:
+        also = f"; on the same data afterwards: {', '.join(shape.also)}" if shape.also else ""
+        yield ["estimator", shape.method + also]
+    if setup.emulated_node_ids:
+        emulated = f"nodes {', '.join(map(str, setup.emulated_node_ids))}"
+        yield ["emulator", f"{emulated}; arm {setup.truth.fidelity}" if setup.arm is not None else emulated]
+    for name in setup.bridge.use:
         yield ["bridge", f"{name}: {BRIDGES[name].what}; needs {', '.join(BRIDGES[name].packages)}"]
     yield ["outputs", ", ".join(plan.outputs)]
 
@@ -351,12 +313,12 @@ SCHEMA = 1
 
 def plan_dict(plan: Plan) -> dict[str, Any]:
     """Every field of the plan; what does not apply is None."""
-    bus = plan.setup.bus
+    setup, bus, shape = plan.setup, plan.setup.bus, plan.setup.shape
     return {
         "schema": SCHEMA,
-        "scene": plan.setup.name,
+        "scene": setup.name,
         "fits": True,
-        "title": plan.setup.title,
+        "title": setup.title,
         "bus": {
             "interface": bus.interface,
             "channel": bus.channel,
@@ -371,17 +333,20 @@ def plan_dict(plan: Plan) -> dict[str, Any]:
             "produced_ms": HEARTBEAT_PRODUCED_MS,
             "consumed_ms": HEARTBEAT_CONSUMED_MS,
         },
-        "nodes": [_node(node) for node in plan.nodes],
+        "nodes": [
+            asdict(node) | {"switched_off": [{"direction": way, "number": number} for way, number in node.switched_off]}
+            for node in plan.nodes
+        ],
         "pdos": [_pdo(pdo) for pdo in plan.pdos],
         "bus_load": {one.channel: _bus(one) for one in plan.buses},
-        "choices": [{"key": choice.key, "value": choice.value, "why": choice.why} for choice in plan.choices],
-        "timeline": [_slot(slot) for slot in timeline(plan)],
+        "choices": [asdict(choice) for choice in plan.choices],
+        "timeline": [_in_us(asdict(slot)) | {"channel": slot.channel or None} for slot in timeline(plan)],
         "joint_speeds": asdict(plan.joint_speeds) if plan.joint_speeds is not None else None,
-        "estimator": plan.estimator,
-        "offline_estimators": list(plan.offline_estimators),
-        "strategy": plan.strategy,
-        "fidelity": plan.fidelity,
-        "bridges": list(plan.setup.bridge.use) if plan.setup.bridge is not None else [],
+        "estimator": shape.method if shape is not None else None,
+        "offline_estimators": list(shape.also) if shape is not None else [],
+        "strategy": setup.scan.name if setup.scan is not None else None,
+        "fidelity": setup.truth.fidelity if setup.emulated_node_ids else None,
+        "bridges": list(setup.bridge.use),
         "outputs": list(plan.outputs),
         "left_out": [{"what": what, "why": why} for what, why in plan.left_out],
         "not_available": [{"what": what, "why": why} for what, why in plan.not_available],
@@ -401,19 +366,15 @@ def refused_dict(name: str, problems: Sequence[str], ways_out: Sequence[str]) ->
 
 
 def _bus(bus: PlannedBus) -> dict[str, Any]:
+    traffic, budget = bus.traffic, bus.traffic.budget
     return {
         "node_ids": list(bus.node_ids),
-        "planned_worst": bus.traffic.load,
-        "parts": dict(bus.traffic.parts),
-        "demands": [_demand(demand) for demand in bus.traffic.demands],
-        "sync_response_us": _microseconds(bus.traffic.sync_response_ns),
-        "budget": _budget(bus.traffic.budget),
+        "planned_worst": traffic.load,
+        "parts": dict(traffic.parts),
+        "demands": [_in_us(asdict(demand)) for demand in traffic.demands],
+        "sync_response_us": _microseconds(traffic.sync_response_ns),
+        "budget": _in_us(asdict(budget) | {"bus_ns": budget.bus_ns}),
     }
-
-
-def _node(node: PlannedNode) -> dict[str, Any]:
-    switched_off = [{"direction": direction, "number": number} for direction, number in node.switched_off]
-    return asdict(node) | {"switched_off": switched_off}
 
 
 def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
@@ -438,34 +399,15 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
     }
 
 
-def _slot(slot: Slot) -> dict[str, Any]:
+def _in_us(values: dict[str, Any]) -> dict[str, Any]:
+    """The same with its times in µs: `start_ns` becomes `start_us`."""
     return {
-        "part": slot.part,
-        "channel": slot.channel or None,
-        "cob_id": slot.cob_id,
-        "cycle": slot.cycle,
-        "start_us": _microseconds(slot.start_ns),
-        "end_us": _microseconds(slot.end_ns),
+        f"{name.removesuffix('_ns')}_us" if name.endswith("_ns") else name: (
+            _microseconds(value) if name.endswith("_ns") else value
+        )
+        for name, value in values.items()
     }
 
 
-def _demand(demand: Demand) -> dict[str, Any]:
-    return {
-        "what": demand.what,
-        "cycles": demand.cycles,
-        "used_us": _microseconds(demand.used_ns),
-        "available_us": _microseconds(demand.available_ns),
-    }
-
-
-def _budget(budget: CycleBudget) -> dict[str, Any]:
-    """The cycle's budget in µs."""
-    times = asdict(budget) | {"bus_ns": budget.bus_ns}
-    looks = times.pop("looks_ns")
-    return {name.removesuffix("_ns") + "_us": _microseconds(t_ns) for name, t_ns in times.items()} | {
-        "looks_us": [_microseconds(look) for look in looks]
-    }
-
-
-def _microseconds(t_ns: int | None) -> float | None:
-    return None if t_ns is None else t_ns / 1000
+def _microseconds(t_ns: Any) -> Any:
+    return None if t_ns is None else [t / 1000 for t in t_ns] if isinstance(t_ns, tuple) else t_ns / 1000

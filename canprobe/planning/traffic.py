@@ -1,10 +1,11 @@
-"""Does it fit the bus: average load, peak demand behind one SYNC, worst-case response time of every message."""
+"""SYNC, and does everything fit the bus: average load, peak demand behind one SYNC, worst-case response time of every
+message.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from canprobe.planning.model import (
     HEARTBEAT_PRODUCED_MS,
@@ -17,6 +18,7 @@ from canprobe.planning.model import (
     Traffic,
 )
 from canprobe.protocol.frame_bits import (
+    FrameLength,
     best_case_bits,
     best_case_fd_bits,
     exact_bits,
@@ -32,40 +34,80 @@ from canprobe.protocol.response_times import (
     worst_case_response,
     worst_case_response_fifo,
 )
-from canprobe.scene.setup import Bus
+from canprobe.scene.setup import Bus, Setup
 
-# How much of a bus a PDO takes: a classical frame, or above 8 bytes one of CAN FD with bit-rate switch.
+# Can the cycle be said in CANopen's objects: SYNC period, interpolation period, tactile trigger.
+
+INTERPOLATION_US = 100  # 60C2h with index −4
+INTERPOLATION_MAX = 255  # 60C2h:01 is an UNSIGNED8
+_TOLERANCE = 1e-5  # of a rate written with six digits
+
+
+def plan_sync(setup: Setup) -> tuple[SyncPlan, list[str]]:
+    """The SYNC of a scene, and why its period is not possible.
+
+    Source: CiA 301 object 1006h (period in µs), CiA 402 object 60C2h (interpolation period, here n·10⁻⁴ s).
+    """
+    rate, moves, problems = setup.rate_hz, setup.arm is not None, []
+    step_us = INTERPOLATION_US if moves else 1
+    period_us = max(1, round(1e6 / rate / step_us)) * step_us
+    if abs(period_us * rate / 1e6 - 1) >= _TOLERANCE:
+        below = int(1e6 / rate / step_us)
+        near = sorted(1e6 / (count * step_us) for count in (below, below + 1) if count > 0)
+        problems.append(
+            f"cycle.rate_hz = {rate:g}: a SYNC period of {1e6 / rate:.3f} µs cannot be set "
+            f"({'1006h counts µs and 60C2h n·10⁻⁴ s' if moves else '1006h counts µs'}); "
+            f"take {' or '.join(f'{rate:.6g}' for rate in near)} Hz"
+        )
+    units = period_us // INTERPOLATION_US
+    if moves and units > INTERPOLATION_MAX:
+        problems.append(
+            f"cycle.rate_hz = {rate:g}: 60C2h holds at most {INTERPOLATION_MAX}·10⁻⁴ s; "
+            f"take {1e6 / (INTERPOLATION_MAX * INTERPOLATION_US):.1f} Hz or more"
+        )
+    return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW, units if moves else None), problems
+
+
+def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
+    """How many SYNCs make one tactile frame (18xxh:02), and why the rate is not possible."""
+    if setup.array is None:
+        return 1, []
+    exact = setup.rate_hz / setup.array.rate_hz
+    ratio = max(1, round(exact))
+    if abs(exact / ratio - 1) < _TOLERANCE and SYNC_OVERFLOW % ratio == 0:
+        return ratio, []
+    fitting = [count for count in range(1, SYNC_OVERFLOW + 1) if SYNC_OVERFLOW % count == 0]
+    near = sorted(fitting, key=lambda count: abs(count - exact))[:2]
+    rates = " or ".join(f"{setup.rate_hz / count:.6g}" for count in sorted(near))
+    return min(ratio, SYNC_OVERFLOW), [
+        f"sensor.rate_hz = {setup.array.rate_hz:g}: a frame every {exact:.4g} SYNCs cannot be triggered; the SYNC "
+        f"counter runs to {SYNC_OVERFLOW}, so cycle.rate_hz must be 1, 2, 3, 4, 5, 6, 8, … times it; take {rates} Hz"
+    ]
+
+
+# How much of a bus a PDO takes: a classical frame, or above 8 bytes one of CAN FD with bit-rate switch. In bit times of
+# the nominal rate; the data phase of an FD frame is rounded up.
 
 CLASSIC_BYTES = 8
 
 
 def frame_bits(n_data: int, bus: Bus) -> int:
-    """Worst case of one frame in bit times of the nominal rate; the data phase of an FD frame rounded up.
-
-    Args:
-        n_data: data bytes.
-        bus: its two bit rates.
-    """
-    if n_data <= CLASSIC_BYTES:
-        return worst_case_bits(n_data)
-    worst = worst_case_fd_bits(n_data)
-    return worst.nominal - (-worst.data * bus.bitrate // bus.data_bitrate)
+    """Worst case of one frame with so many data bytes."""
+    return worst_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(worst_case_fd_bits(n_data), bus)
 
 
 def exact_frame_bits(can_id: int, data: bytes, bus: Bus) -> int:
-    """Bits of this very frame, in the same bit times."""
-    if len(data) <= CLASSIC_BYTES:
-        return exact_bits(can_id, data)
-    exact = exact_fd_bits(can_id, data)
-    return exact.nominal - (-exact.data * bus.bitrate // bus.data_bitrate)
+    """Bits of this very frame."""
+    return exact_bits(can_id, data) if len(data) <= CLASSIC_BYTES else _nominal(exact_fd_bits(can_id, data), bus)
 
 
 def unstuffed_frame_bits(n_data: int, bus: Bus) -> int:
-    """Bits of a frame without stuff bits, as `canbusload -i` counts, in the same bit times."""
-    if n_data <= CLASSIC_BYTES:
-        return best_case_bits(n_data)
-    best = best_case_fd_bits(n_data)
-    return best.nominal - (-best.data * bus.bitrate // bus.data_bitrate)
+    """Bits of a frame without stuff bits, as `canbusload -i` counts."""
+    return best_case_bits(n_data) if n_data <= CLASSIC_BYTES else _nominal(best_case_fd_bits(n_data), bus)
+
+
+def _nominal(length: FrameLength, bus: Bus) -> int:
+    return length.nominal - (-length.data * bus.bitrate // bus.data_bitrate)
 
 
 # The cycle as one transaction behind SYNC: TPDOs, controller, RPDOs, and how much of the period they leave.
@@ -81,18 +123,24 @@ def unstuffed_frame_bits(n_data: int, bus: Bus) -> int:
 
 FIRST_LOOK, LAST_LOOK = 0.25, 0.6
 """Shares of the period at which the cell looks for TPDOs besides the planned time; after the last they are late."""
-_ROUNDS = 20
+SYNCHRONOUS = 240
+"""The highest transmission type that SYNC triggers (CiA 301)."""
+ROUNDS = 20
+"""Of the analysis; where it still moves after them there is no bound."""
+_SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
+SYNC_BITS = worst_case_bits(_SYNC_BYTES)
+SYNC_BITS_LEAST = best_case_bits(_SYNC_BYTES)
 
 
 @dataclass(frozen=True, slots=True)
-class CycleMessages:
+class _Messages:
     """Everything on a bus, by its part in the cycle.
 
     Attributes:
         sync: the SYNC; its offset is 0.
         feedback: TPDOs that the controller waits for.
         commands: RPDOs that it sends.
-        other: TPDOs that it does not wait for, of the sensor.
+        other: TPDOs that it does not wait for, of the array.
         strangers: what keeps its own time.
         best_sync_ns: shortest time of a SYNC on the wire.
         best_feedback_ns: shortest time of the feedback.
@@ -106,128 +154,17 @@ class CycleMessages:
     strangers: tuple[Message, ...]
     best_sync_ns: int
     best_feedback_ns: int
-    fifo_nodes: Mapping[str, int] = field(default_factory=dict)
-
-
-def analyse_cycle(messages: CycleMessages, compute_ns: int, bitrate: int) -> tuple[BusAnalysis, CycleBudget]:
-    """Response times behind SYNC, and the budget of one cycle.
-
-    Args:
-        messages: of one bus.
-        compute_ns: what the controller takes at most.
-        bitrate: bit/s.
-
-    Returns:
-        The analysis, each response counted from the SYNC (a stranger's from its own event), and the budget.
-    """
-    period = messages.sync.period_ns
-    sync_ns, feedback_ns = messages.best_sync_ns, max(messages.best_sync_ns, messages.best_feedback_ns)
-    for _ in range(_ROUNDS):
-        looks = look_times(period, feedback_ns)
-        placed = _placed(messages, sync_ns, looks, feedback_ns, compute_ns)
-        analysis = _analyse(placed, messages.fifo_nodes, bitrate)
-        late_sync = _last(analysis, (messages.sync,))
-        late_feedback = _last(analysis, messages.feedback) if messages.feedback else late_sync
-        if (
-            late_sync is None
-            or late_feedback is None
-            or analysis.load >= 1
-            or (late_sync, late_feedback) == (sync_ns, feedback_ns)
-        ):
-            break
-        sync_ns, feedback_ns = late_sync, late_feedback
-    else:
-        analysis = _without_bound(analysis)
-    return analysis, _budget(messages, analysis, looks, feedback_ns, compute_ns)
-
-
-def _analyse(placed: Sequence[Message], fifo_nodes: Mapping[str, int], bitrate: int) -> BusAnalysis:
-    if fifo_nodes:
-        return worst_case_response_fifo(placed, fifo_nodes, bitrate)
-    return worst_case_response(placed, bitrate)
-
-
-def _without_bound(analysis: BusAnalysis) -> BusAnalysis:
-    """What is left where the rounds do not come to an end."""
-    return dataclasses.replace(
-        analysis, responses=tuple(dataclasses.replace(one, response_ns=None) for one in analysis.responses)
-    )
-
-
-def look_times(period_ns: int, feedback_ns: int | None) -> tuple[int, ...]:
-    """When the cell looks for TPDOs, ns after the SYNC's deadline.
-
-    Args:
-        period_ns: of SYNC.
-        feedback_ns: by when they are in at the latest; None where that is not known or nothing is waited for.
-    """
-    first, last = int(period_ns * FIRST_LOOK), int(period_ns * LAST_LOOK)
-    known = {first, last} if feedback_ns is None else {first, last, min(feedback_ns, period_ns)}
-    return tuple(sorted(look for look in known if look >= first))
-
-
-def controller_starts(messages: CycleMessages, looks: Sequence[int], feedback_ns: int) -> tuple[int, int]:
-    """Earliest and latest start of the controller after the SYNC, ns."""
-    if not messages.feedback:
-        return looks[0], looks[0]
-    earliest = min(max(looks[0], messages.best_feedback_ns), looks[-1])
-    return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
-
-
-def _placed(
-    messages: CycleMessages, sync_ns: int, looks: Sequence[int], feedback_ns: int, compute_ns: int
-) -> list[Message]:
-    answered = messages.best_sync_ns
-    earliest, latest = controller_starts(messages, looks, feedback_ns)
-    answers = [
-        dataclasses.replace(m, offset_ns=answered, jitter_ns=sync_ns - answered)
-        for m in (*messages.feedback, *messages.other)
-    ]
-    commands = [
-        dataclasses.replace(m, offset_ns=earliest, jitter_ns=latest + compute_ns - earliest) for m in messages.commands
-    ]
-    return [dataclasses.replace(messages.sync, offset_ns=0), *answers, *commands, *messages.strangers]
-
-
-def _last(analysis: BusAnalysis, messages: Sequence[Message]) -> int | None:
-    """The latest end of several messages after the SYNC; None without a bound."""
-    names = {message.name for message in messages}
-    found = [response.response_ns for response in analysis.responses if response.message.name in names]
-    return None if None in found or not found else max(ns for ns in found if ns is not None)
-
-
-def _budget(
-    messages: CycleMessages, analysis: BusAnalysis, looks: tuple[int, ...], feedback_ns: int, compute_ns: int
-) -> CycleBudget:
-    period = messages.sync.period_ns
-    sync_ns, tactile = _last(analysis, (messages.sync,)), _last(analysis, messages.other)
-    feedback, commands = _last(analysis, messages.feedback), _last(analysis, messages.commands)
-    _, start = controller_starts(messages, looks, feedback_ns)
-    known = not messages.feedback or feedback is not None
-    out = (start + compute_ns if known else None) if not messages.commands else commands
-    return CycleBudget(
-        period_ns=period,
-        looks_ns=looks,
-        sync_ns=sync_ns,
-        feedback_ns=feedback,
-        start_ns=start if known else None,
-        compute_ns=compute_ns,
-        commands_ns=commands,
-        tactile_ns=tactile,
-        slack_ns=None if out is None else period - out,
-    )
-
-
-# Does it fit the bus: average load, peak demand behind one SYNC, worst-case response time of every message.
-
-_SYNC_BYTES = 1 if SYNC_OVERFLOW else 0
-_SYNC_BITS = worst_case_bits(_SYNC_BYTES)
-SYNCHRONOUS = 240
+    fifo_nodes: Mapping[str, int]
 
 
 def on_the_wire(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
     """One PDO for every identifier: an RPDO that two drives read is sent once."""
     return sorted({pdo.cob_id: pdo for pdo in reversed(pdos)}.values(), key=lambda pdo: pdo.cob_id)
+
+
+def wire_ns(bits: int, bitrate: int) -> int:
+    """Time of so many bits, rounded up."""
+    return -(-bits * 1_000_000_000 // bitrate)
 
 
 def plan_traffic(
@@ -243,141 +180,176 @@ def plan_traffic(
         compute_ns: what the controller takes of a cycle at most.
     """
     wire = on_the_wire(pdos)
-    analysis, budget = analyse_cycle(_messages(wire, sync, node_ids, bus), compute_ns, bus.bitrate)
-    responses = {response.message.cob_id: response for response in analysis.responses}
+    analysis, budget = _analyse(_messages(wire, sync, node_ids, bus), compute_ns, bus.bitrate)
+    response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
+    bits_per_s = {
+        "SYNC": SYNC_BITS * sync.rate_hz,
+        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
+        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
+        "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
+    }
     traffic = Traffic(
         load=analysis.load,
-        parts=_parts(wire, sync, node_ids, bus.bitrate),
-        demands=_demands(wire, sync, bus.bitrate),
-        sync_response_ns=responses[SYNC_ID].response_ns,
+        parts=tuple((what, bits / bus.bitrate) for what, bits in bits_per_s.items() if bits > 0),
+        demands=tuple(_demands(wire, sync, bus.bitrate)),
+        sync_response_ns=response_ns[SYNC_ID],
         budget=budget,
     )
-    timed = [dataclasses.replace(pdo, response_ns=responses[pdo.cob_id].response_ns) for pdo in pdos]
+    timed = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos]
     timed.sort(key=lambda pdo: (pdo.cob_id, pdo.node_id))
     return traffic, timed, _problems(traffic, analysis.responses, bus)
 
 
-def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> CycleMessages:
+def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> _Messages:
     """What SYNC triggers, by its part in the cycle, and what keeps its own time."""
-    bitrate = bus.bitrate
-    cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
-    feedback = [pdo for pdo in cyclic if pdo.direction == "tpdo" and pdo.kind == "drive"]
-    heartbeats = [
-        Message(_heartbeat(node), HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000)
-        for node in (*node_ids, MASTER_NODE_ID)
-    ]
-    best_sync = best_case_bits(_SYNC_BYTES)
-    return CycleMessages(
+    queues = {"SYNC": MASTER_NODE_ID}
+    cyclic: dict[str, list[Message]] = {"feedback": [], "commands": [], "other": []}
+    strangers, feedback_bits = [], SYNC_BITS_LEAST
+    for pdo in wire:
+        triggered = pdo.transmission_type <= SYNCHRONOUS
+        message = Message(
+            f"{pdo.direction.upper()} {pdo.cob_id:03X}h",
+            pdo.cob_id,
+            pdo.layout.length,
+            sync.period_ns * pdo.transmission_type if triggered else round(1e9 / pdo.rate_hz),
+            deadline_ns=pdo.deadline_ns,
+            frame_ns=wire_ns(pdo.bits_worst, bus.bitrate),
+        )
+        queues[message.name] = pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID
+        if not triggered:
+            strangers.append(message)
+        elif pdo.direction == "rpdo":
+            cyclic["commands"].append(message)
+        elif pdo.kind == "drive":
+            cyclic["feedback"].append(message)
+            feedback_bits += best_case_bits(pdo.layout.length)
+        else:
+            cyclic["other"].append(message)
+    for node in (*node_ids, MASTER_NODE_ID):
+        name = f"heartbeat of node {node}"
+        strangers.append(Message(name, HEARTBEAT_BASE + node, 1, HEARTBEAT_PRODUCED_MS * 1_000_000))
+        queues[name] = node
+    return _Messages(
         sync=Message("SYNC", SYNC_ID, _SYNC_BYTES, sync.period_ns),
-        feedback=tuple(_message(pdo, sync, bitrate) for pdo in feedback),
-        commands=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "rpdo"),
-        other=tuple(_message(pdo, sync, bitrate) for pdo in cyclic if pdo.direction == "tpdo" and pdo not in feedback),
-        strangers=(*(_message(pdo, sync, bitrate) for pdo in wire if pdo not in cyclic), *heartbeats),
-        best_sync_ns=best_sync * 1_000_000_000 // bitrate,
-        best_feedback_ns=(best_sync + sum(best_case_bits(pdo.layout.length) for pdo in feedback))
-        * 1_000_000_000
-        // bitrate,
-        fifo_nodes=_senders(wire, node_ids) if bus.transmit_queue == "fifo" else {},
+        **{part: tuple(messages) for part, messages in cyclic.items()},
+        strangers=tuple(strangers),
+        best_sync_ns=SYNC_BITS_LEAST * 1_000_000_000 // bus.bitrate,
+        best_feedback_ns=feedback_bits * 1_000_000_000 // bus.bitrate,
+        fifo_nodes=queues if bus.transmit_queue == "fifo" else {},
     )
 
 
-def _senders(wire: Sequence[PlannedPdo], node_ids: Sequence[int]) -> dict[str, int]:
-    """Name of every message → the node in whose transmit queue it waits."""
-    pdos = {_name(pdo): pdo.node_id if pdo.direction == "tpdo" else MASTER_NODE_ID for pdo in wire}
-    heartbeats = {_heartbeat(node): node for node in (*node_ids, MASTER_NODE_ID)}
-    return {"SYNC": MASTER_NODE_ID, **pdos, **heartbeats}
+def _analyse(messages: _Messages, compute_ns: int, bitrate: int) -> tuple[BusAnalysis, CycleBudget]:
+    """Response times behind SYNC (of a stranger behind its own event), and the budget of one cycle."""
+    period, answered = messages.sync.period_ns, messages.best_sync_ns
+    sync_ns, feedback_ns = answered, max(answered, messages.best_feedback_ns)
+    for _ in range(ROUNDS):
+        looks = look_times(period, feedback_ns)
+        earliest, start = controller_starts(messages, looks, feedback_ns)
+        answers = (*messages.feedback, *messages.other)
+        placed = [
+            replace(messages.sync, offset_ns=0),
+            *(replace(m, offset_ns=answered, jitter_ns=sync_ns - answered) for m in answers),
+            *(replace(m, offset_ns=earliest, jitter_ns=start + compute_ns - earliest) for m in messages.commands),
+            *messages.strangers,
+        ]
+        if messages.fifo_nodes:
+            analysis = worst_case_response_fifo(placed, messages.fifo_nodes, bitrate)
+        else:
+            analysis = worst_case_response(placed, bitrate)
+        late_sync = _last(analysis, (messages.sync,))
+        late_feedback = _last(analysis, messages.feedback) if messages.feedback else late_sync
+        moved = (late_sync, late_feedback) != (sync_ns, feedback_ns)
+        if late_sync is None or late_feedback is None or analysis.load >= 1 or not moved:
+            break
+        sync_ns, feedback_ns = late_sync, late_feedback
+    else:  # the rounds do not end: there is no bound
+        analysis = replace(analysis, responses=tuple(replace(one, response_ns=None) for one in analysis.responses))
+    feedback, commands = _last(analysis, messages.feedback), _last(analysis, messages.commands)
+    _, start = controller_starts(messages, looks, feedback_ns)
+    known = not messages.feedback or feedback is not None
+    out = commands if messages.commands else start + compute_ns if known else None
+    return analysis, CycleBudget(
+        period_ns=period,
+        looks_ns=looks,
+        sync_ns=_last(analysis, (messages.sync,)),
+        feedback_ns=feedback,
+        start_ns=start if known else None,
+        compute_ns=compute_ns,
+        commands_ns=commands,
+        tactile_ns=_last(analysis, messages.other),
+        slack_ns=None if out is None else period - out,
+    )
 
 
-def _name(pdo: PlannedPdo) -> str:
-    return f"{pdo.direction.upper()} {pdo.cob_id:03X}h"
+def look_times(period_ns: int, feedback_ns: int) -> tuple[int, ...]:
+    """When the cell looks for TPDOs, ns after the SYNC's deadline.
+
+    Args:
+        period_ns: of SYNC.
+        feedback_ns: by when they are in at the latest.
+    """
+    first, last = int(period_ns * FIRST_LOOK), int(period_ns * LAST_LOOK)
+    return tuple(sorted(look for look in {first, last, min(feedback_ns, period_ns)} if look >= first))
 
 
-def _heartbeat(node_id: int) -> str:
-    return f"heartbeat of node {node_id}"
+def controller_starts(messages: _Messages, looks: Sequence[int], feedback_ns: int) -> tuple[int, int]:
+    """Earliest and latest start of the controller after the SYNC, ns."""
+    if not messages.feedback:
+        return looks[0], looks[0]
+    earliest = min(max(looks[0], messages.best_feedback_ns), looks[-1])
+    return earliest, next((look for look in looks if look >= feedback_ns), looks[-1])
 
 
-def _message(pdo: PlannedPdo, sync: SyncPlan, bitrate: int) -> Message:
-    frame_ns, period_ns = _ns(pdo.bits_worst, bitrate), _period_ns(pdo, sync)
-    return Message(_name(pdo), pdo.cob_id, pdo.layout.length, period_ns, deadline_ns=pdo.deadline_ns, frame_ns=frame_ns)
+def _last(analysis: BusAnalysis, messages: Sequence[Message]) -> int | None:
+    """The latest end of several messages after the SYNC; None without a bound."""
+    names = {message.name for message in messages}
+    found = [response.response_ns for response in analysis.responses if response.message.name in names]
+    return None if None in found or not found else max(ns for ns in found if ns is not None)
 
 
-def _period_ns(pdo: PlannedPdo, sync: SyncPlan) -> int:
-    if pdo.transmission_type <= SYNCHRONOUS:
-        return sync.period_ns * pdo.transmission_type
-    return round(1e9 / pdo.rate_hz)
-
-
-def _parts(
-    wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bitrate: int
-) -> tuple[tuple[str, float], ...]:
-    heartbeats = worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1)
-    bits = {
-        "SYNC": _SYNC_BITS * sync.rate_hz,
-        "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
-        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
-        "heartbeats": heartbeats,
-    }
-    return tuple((what, rate / bitrate) for what, rate in bits.items() if rate > 0)
-
-
-def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> tuple[Demand, ...]:
+def _demands(wire: Sequence[PlannedPdo], sync: SyncPlan, bitrate: int) -> Iterator[Demand]:
     """What one SYNC releases, and what a tactile frame waits for until its last PDO is through."""
     cyclic = [pdo for pdo in wire if pdo.transmission_type <= SYNCHRONOUS]
-    drives = _SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
+    drives = SYNC_BITS + sum(pdo.bits_worst for pdo in cyclic if pdo.kind == "drive")
     tactile = [pdo for pdo in cyclic if pdo.kind == "tactile"]
-    what = "SYNC and drive PDOs" if drives > _SYNC_BITS else "SYNC"
-    demands = [Demand(what, 1, _ns(drives, bitrate), sync.period_ns)]
+    what = "SYNC and drive PDOs" if drives > SYNC_BITS else "SYNC"
+    yield Demand(what, 1, wire_ns(drives, bitrate), sync.period_ns)
     if tactile:
         cycles = tactile[0].deadline_ns // sync.period_ns
         used = cycles * drives + sum(pdo.bits_worst for pdo in tactile)
-        demands.append(Demand("tactile frame and all above it", cycles, _ns(used, bitrate), cycles * sync.period_ns))
-    return tuple(demands)
-
-
-def _ns(bits: int, bitrate: int) -> int:
-    return -(-bits * 1_000_000_000 // bitrate)
+        yield Demand("tactile frame and all above it", cycles, wire_ns(used, bitrate), cycles * sync.period_ns)
 
 
 def _problems(traffic: Traffic, responses: Sequence[Response], bus: Bus) -> list[str]:
-    where = f"bus {bus.channel} at {bus.bitrate} bit/s"
-    if bus.transmit_queue == "fifo":
-        where += ", every node's oldest frame first"
-    problems = []
+    """What does not fit: load and demands, or else the cycle, or else the first message that is late."""
+    budget, problems = traffic.budget, []
     if traffic.load > 1:
         parts = ", ".join(f"{what} {100 * share:.0f} %" for what, share in traffic.parts)
-        problems.append(f"{where}: worst-case load {100 * traffic.load:.0f} % ({parts})")
+        problems.append(f"worst-case load {100 * traffic.load:.0f} % ({parts})")
     problems += [
-        f"{where}: {demand.what} take {demand.used_ns / 1000:.0f} µs of the {demand.available_ns / 1000:.0f} µs "
+        f"{demand.what} take {demand.used_ns / 1000:.0f} µs of the {demand.available_ns / 1000:.0f} µs "
         f"in {demand.cycles} cycle{'s' if demand.cycles > 1 else ''}"
         for demand in traffic.demands
         if demand.used_ns > demand.available_ns
     ]
-    if not problems and (short := _short(traffic.budget)):
-        problems.append(f"{where}: {short}")
     late = [response for response in responses if not response.fits]
-    if late and not problems:
-        problems.append(f"{where}: {_late(late)}")
-    return problems
-
-
-def _short(budget: CycleBudget) -> str | None:
-    """What is wrong with one cycle: the last RPDO is not through before the next SYNC."""
-    if budget.slack_ns is None or budget.start_ns is None or budget.slack_ns >= 0:
-        return None
-    out = budget.period_ns - budget.slack_ns
-    last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
-    return (
-        f"one cycle: the controller can start after {budget.start_ns / 1000:.0f} µs, takes "
-        f"{budget.compute_ns / 1000:.0f} µs (cycle.compute_us), and {last} after {out / 1000:.0f} µs, "
-        f"{-budget.slack_ns / 1000:.0f} µs behind the next SYNC"
-    )
-
-
-def _late(late: Sequence[Response]) -> str:
-    first = late[0]
-    more = f" and {len(late) - 1} more" if len(late) > 1 else ""
-    response = "without bound" if first.response_ns is None else f"{first.response_ns / 1000:.0f} µs"
-    return (
-        f"worst-case response time of {first.message.name} is {response}, its deadline "
-        f"{first.message.due_ns / 1000:.0f} µs{more}"
-    )
+    if problems:
+        pass
+    elif budget.slack_ns is not None and budget.start_ns is not None and budget.slack_ns < 0:
+        last = "the last RPDO is through" if budget.commands_ns is not None else "the controller is done"
+        out_us, behind_us = (budget.period_ns - budget.slack_ns) / 1000, -budget.slack_ns / 1000
+        problems.append(
+            f"one cycle: the controller can start after {budget.start_ns / 1000:.0f} µs, takes "
+            f"{budget.compute_ns / 1000:.0f} µs (cycle.compute_us), and {last} after {out_us:.0f} µs, "
+            f"{behind_us:.0f} µs behind the next SYNC"
+        )
+    elif late:
+        first = late[0]
+        response = "without bound" if first.response_ns is None else f"{first.response_ns / 1000:.0f} µs"
+        problems.append(
+            f"worst-case response time of {first.message.name} is {response}, its deadline "
+            f"{first.message.due_ns / 1000:.0f} µs{f' and {len(late) - 1} more' if len(late) > 1 else ''}"
+        )
+    queue = ", every node's oldest frame first" if bus.transmit_queue == "fifo" else ""
+    return [f"bus {bus.channel} at {bus.bitrate} bit/s{queue}: {problem}" for problem in problems]

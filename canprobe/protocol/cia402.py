@@ -83,20 +83,8 @@ _S = DriveState
 _C = Command
 INITIAL_STATE = _S.NOT_READY_TO_SWITCH_ON  # transition 0, at power on
 
-# (mask, pattern, state). Bit 5 is free in the states that mask 4Fh tests.
-STATUSWORD_PATTERNS: tuple[tuple[int, int, DriveState], ...] = (
-    (0x4F, 0x00, _S.NOT_READY_TO_SWITCH_ON),
-    (0x4F, 0x40, _S.SWITCH_ON_DISABLED),
-    (0x6F, 0x21, _S.READY_TO_SWITCH_ON),
-    (0x6F, 0x23, _S.SWITCHED_ON),
-    (0x6F, 0x27, _S.OPERATION_ENABLED),
-    (0x6F, 0x07, _S.QUICK_STOP_ACTIVE),
-    (0x4F, 0x0F, _S.FAULT_REACTION_ACTIVE),
-    (0x4F, 0x08, _S.FAULT),
-)
-
 # (mask, pattern, command). With bit 7 clear every controlword matches exactly one line.
-CONTROLWORD_PATTERNS: tuple[tuple[int, int, Command], ...] = (
+_CONTROLWORD_PATTERNS: tuple[tuple[int, int, Command], ...] = (
     (0x82, 0x00, _C.DISABLE_VOLTAGE),
     (0x86, 0x02, _C.QUICK_STOP),
     (0x87, 0x06, _C.SHUTDOWN),
@@ -143,16 +131,15 @@ AUTOMATIC_TRANSITIONS: dict[tuple[DriveState, Event], DriveState] = {
 POWERED_STATES = frozenset({_S.OPERATION_ENABLED, _S.QUICK_STOP_ACTIVE, _S.FAULT_REACTION_ACTIVE})
 """States in which the drive function is on: torque may act on the motor."""
 
-_STATES = {
-    word: state for mask, pattern, state in STATUSWORD_PATTERNS for word in range(0x80) if word & mask == pattern
-}
+_BIT_5_FREE = (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED, _S.FAULT_REACTION_ACTIVE, _S.FAULT)
+_STATES = {state.value: state for state in DriveState} | {state.value | 0x20: state for state in _BIT_5_FREE}
 _COMMANDS = {
-    word: command for mask, pattern, command in CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
+    word: command for mask, pattern, command in _CONTROLWORD_PATTERNS for word in range(0x100) if word & mask == pattern
 }
 
 
 def state_of(statusword: int) -> DriveState:
-    """The drive state that a statusword tells.
+    """The drive state in a statusword.
 
     Raises:
         ProtocolError: a bit pattern that is no state.
@@ -164,12 +151,12 @@ def state_of(statusword: int) -> DriveState:
 
 
 def known_state(statusword: int) -> DriveState | None:
-    """The drive state that a statusword tells; None for a bit pattern that is no state."""
+    """The drive state in a statusword; None for a bit pattern that is no state."""
     return _STATES.get(statusword & 0x6F)
 
 
 def describe_state(statusword: int) -> str:
-    """Say what a statusword tells, to be put behind "the drive is"."""
+    """The drive state in words, to be put behind "the drive is"."""
     state = known_state(statusword)
     return state.name if state is not None else f"in no CiA 402 state (statusword {statusword:#06x})"
 

@@ -8,8 +8,6 @@ from enum import IntEnum
 
 from canprobe.errors import ProtocolError
 
-# CAN frames, the identifiers of CiA 301 and the two network services that are a byte or two long.
-
 Frame = tuple[int, bytes]
 """An 11-bit identifier and up to 8 data bytes."""
 
@@ -25,7 +23,6 @@ EMCY_BASE = 0x080
 SDO_TX_BASE = 0x580  # server (node) to client (master)
 SDO_RX_BASE = 0x600  # client (master) to server (node)
 HEARTBEAT_BASE = 0x700
-BROADCAST = 0  # NMT: every node
 
 # Source: CiA 301, table "restricted COB-IDs"; last row of CANopen's predefined set included.
 _RESTRICTED = (
@@ -51,7 +48,7 @@ class NmtCommand(IntEnum):
 
 
 class NmtState(IntEnum):
-    """NMT state as the heartbeat tells it; INITIALISING is the boot-up message. Source: CiA 301."""
+    """NMT state as the heartbeat reports it; INITIALISING is the boot-up message. Source: CiA 301."""
 
     INITIALISING = 0x00
     STOPPED = 0x04
@@ -65,28 +62,13 @@ def _check_node(node_id: int, lowest: int = 1) -> int:
     return node_id
 
 
-def pack_nmt(command: NmtCommand, node_id: int = BROADCAST) -> Frame:
+def pack_nmt(command: NmtCommand, node_id: int = 0) -> Frame:
     """Pack an NMT command for one node, or for all with node id 0.
 
     Raises:
         ProtocolError: the node id is not 0..127.
     """
     return NMT_ID, bytes((command, _check_node(node_id, lowest=0)))
-
-
-def unpack_nmt(data: bytes) -> tuple[NmtCommand, int]:
-    """Unpack an NMT frame into command and node id (0: all nodes).
-
-    Raises:
-        ProtocolError: not two bytes, an unknown command, or no node id. A node ignores such frames.
-    """
-    if len(data) != 2:
-        raise ProtocolError(f"NMT: expected 2 bytes, got {len(data)}")
-    try:
-        command = NmtCommand(data[0])
-    except ValueError:
-        raise ProtocolError(f"NMT: unknown command {data[0]:#04x}") from None
-    return command, _check_node(data[1], lowest=0)
 
 
 def pack_heartbeat(node_id: int, state: NmtState) -> Frame:
@@ -281,7 +263,7 @@ class Emcy:
 
 
 def describe(code: int) -> str:
-    """Say an emergency error code in words: the most specific entry of CiA 301 or CiA 402 that covers it."""
+    """An emergency error code in words: the most specific entry of CiA 301 or CiA 402 that covers it."""
     for mask in _MASKS:
         words = _WORDS.get(code & mask)
         if words is not None and (code & mask or code == 0):
@@ -338,7 +320,7 @@ class LssCommand(IntEnum):
 
 
 class LssState(IntEnum):
-    """State of an LSS slave, as switch state global tells it."""
+    """State of an LSS slave, as switch state global sets it."""
 
     WAITING = 0
     CONFIGURATION = 1
@@ -354,7 +336,7 @@ class LssError(IntEnum):
 
 @dataclass(frozen=True, slots=True, order=True)
 class LssAddress:
-    """The 128 bits that tell a device from every other one in the world: object 1018h."""
+    """The 128 bits that identify a device in the world: object 1018h."""
 
     vendor_id: int
     product_code: int

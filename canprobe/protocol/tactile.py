@@ -63,18 +63,9 @@ class TactileMode(IntEnum):
     IMAGE = 2
 
 
-PDO_COUNT = {TactileMode.FEATURES: 2, TactileMode.WINDOW: 9, TactileMode.IMAGE: 33}
-"""PDOs of a frame, header included; with a window of 8×8 taxels."""
-
-
 def window_words(side: int) -> int:
     """Payloads of 8 taxels that a window of side × side taxels fills."""
     return -(-side * side // 8)
-
-
-def pdo_count(mode: TactileMode, window: int = WINDOW) -> int:
-    """PDOs of a frame, header included."""
-    return 1 + window_words(window) if mode is TactileMode.WINDOW else PDO_COUNT[mode]
 
 
 def crc16_ccitt(data: bytes, crc: int = 0) -> int:
@@ -97,7 +88,7 @@ class TactileHeader:
         mode: what follows.
         overload: a taxel reached full scale.
         sample_age_us: trigger SYNC minus sample time, µs.
-        crc: over the six bytes before it and the payloads after; `pack_frame` computes it.
+        crc: over the six bytes before it and the payloads after; `pack_whole` computes it.
         window: taxels along the window.
     """
 
@@ -273,12 +264,6 @@ def pack_whole(header: TactileHeader, content: NDArray[np.uint8] | Features) -> 
     return start + crc.to_bytes(2, "little") + body
 
 
-def pack_frame(header: TactileHeader, content: NDArray[np.uint8] | Features) -> list[bytes]:
-    """As `pack_whole`, payload by payload."""
-    whole = pack_whole(header, content)
-    return [whole[i : i + 8] for i in range(0, len(whole), 8)]
-
-
 # Puts the PDOs of a tactile frame together again, or drops them: never half of one frame and half of another.
 
 
@@ -344,7 +329,8 @@ class FrameAssembler:
         """
         self._slots = {cob_id: slot for slot, cob_id in enumerate(cob_ids)}
         self._sizes = tuple(sizes) if sizes is not None else (8,) * len(cob_ids)
-        needed = 8 * pdo_count(mode, window)
+        payloads = {TactileMode.FEATURES: 1, TactileMode.WINDOW: window_words(window), TactileMode.IMAGE: 32}[mode]
+        needed = 8 * (1 + payloads)
         if len(self._slots) != len(cob_ids) or self._sizes[:1] != (8,) or sum(self._sizes) != needed:
             raise ProtocolError(
                 f"{mode.name.lower()} frames need different COB-IDs, a header of 8 bytes first, {needed} bytes in all; "

@@ -1,8 +1,8 @@
-"""A recorded bus, taken up again: recording → cycles → estimates, or observations for other tools.
+"""A recorded bus, estimated again: log → recording → cycles → estimates, or observations for bridges.
 
-`recording` reads a log as the cell needs it: the frames of the planned nodes, and the deadlines of their SYNCs.
-`cycles` makes the measurements of it that a cell would have made, steps the scene's own task through them and holds
-its targets against the recorded ones; where another controller drove, contacts are taken from the images alone.
-`reestimate.replay` estimates the shape from that, with any estimator, and equals the online answer to the last bit
-where the log is a run's. `into_bridges` hands the same observations to other tools.
+`recording` reads a log: the frames of the planned nodes in order, and the deadline of each SYNC. `cycles` makes the
+measurements of a cell from them, steps the scene's task through these and compares its targets with the recorded ones;
+where another controller drove, it takes contacts from the images alone. `reestimate.replay` estimates the shape from
+the contacts with any estimator; for a log of canprobe the answers equal the online ones to the last bit.
+`into_bridges` feeds the same observations to bridges.
 """

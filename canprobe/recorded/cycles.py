@@ -1,4 +1,4 @@
-"""A recorded bus → the cycles that a cell makes of it, and the contacts and estimates of the run."""
+"""A recorded bus → the cycles that a cell makes of it, the scene's task stepped through them, and contacts."""
 
 from __future__ import annotations
 
@@ -10,13 +10,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.port import TimedFrame
-from canprobe.cell.assembly import limits_of, make_drives, make_tactile
+from canprobe.cell.array import make_tactile
 from canprobe.cell.controller import Measurement
 from canprobe.cell.cycle import SYNCS_REMEMBERED, Intake
-from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames
-from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.supervisor import WayBack
+from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames, make_drives
+from canprobe.cell.lift_off import WayBack
+from canprobe.cell.supervision import HOLD_CYCLES, TOUCH_FORCE
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
@@ -28,12 +27,10 @@ from canprobe.tasks.from_plan import make_sensing, make_shape_tracker, make_task
 from canprobe.tasks.shape import ShapeTracker
 from canprobe.tasks.touch import TouchTask
 
-# A recorded bus → the cycles that a cell makes of it, one after another.
-
 DRIFT_BLOCK = 400
-"""SYNCs over which another logger's clock does not drift by a noticeable share of a period."""
+"""SYNCs over which another logger's clock drifts by a small share of a period only."""
 MOST_LOST = 5
-"""A SYNC counter that jumps by more was started again."""
+"""A SYNC counter that jumps by more was restarted."""
 ENABLE_OPERATION = 0x000F
 
 
@@ -42,9 +39,9 @@ class LogCycle:
     """One cycle of a log.
 
     Attributes:
-        measurement: what the cell saw.
-        targets: target positions that the drives were last told, counts; None before all six were.
-        enabled_by_master: every drive's last controlword asks for operation, as far as any was heard.
+        measurement: of the cell.
+        targets: last target positions sent to the drives, counts; None before every drive has one.
+        enabled_by_master: the last controlword of every drive, where there is one, enables operation.
     """
 
     measurement: Measurement
@@ -53,27 +50,27 @@ class LogCycle:
 
 
 class LogCycles:
-    """Iterates over the cycles of a recording. One object, one pass; what it counted is there afterwards.
+    """Iterates over the cycles of a recording. One object, one pass; its counts are complete afterwards.
 
-    With ``as_taken`` the order of the lines decides what a cycle saw, as in a log that a cell on a real bus wrote: a
-    frame is written when it is taken in, so what stands between a SYNC and the RPDOs behind it was seen. Otherwise the
-    stamps decide: the cell is taken to have looked at its bus exactly at its looks, until every TPDO was in. That is
-    so in lockstep; of a real bus it is an estimate, for a cell wakes up later than it wants to, and a frame that came
-    in between then counts one cycle later, or as late.
+    With ``as_taken`` the order of the lines decides which frames a cycle received, as in a log that a cell on a real
+    bus wrote: a frame is written when it is received, so the frames between a SYNC and the RPDOs behind it belong to
+    that cycle. Otherwise the stamps decide: the cell is assumed to have read its bus exactly at its looks, until every
+    TPDO was in. That is exact in lockstep. On a real bus it is an estimate: a cell wakes up late, and a frame that
+    comes in between counts one cycle later, or as late.
 
     Args:
         plan: of the cell.
         recording: the log, in the order that ``as_taken`` wants.
         as_taken: see above.
-        on_deadlines: a measurement's time is its cycle's deadline, as a cell has it. False, for another master, of
-            whom neither deadlines nor looks are known: it is the stamp of its SYNC, and what came before the next SYNC
-            belongs to it.
+        on_deadlines: a measurement's time is its cycle's deadline, as in a cell. False for another master, whose
+            deadlines and looks are unknown: it is the stamp of its SYNC, and all frames before the next SYNC belong to
+            the cycle.
         drifts: the stamps are another clock's than the master's.
 
     Attributes:
-        start_ns: when the first cycle was due, on the clock of the log. A measurement's time counts from there.
+        start_ns: deadline of the first cycle on the clock of the log; a measurement's time counts from there.
         sync_times_s: time of each SYNC, from there.
-        lost_syncs: SYNCs that the log lacks.
+        lost_syncs: SYNCs that are missing in the log.
     """
 
     def __init__(
@@ -96,7 +93,7 @@ class LogCycles:
         if on_deadlines:
             self.start_ns = int(np.min(stamps - _wire_times(plan, recording) - numbers * plan.sync.period_ns))
         looks: Sequence[float] = plan.traffic.budget.looks_ns if on_deadlines else (math.inf,)
-        waited = (plan.traffic.budget.sync_ns or 0) + STAMP_JITTER_NS  # for the bus, or so its stamp says
+        waited = (plan.traffic.budget.sync_ns or 0) + STAMP_JITTER_NS  # for the bus, by its stamp
         on_time = stamps - deadlines <= waited
         self._looks = _looks(recording, np.where(on_time, deadlines, stamps), looks)
         axes = self.drives.axes if self.drives is not None else ()
@@ -123,18 +120,21 @@ class LogCycles:
             if self._as_taken:
                 intake.route(frames[seen:last])
             position = seen
-            self._follow(frames[first:last])
+            for can_id, data, _ in frames[first:last]:
+                if (frame := self._commands.get(can_id)) is not None:
+                    self._take_command(frame, data)
             targets = self._known_targets()
             if self.drives is not None and targets is not None:
                 self.drives.aim(targets)
-            yield LogCycle(measurement, targets, self._enabled_by_master())
+            enabled = all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
+            yield LogCycle(measurement, targets, enabled)
 
     def _begin(self, t_ns: int, stamp_ns: int) -> None:
         self._intake.begin(self._intake.number + 1, t_ns, stamp_ns)
         self.sync_times_s.append(t_ns * 1e-9)
 
     def _lost(self, before: int, counter: int) -> int:
-        """How many SYNCs are missing in the log between two counters; they too have their number and their time."""
+        """How many SYNCs are missing in the log between two counters; they have a number and a time too."""
         lost = (counter - before - 1) % self._overflow if before and counter else 0
         return lost if lost <= MOST_LOST else 0
 
@@ -156,12 +156,6 @@ class LogCycles:
         self._intake.end()
         return end
 
-    def _follow(self, frames: list[TimedFrame]) -> None:
-        for can_id, data, _ in frames:
-            frame = self._commands.get(can_id)
-            if frame is not None:
-                self._take_command(frame, data)
-
     def _take_command(self, frame: CommandFrame, data: bytes) -> None:
         for axis, layout, picks in frame.parts:
             for value, pick in zip(layout.unpack(data), picks, strict=True):
@@ -174,19 +168,16 @@ class LogCycles:
         known = tuple(target for target in self._targets if target is not None)
         return known if known and len(known) == len(self._targets) else None
 
-    def _enabled_by_master(self) -> bool:
-        return all(word & ENABLE_OPERATION == ENABLE_OPERATION for word in self._words.values())
-
 
 def _check_states(drives: DriveGroup) -> None:
-    """A log in which a statusword tells no state was made with another mapping, or by a drive out of order."""
+    """A statusword without a state comes from another mapping, or from a faulty drive."""
     for axis, word in zip(drives.axes, drives.statuswords, strict=True):
         if known_state(word) is None:
             raise ProtocolError(f"node {axis.node_id}: statusword {word:#06x} is no CiA 402 state")
 
 
 def _wire_times(plan: Plan, recording: Recording) -> NDArray[np.int64]:
-    """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate has the ends of frames."""
+    """From each SYNC's deadline to its stamp (n,), ns: a lockstep log with a bit rate stamps the ends of frames."""
     bus = plan.setup.bus
     if bus.interface != "lockstep" or not bus.timed or bus.fd is True:
         return np.zeros(len(recording.syncs), np.int64)
@@ -196,7 +187,7 @@ def _wire_times(plan: Plan, recording: Recording) -> NDArray[np.int64]:
 
 
 def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence[float]) -> list[list[int]]:
-    """Where each look of each cycle ends among the frames; the delays count from when its SYNC was sent."""
+    """Index of the frame at which each look of each cycle ends; the delays count from the sending of its SYNC."""
     stamps, syncs = recording.sync_stamps, recording.syncs
     following = np.append(syncs[1:], len(recording.frames))
     ends = []
@@ -210,25 +201,25 @@ def _looks(recording: Recording, sent_ns: NDArray[np.int64], delays_ns: Sequence
     return [[int(end) for end in row] for row in clipped]
 
 
-# The lift-off at the end of a log: what the cell began it for need not be on the bus, but its targets are its own.
+# The lift-off at the end of a log: its cause need not be on the bus, so its targets identify it.
 
 Vector = NDArray[np.float64]
 TARGET_TOLERANCE = 1
 """Counts that a replayed target may differ from the recorded one by rounding."""
 SHORTEST = 8
-"""Cycles that tell a lift-off from what a task does: by then it has moved most of a millimetre."""
+"""Cycles that distinguish a lift-off from a task: by then it has moved most of a millimetre."""
 UNTOLD = 2
-"""Cycles behind a lift-off in which the drives were told nothing: its last one, and the first of the stop."""
+"""Cycles after a lift-off without new targets: its last one, and the first of the stop."""
 
 
 class LoggedWayBack:
-    """Finds the lift-off among the last cycles of a controller, and what it should have told the drives.
+    """Finds the lift-off among the last cycles of a controller, and its targets.
 
     Args:
         plan: of the cell.
 
     Attributes:
-        steps: its cycles with the joint targets (6,), rad, that belong to them; empty where there was none.
+        steps: its cycles with their joint targets (6,), rad; empty without a lift-off.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -239,32 +230,23 @@ class LoggedWayBack:
         self._flange_probe = plan.setup.probe.T_flange_probe
         self._period_s = plan.sync.period_ns * 1e-9
 
-    @property
-    def begun_s(self) -> float | None:
-        """When it began; None where there was none."""
-        return self.steps[0][0].measurement.t_ns * 1e-9 if self.steps else None
-
     def cycles_before(self, cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
-        """The controller's own cycles; those of the lift-off, if one ends them, are `steps` afterwards."""
+        """The cycles of the controller; those of a lift-off at their end are `steps` afterwards."""
         last: deque[LogCycle] = deque()
         for cycle in cycles:
             last.append(cycle)
             if len(last) > WayBack.cycles(self._period_s) + 1:
                 yield last.popleft()
-        begun = self._find(list(last))
-        yield from (last.popleft() for _ in range(begun))
-
-    def _find(self, last: list[LogCycle]) -> int:
-        """How many of the last cycles are not the lift-off's."""
-        for first in range(1, len(last) - SHORTEST + 1):
-            steps = self._steps_from(last[first - 1], last[first:])
+        rest = list(last)
+        for first in range(1, len(rest) - SHORTEST + 1):
+            steps = self._steps_from(rest[first - 1], rest[first:])
             if steps is not None:
-                self.steps = steps
-                return first
-        return len(last)
+                self.steps, rest = steps, rest[:first]
+                break
+        yield from rest
 
     def _steps_from(self, before: LogCycle, cycles: list[LogCycle]) -> list[tuple[LogCycle, Vector]] | None:
-        """The targets of a lift-off in these cycles; None where the recorded ones are others."""
+        """The targets of a lift-off in these cycles; None where the recorded ones differ."""
         if before.targets is None:
             return None
         targets, free = np.array(before.targets, dtype=float), np.ones(len(before.targets), dtype=bool)
@@ -280,31 +262,31 @@ class LoggedWayBack:
 
 
 def worst_count(model: PumaModel, q: Vector, targets: tuple[int, ...]) -> int:
-    """By how much joint angles (6,), rad, and recorded motor targets differ, counts."""
+    """Largest difference of joint angles (6,), rad, and recorded motor targets, counts."""
     return int(np.abs(np.round(joints_to_counts(model, q)) - targets).max())
 
 
-# A recorded log → the contacts and estimates of the run: by the scene's own task, or from the contacts alone.
+# The contacts of the run: by the scene's task, or from the images alone.
 
 OWN_COUNTS = 20
-"""Median difference up to which the task drove: 0.5 mm or 0.2 deg. One lost line is a few counts for a while."""
+"""Median difference up to which the task drove: 0.5 mm or 0.2 deg. A lost line changes a few counts for a while."""
 PARTED_COUNTS = 100
-"""Difference at which the recorded targets are not the task's: 2 mm or 1 deg."""
+"""Difference from which the recorded targets are not the task's: 2 mm or 1 deg."""
 PARTED_S = 0.1
-"""Time at that difference after which they never will be again: what a lost line sets off, the servo has mended."""
+"""Time at that difference after which they stay apart: the servo corrects the effect of a lost line sooner."""
 
 
 @dataclass(frozen=True, slots=True)
 class TaskReplay:
-    """What the scene's task did on the recorded measurements.
+    """The scene's task on the recorded measurements, and its targets beside the recorded ones.
 
     Attributes:
         task: the task, at its end.
-        compared: cycles with recorded targets beside its own.
-        differing: of these, where a target differed by more than ``TARGET_TOLERANCE``.
-        median_counts, worst_counts: the usual and the largest difference.
-        lifted_s: when the cell began to lift off, whatever it did so for, and ended the task's replay (s); else None.
-        parted_s: when the recorded targets had left the task's for good, which ended its replay (s); else None.
+        compared: number of cycles with recorded targets and the task's.
+        differing: of these, with a difference of more than ``TARGET_TOLERANCE``.
+        median_counts, worst_counts: the median and the largest difference.
+        lifted_s: when the cell began to lift off, which ended the task's replay (s); else None.
+        parted_s: when the recorded targets had departed from the task's, which ended its replay (s); else None.
     """
 
     task: TouchTask
@@ -317,14 +299,13 @@ class TaskReplay:
 
     @property
     def drove(self) -> bool:
-        """The recorded targets are this task's own, mostly and to the end, and it came to a contact of its scan."""
+        """Most recorded targets, to the end, are those of this task, and its scan had a contact."""
         came_to_scan = self.task.shape is not None and bool(self.task.shape.samples)
         return came_to_scan and self.parted_s is None and self.median_counts <= OWN_COUNTS
 
 
 def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
-    """The cycles in which a cell steps its controller: from the one after all drives are in operation enabled until
-    one leaves it, or the master asks for anything else."""
+    """The cycles in which a cell steps its controller: while all drives are, and shall be, in operation enabled."""
     started = False
     for cycle in cycles:
         if not started:
@@ -336,17 +317,17 @@ def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
 
 
 def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
-    """Step the scene's task through recorded cycles and hold its targets against the recorded ones.
+    """Step the scene's task through recorded cycles and compare its targets with the recorded ones.
 
-    It ends early where the targets are clearly another controller's.
+    It ends early where the targets are those of another controller.
     """
     task = make_task(plan)
     assert isinstance(task, TouchTask)
     way_back = LoggedWayBack(plan)
     comparison = _Comparison(plan)
     for cycle in way_back.cycles_before(controller_cycles(cycles)):
-        if max(cycle.measurement.q_age, default=0) >= comparison.hold_cycles:
-            continue  # a late drive: the cell held, and asked its controller nothing
+        if max(cycle.measurement.q_age, default=0) >= HOLD_CYCLES:
+            continue  # a late drive: the cell held, and did not step its controller
         command = task.step(cycle.measurement)
         comparison.add(cycle, command.q_target)
         if command.done or command.stop_reason is not None or comparison.parted_s is not None:
@@ -354,7 +335,16 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
     else:
         for cycle, q in way_back.steps:
             comparison.add(cycle, q)
-    return comparison.result(task, way_back.begun_s)
+    differences = comparison.differences
+    return TaskReplay(
+        task,
+        compared=len(differences),
+        differing=sum(d > TARGET_TOLERANCE for d in differences),
+        median_counts=float(np.median(differences)) if differences else math.inf,
+        worst_counts=max(differences, default=0),
+        lifted_s=way_back.steps[0][0].measurement.t_ns * 1e-9 if way_back.steps else None,
+        parted_s=comparison.parted_s,
+    )
 
 
 class _Comparison:
@@ -362,41 +352,27 @@ class _Comparison:
 
     def __init__(self, plan: Plan) -> None:
         assert plan.setup.arm is not None
-        self.hold_cycles = limits_of(plan).hold_cycles
         self.parted_s: float | None = None
         self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
-        self._differences: list[int] = []
+        self.differences: list[int] = []
         self._away = 0
 
     def add(self, cycle: LogCycle, q: Vector | None) -> None:
-        """One cycle, and the joint angles (6,), rad, that its drives should have been told."""
+        """One cycle, and the joint targets (6,), rad, of the replay."""
         if cycle.targets is None or q is None:
             return
-        self._differences.append(worst_count(self._model, q, cycle.targets))
-        self._away = self._away + 1 if self._differences[-1] > PARTED_COUNTS else 0
+        self.differences.append(worst_count(self._model, q, cycle.targets))
+        self._away = self._away + 1 if self.differences[-1] > PARTED_COUNTS else 0
         if self._away > self._patience:
             self.parted_s = cycle.measurement.t_ns * 1e-9
 
-    def result(self, task: TouchTask, lifted_s: float | None) -> TaskReplay:
-        """What came of it."""
-        differences = self._differences
-        return TaskReplay(
-            task,
-            compared=len(differences),
-            differing=sum(d > TARGET_TOLERANCE for d in differences),
-            median_counts=float(np.median(differences)) if differences else math.inf,
-            worst_counts=max(differences, default=0),
-            lifted_s=lifted_s,
-            parted_s=self.parted_s,
-        )
-
 
 def replay_contacts(plan: Plan, cycles: Iterable[LogCycle]) -> tuple[ShapeTracker, int]:
-    """Feed every contact of a log to the scene's estimator, whoever made it: force above the touch threshold.
+    """Feed every contact of a log, force above the touch threshold, to the scene's estimator.
 
     Returns:
-        The tracker; and how many contacts could not be placed for want of the joints of their instant.
+        The tracker; and how many contacts could not be placed, as the joints of their instant are missing.
     """
     assert isinstance(plan.setup.task, Touch)
     sensing = make_sensing(plan.setup.task)

@@ -1,4 +1,4 @@
-"""A recorded run into other tools: the same observations as the cell handed out, made again from its log."""
+"""A recorded run for bridges: the observations of the cell, made again from its log."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ from canprobe.results.summary import check_clock
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
-from canprobe.session.session import LOCKSTEP, Say
+from canprobe.session.session import Say
+from canprobe.session.target import LOCKSTEP
 from canprobe.touch.estimate.answer import SurfaceEstimate
 
 LOGGED = ("phase", "depth_at_1n_mm")
@@ -34,11 +35,11 @@ LOGGED = ("phase", "depth_at_1n_mm")
 
 @dataclass(frozen=True, slots=True)
 class RecordedBridges:
-    """What became of a log.
+    """The result of a log that was fed to bridges.
 
     Attributes:
-        result: of its estimators; None where the scene has none, or nothing was touched.
-        bridges: of each bridge what `summary.json` says of it.
+        result: of its estimators; None where the scene has none.
+        bridges: the entry of each bridge in `summary.json`.
     """
 
     result: ReplayResult | None
@@ -53,25 +54,27 @@ def replay_into(
     method: str | Sequence[str] | None = None,
     say: Say = lambda _: None,
 ) -> RecordedBridges:
-    """Feed a recorded bus to bridges, as if the cell were running; those that show it live get it in real time.
+    """Feed a recorded bus to bridges, as if the cell were running; in real time where one shows it live.
 
     Args:
         log: folder of a run, or a candump file.
         bridge: names of the bridges.
-        scene: what the nodes are; by default the ``scene.toml`` beside the log.
+        scene: describes the nodes; by default the ``scene.toml`` beside the log.
         method: estimators, as for :func:`canprobe.replay`.
-        say: called with where each bridge is to be found.
+        say: called with the address or file of each bridge.
 
     Raises:
-        UsageError: as :func:`canprobe.replay`; or a bridge cannot be had.
+        UsageError: as :func:`canprobe.replay`; or a bridge is not available.
     """
     path, folder = find_log(Path(log))
     check_bridges(bridge)
-    resolved = _only(scene_of(path, folder, scene), bridge)
+    named = scene_of(path, folder, scene)  # its own bridges fed the run: they are replaced
+    settings = replace(named.bridge or BridgeSettings(), use=tuple(dict.fromkeys(bridge)))  # type: ignore[arg-type]
+    resolved = replace(named, bridge=settings)
     plan = make_plan(resolve(resolved))
     estimated = method is not None or (resolved.shape is not None and resolved.task.kind == "scan")
     result = replay(log, scene=resolved, method=method) if estimated else None
-    observations = _Observations(plan, path, folder, result)
+    observations = _observations(plan, path, folder, result)
     with Bridges(plan, path.parent, virtual=True, say=say) as bridges:
         live = any(BRIDGES[name].live for name in bridge)
         for observation in _in_real_time(observations) if live else observations:
@@ -80,13 +83,7 @@ def replay_into(
         return RecordedBridges(result, bridges.end(None) or {})
 
 
-def _only(scene: Scene, bridge: Sequence[str]) -> Scene:
-    """The scene with these bridges in the place of those that fed the run."""
-    settings = scene.bridge or BridgeSettings()
-    return replace(scene, bridge=replace(settings, use=tuple(dict.fromkeys(bridge))))  # type: ignore[arg-type]
-
-
-def _in_real_time(observations: _Observations) -> Iterator[Observation]:
+def _in_real_time(observations: Iterator[Observation]) -> Iterator[Observation]:
     clock = MonotonicClock()
     start_ns: int | None = None
     for observation in observations:
@@ -96,53 +93,34 @@ def _in_real_time(observations: _Observations) -> Iterator[Observation]:
         yield observation
 
 
-class _Observations:
-    """Iterates over what an observer would have seen of a recorded log.
-
-    Args:
-        plan: of the scene.
-        path: the candump file.
-        folder: of the run; None for a log from elsewhere.
-        result: of the estimators; None without.
-    """
-
-    def __init__(self, plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> None:
-        self._plan = plan
-        self._path = path
-        self._as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
-        self._ours = (result is None and folder is not None) or (
-            result is not None and result.summary["driven_by"] == "task"
-        )
-        self._recording = read_recording(path, plan, as_taken=self._as_taken)
-        self._drifts = folder is None
-        self._estimates = _estimates(result)
-        self._folder = folder
-
-    def __iter__(self) -> Iterator[Observation]:
-        groups = _frames_by_sync(self._path, self._recording)
-        before = next(groups)
-        if before:
-            yield Observation(before[-1][2], None, None, before)
-        cycles = LogCycles(
-            self._plan, self._recording, as_taken=self._as_taken, on_deadlines=self._ours, drifts=self._drifts
-        )
-        columns = _columns(self._folder, cycles.start_ns, self._plan.sync.period_ns) if self._ours else {}
-        for cycle, frames in zip(cycles, groups, strict=True):
-            m = cycle.measurement
-            logged, estimate = columns.get(m.t_ns, {}), self._estimates.get(m.t_ns)
-            command = Command(columns=logged, estimate=estimate) if logged or estimate is not None else None
-            yield Observation(cycles.start_ns + m.t_ns, m, command, frames)
+def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayResult | None) -> Iterator[Observation]:
+    """The observations of a recorded log; `folder` of the run, None for another log; `result` of the estimators."""
+    as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
+    ours = folder is not None if result is None else result.summary["driven_by"] == "task"
+    recording = read_recording(path, plan, as_taken=as_taken)
+    groups = _frames_by_sync(path, recording)
+    before = next(groups)
+    if before:
+        yield Observation(before[-1][2], None, None, before)
+    cycles = LogCycles(plan, recording, as_taken=as_taken, on_deadlines=ours, drifts=folder is None)
+    columns = _columns(folder, cycles.start_ns, plan.sync.period_ns) if ours else {}
+    estimates = _estimates(result)
+    for cycle, frames in zip(cycles, groups, strict=True):
+        m = cycle.measurement
+        logged, estimate = columns.get(m.t_ns, {}), estimates.get(m.t_ns)
+        command = Command(columns=logged, estimate=estimate) if logged or estimate is not None else None
+        yield Observation(cycles.start_ns + m.t_ns, m, command, frames)
 
 
 def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
-    """What the scene's estimator said, by the cycle's time since the first, ns."""
+    """The answers of the scene's estimator, by the cycle's time since the first, ns."""
     return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
 
 
 def _columns(folder: Path | None, start_ns: int, period_ns: int) -> dict[int, dict[str, float | NDArray[np.float64]]]:
-    """What the bridges use of the task's columns, where the run logged it, by the cycle's time since the first, ns.
+    """The columns of the task that bridges use, from the run's log, by the cycle's time since the first, ns.
 
-    ``start_ns`` comes from the stamps of SYNCs, which are late by less than half a period at the best of times.
+    ``start_ns`` comes from the stamps of SYNCs, of which some are late by less than half a period.
     """
     if folder is None or not (folder / "log.npz").is_file():
         return {}

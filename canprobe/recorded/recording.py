@@ -9,32 +9,30 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import read_log
+from canprobe.bus.disk import read_candump
 from canprobe.bus.port import TimedFrame, is_bus_error
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import SYNC_ID
 
-# A recorded bus as the cell needs it: the frames of the planned nodes, in order, checked to be there.
-
 RATE_TOLERANCE = 0.2
 """Share by which the recorded SYNC period may differ from the scene's."""
 STAMP_JITTER_NS = 300_000
-"""Lines out of the order of their stamps by no more are in the order of the bus, and the stamps are wrong."""
+"""Lines whose stamps go back by no more are in the order of the bus: the stamps are wrong."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """The frames of one channel that the cell takes or sends.
+    """The frames of one channel that the cell receives or sends.
 
     Attributes:
         path: the log.
-        channel: the one of its channels on which the nodes are.
+        channel: of the nodes.
         frames: SYNC, TPDOs and RPDOs of the planned nodes, (can_id, data, t_ns).
         times: their stamps (n,), ns.
-        syncs: which of them are SYNCs.
-        other: frames of this channel that are none of these.
-        malformed: PDOs of a wrong length, left out.
+        syncs: indices of the SYNCs among them.
+        other: number of other frames on this channel.
+        malformed: number of PDOs of a wrong length, left out.
         error_frames: bus errors on all channels.
     """
 
@@ -49,12 +47,12 @@ class Recording:
 
     @property
     def sync_stamps(self) -> NDArray[np.int64]:
-        """When each SYNC went out, ns."""
+        """When each SYNC was sent, ns."""
         return self.times[self.syncs]
 
     @property
     def sync_overflow(self) -> int | None:
-        """At which the SYNC counter starts again; None where it did not twice, or there is no counter."""
+        """Value after which the SYNC counter restarts; None without a counter, or where it did not restart twice."""
         counters = [data[0] for _, data, _ in map(self.frames.__getitem__, self.syncs) if data]
         last = [a for a, b in pairwise(counters) if b < a]
         return max(counters) if last and last.count(max(counters)) >= 2 else None
@@ -75,14 +73,14 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
     """Read the frames of a plan's nodes from a log.
 
     Args:
-        path: the log; it may hold other nodes, other channels and error frames. Where the plan has several buses, the
-            log has them by the plan's names, and they are read as one.
-        plan: which identifiers and lengths to expect.
-        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order in which it
-            took the frames in. False puts them into the order of the bus.
+        path: the log; it may hold other nodes, other channels and error frames. The buses of a plan with several of
+            them have the plan's names in the log, and are read as one.
+        plan: gives the identifiers and lengths.
+        as_taken: keep lines and stamps as they are: a cell on a real bus writes its lines in the order of reception.
+            False sorts them into the order of the bus.
 
     Raises:
-        UsageError: no such file, a torn line, a node that was never heard, no SYNC, or SYNCs of another rate.
+        UsageError: no such file, a torn line, a node without any TPDO, no SYNC, or SYNCs of another rate.
     """
     channels, error_frames = _read(path, plan)
     name = max(channels, key=lambda c: (channels[c].answers, len(channels[c].frames)), default="")
@@ -104,9 +102,9 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     channels: dict[str, _Channel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
-    for t_ns, on, can_id, data in read_log(path):
+    for t_ns, on, can_id, data in read_candump(path):
         if on in others and can_id == SYNC_ID:
-            continue  # the cell has one SYNC, which goes to all its buses
+            continue  # the cell sends one SYNC to all its buses
         name = main if on in others else on
         channel = channels.get(name)
         if channel is None:
@@ -127,7 +125,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
 
 
 def _in_bus_order(frames: list[TimedFrame]) -> list[TimedFrame]:
-    """Frames with stamps that never go back: a logger's small jitter is evened out, anything more is sorted."""
+    """Frames with stamps that never go back: small jitter of a logger is removed, larger jumps are sorted."""
     stamps = np.array([frame[2] for frame in frames], np.int64)
     latest = np.maximum.accumulate(stamps)
     if int((latest - stamps).max(initial=0)) > STAMP_JITTER_NS:
@@ -155,7 +153,7 @@ def _check_syncs(recording: Recording, plan: Plan) -> None:
     steps = np.diff(recording.sync_stamps)
     if 3 * (twice := np.count_nonzero(steps < STAMP_JITTER_NS)) > len(steps):
         raise UsageError(
-            f"{where} {twice} of {len(recording.syncs)} SYNCs (080h) at once with the one before: was every"
+            f"{where} {twice} of {len(recording.syncs)} SYNCs (080h) have the stamp of the one before: was every"
             " frame logged twice?"
         )
     period = float(np.median(steps))
@@ -166,25 +164,25 @@ def _check_syncs(recording: Recording, plan: Plan) -> None:
         )
 
 
-# The deadlines behind recorded SYNCs: which multiple of the period each was meant for.
+# The deadline of each recorded SYNC, a multiple of the period after the first.
 
 Numbers = NDArray[np.int64]
 _TRIALS = 64
 _EARLIER = 8
-"""By this part of a period at most the phase may be earlier than the one of the least lateness."""
+"""The phase may be earlier than that of the least lateness by a period over this."""
 
 
 def find_deadlines(stamps_ns: Numbers, period_ns: int, block: int | None = None) -> tuple[Numbers, Numbers]:
     """The deadline of each SYNC.
 
-    A SYNC goes out at its deadline or less than a period later, and never two for one deadline. The phase of the
+    A SYNC is sent at its deadline or less than a period later, and one deadline never has two. The phase of the
     deadlines is the one that obeys this with the least lateness; stamps may be a microsecond early.
 
     Args:
-        stamps_ns: when each SYNC went out (n,), ns, increasing, in whole microseconds as candump has them.
+        stamps_ns: when each SYNC was sent (n,), ns, increasing, in whole microseconds as in candump.
         period_ns: of the cycle.
-        block: SYNCs after which the phase is looked for again, where the stamps are another clock's than the
-            producer's and drift against it; None where they are the same clock's.
+        block: number of SYNCs after which the phase is found again, where the clock of the stamps drifts against the
+            producer's; None where they are the same clock.
 
     Returns:
         Number of each deadline (n,), in periods since the first one, strictly increasing; and the deadline itself
@@ -220,8 +218,8 @@ def _phase(stamps_ns: Numbers, period_ns: int) -> int:
 def _earliest(candidates: Numbers, doubled: Numbers, best: int, most_ns: int) -> int:
     """The earliest phase before ``best`` that contradicts no more than it does.
 
-    Where many SYNCs are late the least lateness is found too late: those that were in time before it would then all be
-    a whole period late.
+    Where many SYNCs are late, the phase of the least lateness is too late: the punctual SYNCs before it would all be a
+    whole period late.
     """
     i = int(np.searchsorted(candidates, best))
     while i > 0 and doubled[i - 1] <= doubled[i] and best - candidates[i - 1] <= most_ns:
@@ -230,7 +228,7 @@ def _earliest(candidates: Numbers, doubled: Numbers, best: int, most_ns: int) ->
 
 
 def _doubled(stamps_ns: Numbers, phases: Numbers, period_ns: int) -> Numbers:
-    """By phase (m,), ascending: how many SYNCs had the deadline of the one before, as none lies between the two."""
+    """By phase (m,), ascending: how many SYNCs have the deadline of the one before, as none lies between the two."""
     close = np.flatnonzero(np.diff(stamps_ns) < period_ns)
     first = np.searchsorted(phases, stamps_ns[close] % period_ns, side="right")
     end = np.searchsorted(phases, stamps_ns[close + 1] % period_ns, side="right")
@@ -242,10 +240,10 @@ def _doubled(stamps_ns: Numbers, phases: Numbers, period_ns: int) -> Numbers:
 
 
 def _implausibility(stamps_ns: Numbers, phase: int, period_ns: int) -> tuple[int, float]:
-    """Contradictions of a phase; and the lateness, by its root: many in time and one late, not all a little late.
+    """Contradictions of a phase; and the lateness, by its root: many punctual and one late, not all a little late.
 
-    Two SYNCs at one deadline contradict it, and so does a first SYNC that is nearly a period late, unless it is: for
-    want of one before it nothing else tells an early one from a late one.
+    Two SYNCs at one deadline contradict it, and so does a first SYNC that is nearly a period late: no SYNC before it
+    distinguishes an early one from a late one.
     """
     numbers, lateness = np.divmod(stamps_ns - phase, period_ns)
     steps, waits = np.diff(numbers), np.diff(stamps_ns)

@@ -1,4 +1,4 @@
-"""A recorded run, estimated again from its log alone: candump in, shape out, with a summary of its own."""
+"""A recorded run, estimated again from its log alone: candump in, shape and summary out."""
 
 from __future__ import annotations
 
@@ -16,18 +16,15 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.recorded.cycles import LogCycles, TaskReplay, replay_contacts, replay_task
 from canprobe.recorded.recording import Recording, read_recording
-from canprobe.results.scores import estimate_columns, map_of_scan, summarise_map
+from canprobe.results.scores import estimate_columns, map_of_scan
 from canprobe.results.summary import curvature_text, finite_or_none, shape_lines, summarise_shape
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import LOCKSTEP
+from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.from_plan import estimates_of
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
-from canprobe.touch.consistency import check_consistency
 from canprobe.touch.estimate.fit import METHODS, unknown_method
-
-# What a replay tells: its summary, its text, its estimates as columns.
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -46,56 +43,47 @@ def summarise_replay(
     estimates: dict[str, list[ShapeRecord]],
     folder: Path | None,
 ) -> dict[str, Any]:
-    """The summary of :class:`canprobe.recorded.reestimate.ReplayResult`; what does not apply is None.
+    """The summary of a `ReplayResult`; what does not apply is None.
 
     Args:
         plan: of the scene.
         recording: the log.
-        cycles: what was made of it, iterated to the end.
+        cycles: of the log, iterated to the end.
         task: the comparison with the scene's task.
         tracker: the contacts.
-        unplaced: contacts without the joints of their instant.
+        unplaced: number of contacts without the joints of their instant.
         estimates: by name.
         folder: of the run, for ``truth.npz`` and ``log.npz``; None for a log alone.
     """
     truth = _truth(folder / "truth.npz") if folder is not None else {}
     start_s = cycles.start_ns * 1e-9
+    map_summary = None if plan.scene.shape is None else map_of_scan(tracker, plan.scene.shape.method)[2]
     return {
         "schema": SCHEMA,
         "scene": plan.scene.name,
         "log": str(recording.path),
         "channel": recording.channel,
         "driven_by": "task" if task.drove else "other",
-        "targets": _targets(task, start_s),
+        "targets": {
+            "compared": task.compared,
+            "differing": task.differing,
+            "worst_counts": task.worst_counts,
+            "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
+            "parted_s": None if task.parted_s is None else start_s + task.parted_s,
+        },
         "cycle": _cycle(cycles, recording, unplaced),
         "contacts": len(tracker.samples),
         "estimates": {name: _last(records, start_s) for name, records in estimates.items()},
         "shape": summarise_shape(
-            plan.scene,
-            tracker,
-            estimates,
-            truth,
-            np.array(cycles.sync_times_s),
-            map_summary=_map_summary(plan, tracker),
+            plan.scene, tracker, estimates, truth, np.array(cycles.sync_times_s), map_summary=map_summary
         ),
         "online": _online(folder, tracker.records) if folder is not None and task.drove else None,
     }
 
 
-def _map_summary(plan: Plan, tracker: ShapeTracker) -> dict[str, Any] | None:
-    if plan.scene.shape is None:
-        return None
-    surface_map = map_of_scan(tracker, plan.scene.shape.method)
-    return summarise_map(surface_map, check_consistency(surface_map))
-
-
-def _arrays(path: Path) -> dict[str, Array]:
-    return read_npz(path) if path.is_file() else {}
-
-
 def _truth(path: Path) -> dict[str, Array]:
-    """The plant's truth, one row a SYNC."""
-    columns = _arrays(path)
+    """The plant's truth, one row per SYNC; empty without the file."""
+    columns = read_npz(path) if path.is_file() else {}
     for name in _SCORED if columns else ():
         column = columns.get(name, np.zeros(0))
         if column.dtype.kind != "f" or column.ndim != 2:
@@ -103,16 +91,6 @@ def _truth(path: Path) -> dict[str, Array]:
                 f"{path}: {name}: expected a row of numbers for each SYNC, got {column.dtype} of shape {column.shape}"
             )
     return columns
-
-
-def _targets(task: TaskReplay, start_s: float) -> dict[str, float | None]:
-    return {
-        "compared": task.compared,
-        "differing": task.differing,
-        "worst_counts": task.worst_counts,
-        "lifted_s": None if task.lifted_s is None else start_s + task.lifted_s,
-        "parted_s": None if task.parted_s is None else start_s + task.parted_s,
-    }
 
 
 def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, int]:
@@ -133,7 +111,7 @@ def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, 
 
 
 def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
-    """How many answers an estimator gave, and its last one."""
+    """Number of answers of an estimator, and the last one."""
     if not records:
         return {"count": 0, "t_s": None, "kappa_per_m": None, "observed": None}
     record = records[-1]
@@ -146,8 +124,9 @@ def _last(records: Sequence[ShapeRecord], start_s: float) -> dict[str, Any]:
 
 
 def _online(folder: Path, records: Sequence[ShapeRecord]) -> dict[str, Any] | None:
-    """How far the replayed curvature of the estimator in the loop is from what the run logged, number by number."""
-    logged = _arrays(folder / "log.npz").get("K_per_m")
+    """Difference of the replayed curvature of the estimator in the loop and the logged one, number by number."""
+    path = folder / "log.npz"
+    logged = read_npz(path).get("K_per_m") if path.is_file() else None
     if logged is None:
         return None
     online = _changes(logged[np.isfinite(logged).all(axis=(1, 2))])
@@ -168,7 +147,7 @@ def _changes(K: Array) -> Array:
 
 
 def replay_text(summary: dict[str, Any]) -> str:
-    """A summary as lines for people."""
+    """A summary as text."""
     cycle, targets, online = summary["cycle"], summary["targets"], summary["online"]
     if summary["driven_by"] == "task":
         how = "the scene's task drove: its scan is replayed"
@@ -208,9 +187,6 @@ def _estimate_lines(summary: dict[str, Any]) -> list[str]:
     ]
 
 
-# A recorded run, estimated again from its log alone: candump in, shape out.
-
-
 @dataclass(frozen=True, slots=True)
 class ReplayResult:
     """One replayed log.
@@ -218,12 +194,11 @@ class ReplayResult:
     Attributes:
         plan: of the scene.
         summary: ``schema, scene, log, channel``; ``driven_by`` (``task``: the scene's task made the recorded targets
-            and was stepped again; ``other``: every contact was fed) with the comparison of ``targets``; ``cycle`` (what
-            was missed); ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in ``summary.json``;
-            ``online`` (the difference to what the run logged, None where there is nothing to compare).
-        estimates: what each estimator said, by name; its times, as all those of the summary, are on the log's clock.
-        tracker: the contacts that they were fed, and what the scene's estimator said of them, with times since the
-            first SYNC.
+            and was stepped again; ``other``: every contact was used) with the comparison of ``targets``; ``cycle``
+            (counts of what is missing); ``contacts``; ``estimates`` (the last of each estimator); ``shape`` as in
+            ``summary.json``; ``online`` (the difference to the run's log, None without one).
+        estimates: the answers of each estimator, by name; all times are on the log's clock, as in the summary.
+        tracker: the contacts, and the answers of the scene's estimator, with times since the first SYNC.
     """
 
     plan: Plan
@@ -232,7 +207,7 @@ class ReplayResult:
     tracker: ShapeTracker
 
     def text(self) -> str:
-        """The summary for people."""
+        """The summary as text."""
         return replay_text(self.summary)
 
     def save(self, path: Path | str) -> None:
@@ -248,17 +223,17 @@ def replay(
 ) -> ReplayResult:
     """Estimate the shape again from a recorded bus.
 
-    The log of a run of ours gives the online result once more. In a log of the same nodes under another master, every
-    contact is fed to the estimators. Which of the two was done stands in the summary.
+    The log of a run of canprobe gives the online result again. From a log of the same nodes under another master, every
+    contact is used. The summary states which of the two was done.
 
     Args:
         log: folder of a run, or a candump file.
-        scene: what the nodes are and how the estimators are set; by default the ``scene.toml`` beside the log.
+        scene: describes nodes and estimators; by default the ``scene.toml`` beside the log.
         method: the estimators, one or several; by default the scene's.
 
     Raises:
-        UsageError: no log or scene, an unknown method, a line that is not candump's, a node that was never heard, no
-            SYNC, or no contact at all.
+        UsageError: no log or scene, an unknown method, a line that is not candump's, a node without any TPDO, no SYNC,
+            or no contact.
     """
     path, folder = find_log(Path(log))
     plan = make_plan(resolve(scene_of(path, folder, scene)))
@@ -285,15 +260,8 @@ def replay(
     return ReplayResult(plan, summary, on_clock, tracker)
 
 
-# what to read
-
-
 def find_log(log: Path) -> tuple[Path, Path | None]:
-    """The candump file; and the run's folder where it is one.
-
-    Raises:
-        UsageError: nothing is there, or a folder without a log.
-    """
+    """The candump file, and the run's folder if `log` is one; UsageError where either is missing."""
     if not log.exists():
         raise UsageError(f"{log}: no such folder or file; expected the folder of a run, or a candump file")
     if not log.is_dir():
@@ -305,17 +273,13 @@ def find_log(log: Path) -> tuple[Path, Path | None]:
 
 
 def scene_of(path: Path, folder: Path | None, scene: Scene | str | Path | None) -> Scene:
-    """The scene that was named, or the one beside the log.
-
-    Raises:
-        UsageError: there is neither.
-    """
+    """The given scene, or the one beside the log; UsageError without either."""
     if isinstance(scene, Scene):
         return scene
     if scene is not None:
         return load_scene(scene)
     if folder is None:
-        raise UsageError(f"{path}: a log alone does not tell what its nodes are: name the scene (--scene)")
+        raise UsageError(f"{path}: a log alone does not describe its nodes: name the scene (--scene)")
     if not (folder / "scene.toml").is_file():
         raise UsageError(f"{folder}: no scene.toml in this folder: name the scene (--scene)")
     return load_scene(folder / "scene.toml")

@@ -1,9 +1,9 @@
-"""Columns of a run as a table, and a surface map as a file: each with its units, and back without loss.
+"""Columns of a run as a table (pandas, Parquet), and a surface map as a file, each with its units.
 
-A column of a log may hold a vector or a matrix a row. A table has one number a cell: `q_rad` (n, 6) becomes `q_rad_0` …
-`q_rad_5`, `K_per_m` (n, 2, 2) becomes `K_per_m_0_0` … `K_per_m_1_1`. Which column it was stands in the metadata.
+A column of a log may hold a vector or a matrix per row. A table has one number per cell: `q_rad` (n, 6) becomes
+`q_rad_0` … `q_rad_5`, `K_per_m` (n, 2, 2) becomes `K_per_m_0_0` … `K_per_m_1_1`.
 
-Needs the extra `data` (pandas, pyarrow).
+Tables need the extra `data` (pandas, pyarrow).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import importlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,34 +25,14 @@ from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 if TYPE_CHECKING:
     import pandas
 
-
-# Columns of a run as a table: pandas in memory, Parquet on disk, each with its units, and back without loss.
-
 _UNITS = {
-    "per_m2": "1/m^2",
-    "per_m": "1/m",
-    "permille": "permille",
-    "m_s": "m/s",
-    "rad": "rad",
-    "deg": "deg",
-    "mm": "mm",
-    "hz": "Hz",
-    "ns": "ns",
-    "us": "us",
-    "n": "N",
-    "m": "m",
-    "s": "s",
-}
-_TRUTH_UNITS = {  # the plant's own columns carry no suffix: they are SI
-    "q": "rad",
-    "probe_centre": "m",
-    "force": "N",
-    "depth": "m",
-    "depth_rate": "m/s",
-    "contact_point": "m",
-    "kappa": "1/m",
-    "pad_uv": "m",
-}
+    "per_m2": "1/m^2", "per_m": "1/m", "permille": "permille", "m_s": "m/s", "rad": "rad", "deg": "deg", "mm": "mm",
+    "hz": "Hz", "ns": "ns", "us": "us", "n": "N", "m": "m", "s": "s",
+}  # fmt: skip
+_TRUTH_UNITS = {  # the plant's own columns are SI without a suffix
+    "q": "rad", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
+    "kappa": "1/m", "pad_uv": "m",
+}  # fmt: skip
 _EXTRA = "pip install 'canprobe[data]'"
 _ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet
 
@@ -65,22 +44,11 @@ def unit_of(name: str) -> str:
     return next((unit for suffix, unit in _UNITS.items() if name.endswith(f"_{suffix}")), "1")
 
 
-@dataclass(frozen=True, slots=True)
-class _Cell:
-    """One column of a table: of which array, and where in it."""
-
-    name: str
-    of: str
-    index: tuple[int, ...]
-    shape: tuple[int, ...]
-    values: NDArray[Any]
-
-
 def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | None = None) -> pandas.DataFrame:
     """Columns as a table, by time.
 
     Args:
-        columns: arrays (n,), (n, k) or (n, k, l) with one row a cycle; the suffix of a name is its unit.
+        columns: arrays (n,), (n, k) or (n, k, l), one row per cycle; the suffix of a name is its unit.
         attrs: added to the frame's `attrs`.
 
     Returns:
@@ -89,12 +57,11 @@ def to_frame(columns: Mapping[str, NDArray[Any]], attrs: Mapping[str, Any] | Non
     Raises:
         UsageError: pandas is missing, or columns differ in length.
     """
-    pandas = _need("pandas", "a table")
-    cells = _cells(columns)
-    frame = pandas.DataFrame({cell.name: cell.values for cell in cells})
-    if "t_s" in columns:
+    values, units = _scalars(columns)
+    frame = _need("pandas", "a table").DataFrame(values)
+    if "t_s" in values:
         frame = frame.set_index("t_s")
-    frame.attrs = {**(attrs or {}), "units": {cell.name: unit_of(cell.of) for cell in cells}}
+    frame.attrs = {**(attrs or {}), "units": units}
     return frame
 
 
@@ -107,86 +74,45 @@ def load_table(path: Path | str) -> pandas.DataFrame:
     source = Path(path)
     if source.suffix == ".npz":
         return to_frame(read_npz(source))
-    columns, attrs = _read_parquet(source)
-    return to_frame(columns, {name: value for name, value in attrs.items() if name != "units"})
-
-
-def npz_to_parquet(npz: Path | str, parquet: Path | str, attrs: Mapping[str, Any] | None = None) -> None:
-    """Write a run's `.npz` as Parquet: any tool reads the numbers, and `parquet_to_npz` all of it.
-
-    Raises:
-        UsageError: no such file, or the extra is missing.
-    """
-    write_parquet(read_npz(Path(npz)), parquet, attrs)
-
-
-def parquet_to_npz(parquet: Path | str, npz: Path | str) -> None:
-    """Write a Parquet file of ours as the `.npz` that it came from: same names, shapes, types and bits.
-
-    Raises:
-        UsageError: no such file, not one of ours, or the extra is missing.
-    """
-    columns, _ = _read_parquet(Path(parquet))
-    write_npz(Path(npz), columns)
+    reader, arrow = _need("pandas", "a table"), _need("pyarrow", "Parquet")
+    if not source.exists():
+        raise UsageError(f"{source}: no such file")
+    try:
+        frame: pandas.DataFrame = reader.read_parquet(source, engine="pyarrow")
+    except (OSError, arrow.ArrowException) as error:
+        raise UsageError(f"{source}: expected Parquet: {error}") from error
+    return frame.set_index("t_s") if "t_s" in frame else frame
 
 
 def write_parquet(
     columns: Mapping[str, NDArray[Any]], path: Path | str, attrs: Mapping[str, Any] | None = None
 ) -> None:
-    """Write columns as Parquet; each field's metadata has its unit, and the array and place that it came from.
+    """Write columns as Parquet; the metadata of each field and the `attrs` of pandas have its unit.
 
     Raises:
         UsageError: the extra is missing, or columns differ in length.
         ResultsError: the file cannot be written.
     """
-    arrow = _need("pyarrow", "Parquet")
-    cells = _cells(columns)
-    fields, arrays = [], []
-    for cell in cells:
-        array = arrow.array(cell.values)
-        metadata = {
-            "unit": unit_of(cell.of),
-            "of": cell.of,
-            "index": json.dumps(cell.index),
-            "shape": json.dumps(cell.shape),
-        }
-        fields.append(arrow.field(cell.name, array.type, metadata=metadata))
-        arrays.append(array)
-    units = {cell.name: unit_of(cell.of) for cell in cells}
+    arrow, parquet = _need("pyarrow", "Parquet"), _need("pyarrow.parquet", "Parquet")
+    values, units = _scalars(columns)
+    arrays = {name: arrow.array(column) for name, column in values.items()}
+    fields = [arrow.field(name, array.type, metadata={"unit": units[name]}) for name, array in arrays.items()]
     schema = arrow.schema(fields, metadata={_ATTRS: json.dumps({**(attrs or {}), "units": units})})
-    parquet = _need("pyarrow.parquet", "Parquet")
     with whole_file(Path(path)) as part:
-        parquet.write_table(arrow.Table.from_arrays(arrays, schema=schema), part)
+        parquet.write_table(arrow.Table.from_arrays(list(arrays.values()), schema=schema), part)
 
 
-def _cells(columns: Mapping[str, NDArray[Any]]) -> list[_Cell]:
+def _scalars(columns: Mapping[str, NDArray[Any]]) -> tuple[dict[str, NDArray[Any]], dict[str, str]]:
+    """Columns with one number per row, and their units."""
     lengths = {len(values) for values in columns.values()}
     if len(lengths) > 1:
         raise UsageError(f"columns of {', '.join(map(str, sorted(lengths)))} rows do not make one table")
-    return [
-        _Cell("_".join((name, *map(str, index))), name, index, values.shape[1:], values[(slice(None), *index)])
-        for name, values in columns.items()
-        for index in np.ndindex(*values.shape[1:])
-    ]
-
-
-def _read_parquet(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
-    arrow = _need("pyarrow", "Parquet")
-    if not path.exists():
-        raise UsageError(f"{path}: no such file")
-    try:
-        table = _need("pyarrow.parquet", "Parquet").read_table(path)
-    except (OSError, arrow.ArrowException) as error:
-        raise UsageError(f"{path}: expected Parquet: {error}") from error
-    columns: dict[str, NDArray[Any]] = {}
-    for field in table.schema:
-        if field.metadata is None or b"of" not in field.metadata:
-            raise UsageError(f"{path}: column {field.name} does not say of which array it is: not a file of ours")
-        values = table.column(field.name).to_numpy()
-        name, shape = field.metadata[b"of"].decode(), json.loads(field.metadata[b"shape"])
-        column = columns.setdefault(name, np.empty((len(values), *shape), values.dtype))
-        column[(slice(None), *json.loads(field.metadata[b"index"]))] = values
-    return columns, json.loads((table.schema.metadata or {}).get(_ATTRS, b"{}"))
+    found, units = {}, {}
+    for of, values in columns.items():
+        for index in np.ndindex(*values.shape[1:]):
+            name = "_".join((of, *map(str, index)))
+            found[name], units[name] = values[(slice(None), *index)], unit_of(of)
+    return found, units
 
 
 def _need(module: str, purpose: str) -> Any:
@@ -209,7 +135,7 @@ def _need(module: str, purpose: str) -> Any:
 # ``S_per_m``                (n, 4, 4)   surface matrix in the contact frame, c34 = −½
 # ``K_covariance_per_m2``    (n, 3, 3)   of (K11, K12, K22); NaN, infinite where not observed
 # ``S_covariance_si``        (n, 9, 9)   of (c14, c24, c44, c13, c23, c33, c11, c12, c22): –, –, m, 1/m …
-# ``pose_known``             (n,)        1 where ``S_covariance_si`` tells height and tilt
+# ``pose_known``             (n,)        1 where ``S_covariance_si`` has height and tilt
 # ``observed``               (n, 2)      1 for each principal curvature that was observed
 # ``combinations``           (n, 3, 3)   rows: observed combinations of (K11, √2 K12, K22); NaN beyond the rank
 # ``memory_m``               (n,)        path that the patch rests on
@@ -238,12 +164,7 @@ _COLUMNS = ("format_version", "method", "path_m", *_PER_PATCH)
 
 
 def save_surface_map(surface_map: SurfaceMap, path: str | PathLike[str]) -> None:
-    """Write a map to a file, exactly that file (numpy would append ``.npz`` to a name without it).
-
-    Args:
-        surface_map: the map.
-        path: of the file; an older one is replaced.
-    """
+    """Write a map to exactly this file (numpy would append ``.npz`` to a name without it)."""
     columns: dict[str, NDArray[np.generic]] = {
         "format_version": np.array(FORMAT_VERSION),
         "method": np.array(surface_map.method),
@@ -284,14 +205,9 @@ def load_surface_map(path: str | PathLike[str]) -> SurfaceMap:
         raise UsageError(f"{file}: missing {', '.join(missing)}")
     if unknown := [name for name in columns if name not in _COLUMNS]:
         raise UsageError(f"{file}: unknown {', '.join(unknown)}; expected {', '.join(_COLUMNS)}")
-    method = columns.pop("method")
+    method = columns["method"]
     if method.dtype.kind != "U" or method.shape != ():
         raise UsageError(f"{file}: method: expected a name, got {method.dtype} of shape {method.shape}")
-    _check(file, columns)
-    return _build(file, columns, str(method))
-
-
-def _check(file: Path, columns: dict[str, NDArray[np.generic]]) -> None:
     rows = len(columns["t_s"]) if columns["t_s"].ndim else 0
     wanted = {name: (rows, *shape) for name, (_, shape) in _PER_PATCH.items()}
     wanted["path_m"] = (len(columns["path_m"]) if columns["path_m"].ndim else 0, 3)
@@ -300,15 +216,12 @@ def _check(file: Path, columns: dict[str, NDArray[np.generic]]) -> None:
             raise UsageError(
                 f"{file}: {name}: expected float64 of shape {shape}, got {columns[name].dtype} of {columns[name].shape}"
             )
-
-
-def _build(file: Path, columns: dict[str, NDArray[np.generic]], method: str) -> SurfaceMap:
-    values = {name: column.astype(np.float64) for name, column in columns.items() if name != "format_version"}
+    values = {name: columns[name].astype(np.float64) for name in wanted}
     patches: list[LocalPatch] = []
     try:
         for i in range(len(values["t_s"])):
             patches.append(_patch({field: values[name][i] for name, (field, _) in _PER_PATCH.items()}))
-        return SurfaceMap(patches=tuple(patches), path=values["path_m"], method=method)
+        return SurfaceMap(patches=tuple(patches), path=values["path_m"], method=str(method))
     except UsageError as error:
         raise UsageError(f"{file}: patch {len(patches)}: {error}") from error
 

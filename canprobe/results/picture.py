@@ -2,8 +2,8 @@
 
 A picture is as wide as a page: in a column of 800 pixels, as the README has, its smallest type is 9 pixels high. Its
 title says what is seen and explains marks and shades. A legend stands below what it explains, never among the data.
-The colours are those of Okabe and Ito, which people with any colour vision tell apart; what two of them tell is told by
-a mark, a line style or a place as well.
+The colours are those of Okabe and Ito, which people with any colour vision distinguish; a mark, a line style or a place
+distinguishes them as well.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ def picture(path: Path | str, title: str, height_in: float) -> Iterator[Figure]:
 
 
 def parts(of: Part, rows: int, columns: int, **ratios: Any) -> list[SubFigure]:
-    """Parts of a sheet, row by row, each with a legend of its own."""
+    """Parts of a sheet, row by row, each with its legend."""
     return list(np.asarray(of.subfigures(rows, columns, squeeze=False, **ratios)).flat)
 
 

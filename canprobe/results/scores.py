@@ -12,15 +12,13 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
-from canprobe.touch.consistency import PARTS, Consistency
+from canprobe.touch.consistency import PARTS, Consistency, check_consistency
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.surface_map import LocalPatch, SurfaceMap, merge_patches
 
-# Scores of a run against the plant's truth: contact over the scan, shape after the first 20 mm.
-
 Array = NDArray[np.float64]
 RUN_IN_M = 0.020
-"""Path that an estimator is given before its answers count."""
+"""Path after which the answers of an estimator count."""
 CHECKPOINTS = 12
 
 
@@ -57,21 +55,21 @@ class ShapeScore:
     """Errors of one estimator over a run; None where nothing could be scored.
 
     Attributes:
-        kappa_true: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as part
-            of the curvature was not observed, over all after the run-in, or else over all.
-        kappa_est: mean estimated ones (1/m).
-        kappa_rms: RMS Frobenius norm of K_est − K_true (1/m).
-        kappa_rms_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
+        kappa_true_per_m: mean true principal curvatures (1/m) over the scored estimates; where none could be scored, as
+            part of the curvature was not observed, over all after the run-in, or else over all.
+        kappa_est_per_m: mean estimated ones (1/m).
+        kappa_rms_error_per_m: RMS Frobenius norm of K_est − K_true (1/m).
+        kappa_rms_error_percent: the same relative to the RMS of ‖K_true‖; None on a plane.
         normal_rms_deg, position_rms_mm: of the estimated contact frame.
         estimates: how many were scored.
         observed_fraction: share of the answers after the run-in that observed all curvature.
-        patch_fraction: share of the scored answers of which the contact patch gave a tenth or more.
+        patch_fraction: share of the scored answers to which the contact patch contributed a tenth or more.
     """
 
-    kappa_true: tuple[float, float] | None
-    kappa_est: tuple[float, float] | None
-    kappa_rms: float | None
-    kappa_rms_percent: float | None
+    kappa_true_per_m: tuple[float, float] | None
+    kappa_est_per_m: tuple[float, float] | None
+    kappa_rms_error_per_m: float | None
+    kappa_rms_error_percent: float | None
     normal_rms_deg: float | None
     position_rms_mm: float | None
     estimates: int
@@ -92,7 +90,7 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
     rows = np.searchsorted(sync_times, [r.t_s - 1e-6 for r in seen or late or records])
     if rows.max(initial=0) >= len(truth["kappa"]):
         raise UsageError(
-            f"truth: expected a row a SYNC, {rows.max() + 1} at least, got {len(truth['kappa'])}: another run's?"
+            f"truth: expected one row per SYNC, at least {rows.max() + 1}, got {len(truth['kappa'])}: of another run?"
         )
     kappa_true = _pair(truth["kappa"][rows].mean(axis=0)) if len(rows) else None
     if not seen:
@@ -110,10 +108,10 @@ def score_shape(records: Sequence[ShapeRecord], truth: Mapping[str, Array], sync
         offsets.append(float(np.sum((T[:3, 3] - truth["contact_point"][row]) ** 2)))
     rms, scale = float(np.sqrt(np.mean(errors))), float(np.sqrt(np.mean(norms)))
     return ShapeScore(
-        kappa_true=kappa_true,
-        kappa_est=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
-        kappa_rms=rms,
-        kappa_rms_percent=100 * rms / scale if scale > 1e-9 else None,
+        kappa_true_per_m=kappa_true,
+        kappa_est_per_m=_pair(np.mean([r.estimate.kappa for r in seen], axis=0)),
+        kappa_rms_error_per_m=rms,
+        kappa_rms_error_percent=100 * rms / scale if scale > 1e-9 else None,
         normal_rms_deg=float(np.degrees(np.sqrt(np.mean(tilts)))),
         position_rms_mm=float(np.sqrt(np.mean(offsets)) * 1e3),
         estimates=len(seen),
@@ -134,8 +132,8 @@ def bound_of_scan(
 ) -> float | None:
     """Cramér–Rao bound on the RMS Frobenius error of K (1/m), over the run; None where a window leaves K open.
 
-    For unbiased estimates from the last ``memory_m`` of path with independent noise of the stated size. The mean over
-    ``CHECKPOINTS`` places after the run-in. An estimator that remembers further back may do better.
+    The limit of unbiased estimates from the last ``memory_m`` of path with independent noise of the stated size, the
+    mean over ``CHECKPOINTS`` places after the run-in. An estimator with a longer memory may be better.
 
     Args:
         samples: the contacts of the scan.
@@ -176,34 +174,40 @@ def _pair(values: Array) -> tuple[float, float]:
     return float(values[0]), float(values[1])
 
 
-# The surface map of a scan, and what the summary says of it.
+# The surface map of a scan, and its section of the summary.
 
 SAME_DIRECTION_RAD = math.radians(30.0)
-"""Passes that differ by less than this felt the place alike, hysteresis included."""
+"""Passes whose directions differ by less have the same hysteresis of the array."""
 
 
-def map_of_scan(tracker: ShapeTracker, method: str, start_s: float = 0.0) -> SurfaceMap:
-    """Merge what the estimator in the loop said along a scan.
+def map_of_scan(
+    tracker: ShapeTracker, method: str, start_s: float = 0.0
+) -> tuple[SurfaceMap, Consistency, dict[str, Any]]:
+    """Merge the answers of the estimator in the loop along a scan.
 
     Args:
         tracker: with the answers and the contacts of the scan.
         method: name of the estimator.
-        start_s: when the first SYNC was due, on the run's clock.
+        start_s: deadline of the first SYNC on the run's clock.
+
+    Returns:
+        The map, the tests at its crossings, and its section of ``summary.json``: None without a test.
     """
     patches = [LocalPatch.of(r.estimate, t_s=start_s + r.t_s, travelled_m=r.travelled_m) for r in tracker.records]
     path = np.array([sample.p_base for sample in tracker.samples]).reshape(-1, 3)
-    return merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
-
-
-def summarise_map(surface_map: SurfaceMap, consistency: Consistency) -> dict[str, Any]:
-    """Patches, crossings and their tests for ``summary.json``; None where there was nothing to test."""
-    return {
-        "patches": len(surface_map),
-        "crossings": len(consistency.crossings),
-        "independent_crossings": len(consistency.independent),
-        "consistent": consistency.consistent,
-        **{part: _verdict(consistency, part) for part in PARTS},
-    }
+    surface_map = merge_patches(patches, path[np.isfinite(path).all(axis=1)], method=method)
+    consistency = check_consistency(surface_map)
+    return (
+        surface_map,
+        consistency,
+        {
+            "patches": len(surface_map),
+            "crossings": len(consistency.crossings),
+            "independent_crossings": len(consistency.independent),
+            "consistent": consistency.consistent,
+            **{part: _verdict(consistency, part) for part in PARTS},
+        },
+    )
 
 
 def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
@@ -222,12 +226,13 @@ def _verdict(consistency: Consistency, part: str) -> dict[str, float | None]:
 
 def estimate_columns(records: Sequence[ShapeRecord]) -> dict[str, Array]:
     """Estimates as columns, one row each; the suffix of a name is its unit."""
+    answers = [r.estimate for r in records]
     return {
         "t_s": np.array([r.t_s for r in records]),
         "travelled_m": np.array([r.travelled_m for r in records]),
-        "K_per_m": np.array([r.estimate.K for r in records]).reshape(-1, 2, 2),
-        "K_covariance_per_m2": np.array([r.estimate.covariance for r in records]).reshape(-1, 3, 3),
-        "kappa_per_m": np.array([r.estimate.kappa for r in records]).reshape(-1, 2),
-        "observed": np.array([r.estimate.observed for r in records], bool).reshape(-1, 2),
-        "T_base_contact_m": np.array([r.estimate.T_frame_contact for r in records]).reshape(-1, 4, 4),
+        "K_per_m": np.array([a.K for a in answers]).reshape(-1, 2, 2),
+        "K_covariance_per_m2": np.array([a.covariance for a in answers]).reshape(-1, 3, 3),
+        "kappa_per_m": np.array([a.kappa for a in answers]).reshape(-1, 2),
+        "observed": np.array([a.observed for a in answers], bool).reshape(-1, 2),
+        "T_base_contact_m": np.array([a.T_frame_contact for a in answers]).reshape(-1, 4, 4),
     }

@@ -6,7 +6,7 @@ import contextlib
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -26,7 +26,8 @@ from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibrati
 from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import LOCKSTEP, Session
+from canprobe.session.session import Session
+from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.tasks.task import TaskRecord
 from canprobe.tasks.touch import losses_text, summarise_losses
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     import pandas
 
 
-# A recorded bus set beside the plan of its scene.
+# A recorded bus beside the plan of its scene.
 
 LOG = "bus.log"
 
@@ -45,13 +46,13 @@ LOG = "bus.log"
 def measure_traffic(
     log: Path | str, scene: Scene | Plan, *, channel: str | None = None, exact: bool = True
 ) -> MeasuredTraffic:
-    """Count what was on a bus and set it beside the plan, message by message.
+    """Count the frames of a bus and compare them with the plan, message by message.
 
     Args:
         log: a candump log, or the folder of a run.
         scene: the scene that ran, or its plan.
         channel: of the log; by default that of the scene's first bus, or the only one in the log.
-        exact: count stuff bits too, which takes a few µs a frame.
+        exact: count stuff bits too, which takes a few µs per frame.
 
     Returns:
         Frames and bits (stuff bits included) of every class of messages, their times behind SYNC, and the identifiers
@@ -93,7 +94,7 @@ def _chosen(
     )
 
 
-# What a run leaves behind: the summary, the log, the scene as resolved.
+# The result of a run, its summary and its files.
 
 Array = NDArray[np.float64]
 SCHEMA = 1
@@ -103,18 +104,18 @@ SCHEMA = 1
 class RunResult:
     """One finished run.
 
-    That of :func:`canprobe.open_cell` is there when a controller has ended, and complete when the block is left: until
-    then the drives are not disabled, the bus is not closed, and nothing may be asked of it.
+    That of :func:`canprobe.open_cell` is complete when its block is left: until then the drives are not disabled, the
+    bus is not closed, and reading an attribute raises.
 
     Attributes:
         plan: what was planned.
         summary: the content of ``summary.json``.
-        log: the columns of ``log.npz``, one row a cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
+        log: the columns of ``log.npz``, one row per cycle; the suffix of a name is its unit. ``t_s`` here, in the truth
             and in the estimates counts from the instant that is 0 in ``bus.log``.
-        truth: the plant's true values, one row a SYNC; empty where nothing was emulated.
-        estimates: what each estimator said, by name; the online one first.
+        truth: the plant's true values, one row per SYNC; empty where nothing was emulated.
+        estimates: the answers of each estimator, by name; the online one first.
         taxels: (16, 16) counts of the task's last tactile frame, or None.
-        surface_map: the local patches of the online estimator, or None where no shape was felt.
+        surface_map: the local patches of the online estimator, or None without a shape.
         consistency: the tests at its crossings, or None.
         out: the folder with the files, or None.
     """
@@ -132,23 +133,21 @@ class RunResult:
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Only what is not there is asked for here: before the run is finished, everything."""
+            """Called for missing attributes: all of them before the run is finished."""
             if name not in RunResult.__slots__:
                 raise AttributeError(f"RunResult has no attribute {name!r}")
-            raise UsageError(
-                f"result.{name}: complete when the block of open_cell is left; ask for it behind the block"
-            )
+            raise UsageError(f"result.{name}: complete when the block of open_cell is left; read it after the block")
 
     def text(self) -> str:
-        """The summary for people."""
+        """The summary as text."""
         return summary_text(self.summary, self.out)
 
     def to_pandas(self, what: Literal["log", "truth", "estimates"] = "log") -> pandas.DataFrame:
         """A table of the run, by time; vectors are spread over columns, and `attrs["units"]` has every unit.
 
         Args:
-            what: `log` (a row a cycle), `truth` (a row a SYNC), or `estimates` (a row an answer of the estimator in
-                the loop; see `estimates` for the others).
+            what: `log` (one row per cycle), `truth` (per SYNC), or `estimates` (per answer of the estimator in the
+                loop; the attribute `estimates` has the others).
 
         Raises:
             UsageError: the extra `data` is missing.
@@ -238,11 +237,7 @@ def log_columns(cell: Cell) -> dict[str, Array]:
 
 
 def check_clock(file: Path, log: Mapping[str, Array]) -> None:
-    """Refuse the log of an earlier canprobe, whose times counted from the first SYNC: no cycle is due at 0.
-
-    Raises:
-        UsageError: it is such a log.
-    """
+    """Raise UsageError for the log of an earlier canprobe, whose times count from the first SYNC: it begins at 0."""
     if np.size(log["t_s"]) and log["t_s"][0] == 0.0:
         raise UsageError(
             f"{file}: expected t_s on the clock of bus.log, got times since the first SYNC, as an earlier canprobe"
@@ -251,7 +246,7 @@ def check_clock(file: Path, log: Mapping[str, Array]) -> None:
 
 
 def _without_nan(value: Any) -> Any:
-    """The same for JSON: what is not finite does not apply."""
+    """The value for JSON, null for numbers that are not finite."""
     if isinstance(value, dict):
         return {name: _without_nan(part) for name, part in value.items()}
     if isinstance(value, list | tuple):
@@ -260,9 +255,9 @@ def _without_nan(value: Any) -> Any:
 
 
 def _traffic(session: Session) -> dict[str, Any]:
-    """What was on each bus beside the plan; on a real one counted afterwards, from the log.
+    """The traffic of each bus beside the plan; that of a real one is counted afterwards, from the log.
 
-    Where there is no log, or it ended before the first SYNC, only the bus errors are known.
+    Without a log, or where it ends before the first SYNC, only the bus errors are known.
     """
     if session.meters:
         return {channel: meter.report().as_dict() for channel, meter in session.meters.items()}
@@ -300,9 +295,9 @@ def _contact(session: Session, record: TaskRecord, log: dict[str, Array]) -> dic
 
 
 def _rms_error(values: Array, target: float) -> float | None:
-    """RMS error over the cycles that have a value: one in which the cell held has none."""
-    told = values[np.isfinite(values)]
-    return float(np.sqrt(np.mean((told - target) ** 2))) if len(told) else None
+    """RMS error over the cycles that have a value: a cycle in which the cell held has none."""
+    known = values[np.isfinite(values)]
+    return float(np.sqrt(np.mean((known - target) ** 2))) if len(known) else None
 
 
 def summarise_shape(
@@ -314,13 +309,13 @@ def summarise_shape(
     *,
     map_summary: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The section ``shape`` of ``summary.json``; the first of the estimates is the one that is summed up.
+    """The section ``shape`` of ``summary.json``, of the first estimator and a table of all.
 
     Args:
         scene: of the run.
         tracker: its contacts; None without a shape.
-        estimates: what each estimator said, by name.
-        truth: columns of the plant's truth, one row a SYNC; empty where there is none.
+        estimates: the answers of each estimator, by name.
+        truth: columns of the plant's truth, one row per SYNC; empty without a truth.
         sync_times: time of each SYNC (n,), s, on the clock of the estimates.
         map_summary: of the scan's surface map.
     """
@@ -342,28 +337,14 @@ def summarise_shape(
     if not truth:
         return shape
     scores = {name: score_shape(records, truth, sync_times) for name, records in estimates.items()}
-    score = scores[method]
-    shape |= {
-        "kappa_true_per_m": score.kappa_true,
-        "kappa_est_per_m": score.kappa_est or shape["kappa_est_per_m"],
-        "kappa_rms_error_per_m": score.kappa_rms,
-        "kappa_rms_error_percent": score.kappa_rms_percent,
-        "normal_rms_deg": score.normal_rms_deg,
-        "position_rms_mm": score.position_rms_mm,
-        "patch_fraction": score.patch_fraction,
-        "cramer_rao_ratio": _bound_ratio(scene, tracker, score, truth, sync_times),
-        "methods": {
-            name: {
-                "kappa_rms_error_per_m": s.kappa_rms,
-                "kappa_rms_error_percent": s.kappa_rms_percent,
-                "normal_rms_deg": s.normal_rms_deg,
-                "position_rms_mm": s.position_rms_mm,
-                "estimates": s.estimates,
-                "observed_fraction": s.observed_fraction,
-                "patch_fraction": s.patch_fraction,
-            }
-            for name, s in scores.items()
-        },
+    score = asdict(scores[method])
+    score["kappa_est_per_m"] = score["kappa_est_per_m"] or shape["kappa_est_per_m"]
+    shape |= {name: value for name, value in score.items() if name in names}
+    shape["cramer_rao_ratio"] = _bound_ratio(scene, tracker, scores[method], truth, sync_times)
+    of_run = ("kappa_true_per_m", "kappa_est_per_m")
+    shape["methods"] = {
+        method: {name: value for name, value in asdict(one).items() if name not in of_run}
+        for method, one in scores.items()
     }
     return shape
 
@@ -373,12 +354,12 @@ def _bound_ratio(
 ) -> float | None:
     """Error of the online estimator over the Cramér–Rao bound of one memory at the stated noise.
 
-    None where the contact patch helped most answers: the bound is that of points and normals.
+    None where the contact patch contributed to most answers: the bound is that of points and normals.
     """
     from canprobe.tasks.from_plan import SIGMA_NORMAL_RAD, SIGMA_POINT_M, centroid_coupling
 
     shape = scene.shape
-    if tracker is None or shape is None or score.kappa_rms is None or (score.patch_fraction or 0.0) > 0.5:
+    if tracker is None or shape is None or score.kappa_rms_error_per_m is None or (score.patch_fraction or 0.0) > 0.5:
         return None
     bound = bound_of_scan(
         tracker.samples,
@@ -389,11 +370,11 @@ def _bound_ratio(
         sigma_normal=SIGMA_NORMAL_RAD,
         coupling=centroid_coupling(resolve(scene).probe),
     )
-    return None if bound is None else score.kappa_rms / bound
+    return None if bound is None else score.kappa_rms_error_per_m / bound
 
 
 def finite_or_none(values: Sequence[float] | Array) -> list[float | None]:
-    """Floats for JSON: what is not finite was not observed, and is None."""
+    """Floats for JSON; None for what was not observed, which is not finite."""
     return [float(v) if np.isfinite(v) else None for v in values]
 
 
@@ -419,7 +400,7 @@ def _cycle(cell: Cell, record: TaskRecord) -> dict[str, Any]:
 
 
 def _observed(session: Session) -> dict[str, float | None] | None:
-    """What observers and bridges added to a cycle, after its work; None without any."""
+    """Time that observers and bridges added to a cycle, after its work; None without any."""
     return _percentiles(list(session.observers.cost_ns)) if session.observers is not None else None
 
 
@@ -432,10 +413,10 @@ def _percentiles(values_ns: Sequence[int]) -> dict[str, float | None]:
 
 
 def write_files(result: RunResult, out: Path) -> None:
-    """Write what a run leaves in ``out``, besides the files that are there already and the figures.
+    """Write the files of a run into ``out`` that the session has not written, without the figures.
 
     Raises:
-        ResultsError: one cannot be written; no part of it is left.
+        ResultsError: a file cannot be written; no part of it is left.
     """
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
     write_text(out / "scene.toml", dump_scene(result.plan.scene))
@@ -451,7 +432,7 @@ def _figure(value: float | None, unit: str, digits: int = 2) -> str:
 
 
 def summary_text(summary: dict[str, Any], out: Path | None) -> str:
-    """A summary as lines for people."""
+    """A summary as text."""
     contact, shape, cycle = summary["contact"], summary["shape"], summary["cycle"]
     pace = f"{summary['realtime_factor']:.1f} × real time" if summary["bus"] == LOCKSTEP else "real time"
     rate = "no cycle" if cycle["rate_hz"] is None else f"{cycle['cycles']} at {cycle['rate_hz']:.4g} Hz"
@@ -489,7 +470,7 @@ def summary_text(summary: dict[str, Any], out: Path | None) -> str:
 
 
 def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """What each bridge was given and lost, as lines for people."""
+    """Samples, drops and errors of each bridge, as text."""
     return [
         f"  bridge     {name}: {status['samples']} samples, {status['dropped']} dropped; "
         + (f"failed: {status['error']}" if status["error"] is not None else f"{status['where']}")
@@ -498,7 +479,7 @@ def bridge_lines(bridges: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def curvature_text(values: Sequence[float | None] | None) -> str:
-    """Principal curvatures as people read them, with their unit."""
+    """Principal curvatures as text, with their unit."""
     if values is None:
         return "–"
     observed = ", ".join(f"{v:.2f}" for v in values if v is not None)
@@ -508,7 +489,7 @@ def curvature_text(values: Sequence[float | None] | None) -> str:
 
 
 def shape_lines(shape: dict[str, Any]) -> list[str]:
-    """The section ``shape`` of a summary as lines for people."""
+    """The section ``shape`` of a summary as text."""
     estimated, true = curvature_text(shape["kappa_est_per_m"]), curvature_text(shape["kappa_true_per_m"])
     lines = [f"  curvature  {estimated}; true {true}"]
     for name, score in shape.get("methods", {}).items():

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
-import typing
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,13 +14,10 @@ from numpy.typing import NDArray
 from canprobe.errors import SceneError
 from canprobe.robot.kinematics import tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
-from canprobe.scene.checks import MismatchError, convert
-from canprobe.scene.load import toml_value
+from canprobe.scene.load import Reader, read_toml
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.touch.shapes import PlacedShape
-
-# The geometry that a scene describes, in SI units and the base frame.
 
 Array = NDArray[np.float64]
 
@@ -57,20 +52,14 @@ def true_object(settings: ObjectSettings) -> PlacedShape:
     """The object that a scene describes.
 
     Raises:
-        ValueError: for a matrix that is no surface through the object's origin with z outward.
+        ValueError: for a matrix that describes no surface through the object's origin with z outward.
     """
-    params = {name: _parameter(settings, name) for name in OBJECT_PARAMETERS[settings.kind]}
+    values: dict[str, object] = {"matrix": np.array(settings.matrix), "angle": math.radians(settings.angle_deg or 0.0)}
+    params = {
+        name: values[name] if name in values else getattr(settings, f"{name}_mm") * 1e-3
+        for name in OBJECT_PARAMETERS[settings.kind]
+    }
     return make_object(settings.kind, T_base_object=T_base_object(settings), **params)
-
-
-def _parameter(settings: ObjectSettings, name: str) -> object:
-    """One parameter of the object in SI units."""
-    if name == "matrix":
-        return np.array(settings.matrix)
-    if name == "angle":
-        return math.radians(settings.angle_deg or 0.0)
-    length: float = getattr(settings, f"{name}_mm")
-    return length * 1e-3
 
 
 def T_flange_probe(probe: ProbeSettings) -> Array:
@@ -116,9 +105,9 @@ def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[s
     """The section ``calibration`` of ``summary.json``; None without an estimate."""
     if estimate is None or scene.probe is None:
         return None
-    believed = T_flange_probe(scene.probe)[:3, 3] * 1e3
-    found = estimate.t_flange * 1e3
-    true = _true_tool(scene, believed)
+    believed, found = T_flange_probe(scene.probe)[:3, 3] * 1e3, estimate.t_flange * 1e3
+    emulated = scene.arm is not None and scene.arm.emulated
+    true = believed + np.array((scene.plant or PlantSettings()).tool_error_mm) if emulated else None
     return {
         "touches": estimate.touches,
         "tool_centre_mm": _known(found),
@@ -140,14 +129,6 @@ def summarise_calibration(scene: Scene, estimate: ToolEstimate | None) -> dict[s
 
 def _known(values: Array) -> list[float | None]:
     return [float(value) if np.isfinite(value) else None for value in values]
-
-
-def _true_tool(scene: Scene, believed: Array) -> Array | None:
-    """Where the emulated probe's centre is (3,), mm; None of a real arm."""
-    if scene.arm is None or not scene.arm.emulated:
-        return None
-    true: Array = believed + np.array((scene.plant or PlantSettings()).tool_error_mm)
-    return true
 
 
 def calibration_lines(found: Mapping[str, Any]) -> list[str]:
@@ -192,36 +173,20 @@ def with_tool(scene: Scene, path: Path | str) -> Scene:
         path: ``tool.toml`` of a calibration.
 
     Raises:
-        SceneError: the file cannot be read or is none, or the scene has no probe.
+        SceneError: the file cannot be read or has other content, or the scene has no probe.
     """
-    values = _read(Path(path))
+    document, reader = read_toml(Path(path), str(path)), Reader()
+    table = document.get("probe")
+    if set(document) != {"probe"} or not isinstance(table, dict) or set(table) != set(KEYS):
+        raise SceneError([f"{path}: expected the section [probe] with {' and '.join(KEYS)}, and nothing else"])
+    found = reader.section(ProbeSettings, table, "probe")
+    if reader.problems:
+        raise SceneError([f"{path}: {problem}" for problem in reader.problems])
     if scene.probe is None:
         raise SceneError([f"{path}: scene {scene.name} has no probe that could be calibrated"])
-    probe = replace(scene.probe, **values)
+    probe = replace(scene.probe, **{key: getattr(found, key) for key in KEYS})
     if scene.plant is None or scene.arm is None or not scene.arm.emulated:
         return replace(scene, probe=probe)
     moved = (T_flange_probe(probe) - T_flange_probe(scene.probe))[:3, 3] * 1e3
     x, y, z = (np.array(scene.plant.tool_error_mm) - moved).tolist()
     return replace(scene, probe=probe, plant=replace(scene.plant, tool_error_mm=(x, y, z)))
-
-
-def _read(path: Path) -> dict[str, Any]:
-    try:
-        document = tomllib.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise SceneError([f"{path}: cannot be read: {error.strerror}"]) from error
-    except (ValueError, RecursionError) as error:
-        raise SceneError([f"{path}: not valid TOML: {error}"]) from error
-    table = document.get("probe")
-    if set(document) != {"probe"} or not isinstance(table, dict) or set(table) != set(KEYS):
-        raise SceneError([f"{path}: expected the section [probe] with {' and '.join(KEYS)}, and nothing else"])
-    annotations = typing.get_type_hints(ProbeSettings, include_extras=True)
-    values, problems = {}, []
-    for key in KEYS:
-        try:
-            values[key] = convert(table[key], annotations[key])
-        except MismatchError as mismatch:
-            problems.append(f"{path}: probe.{key}: expected {mismatch}, got {toml_value(table[key])}")
-    if problems:
-        raise SceneError(problems)
-    return values

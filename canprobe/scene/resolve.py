@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (
     ArmSettings,
+    BridgeSettings,
     LimitSettings,
     PlantSettings,
     ProbeSettings,
@@ -29,7 +31,6 @@ from canprobe.scene.setup import (
     Calibrate,
     Drive,
     Dynamics,
-    Floats,
     Free,
     Listen,
     Probe,
@@ -54,8 +55,8 @@ def resolve(scene: Scene) -> Setup:
         scene: as `load_scene` gave it, or changed since.
 
     Raises:
-        UsageError: this is no scene.
-        PlanError: the object that the scene describes is none.
+        UsageError: the argument is not a scene.
+        PlanError: the scene describes an object without a surface.
     """
     need_scene(scene)
     arm = _arm(scene.arm) if scene.arm is not None else None
@@ -74,7 +75,7 @@ def resolve(scene: Scene) -> Setup:
         compute_ns=round(scene.cycle.compute_us * 1000),
         limits=_limits(scene.limits),
         bring_up=scene.bring_up,
-        bridge=scene.bridge,
+        bridge=scene.bridge or BridgeSettings(),
         arm=arm,
         array=array,
         probe=probe,
@@ -133,41 +134,38 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
     assert arm is not None
-    approach = Approach(
-        start=np.array(settings.start_mm) * MM,
-        axes=scan_axes(settings),
-        speed=settings.approach_mm_s * MM,
-        clearance=settings.clearance_mm * MM,
-        search=settings.search_mm * MM,
-    )
     servo = scene.servo or ServoSettings()
+    touching: dict[str, Any] = {
+        "arm": arm,
+        "array": array,
+        "probe": probe,
+        "approach": Approach(
+            start=np.array(settings.start_mm) * MM,
+            axes=scan_axes(settings),
+            speed=settings.approach_mm_s * MM,
+            clearance=settings.clearance_mm * MM,
+            search=settings.search_mm * MM,
+        ),
+        "force": settings.force_n,
+        "duration_s": settings.duration_s,
+        "lag_s": servo.drive_lag_ms * 1e-3,
+    }
     if settings.kind == "calibrate":
         centre, radius = expected_ball(settings)
         tilt, beside = math.radians(settings.tilt_deg), math.radians(settings.beside_deg)
         return Calibrate(
-            arm=arm,
-            array=array,
-            probe=probe,
-            approach=approach,
-            force=settings.force_n,
-            duration_s=settings.duration_s,
-            lag_s=servo.drive_lag_ms * 1e-3,
+            **touching,
             ball_centre=centre,
             ball_radius=radius,
             ball_sigma=settings.ball_sigma_mm * MM,
-            approaches=ball_approaches(settings.touches, tilt, beside, approach.normal),
+            approaches=ball_approaches(settings.touches, tilt, beside, touching["approach"].normal),
         )
+    scanning = settings.kind == "scan"
     return Touch(
-        arm=arm,
-        array=array,
-        probe=probe,
-        approach=approach,
-        force=settings.force_n,
-        duration_s=settings.duration_s,
-        lag_s=servo.drive_lag_ms * 1e-3,
+        **touching,
         gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
-        scan=_scan(settings) if settings.kind == "scan" else None,
-        shape=_shape(scene.shape) if settings.kind == "scan" and scene.shape is not None else None,
+        scan=_scan(settings) if scanning else None,
+        shape=_shape(scene.shape) if scanning and scene.shape is not None else None,
     )
 
 
@@ -192,11 +190,13 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         shape = true_object(scene.object) if scene.object is not None else None
     except ValueError as error:
         raise PlanError([f"object: {error}"]) from error
+    T_flange_there = probe.T_flange_probe.copy()
+    T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
     model = MODELS[plant.arm_model] if plant.arm_model is not None else arm.model if arm is not None else None
     return Truth(
         object=shape,
         model=model if arm is not None else None,
-        T_flange_probe=_displaced(probe.T_flange_probe, np.array(plant.tool_error_mm) * MM),
+        T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or probe.stiffness,
         damping=plant.contact_damping_s_m,
         bandwidth_hz=plant.drive_bandwidth_hz,
@@ -213,10 +213,3 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
         adc_bits=plant.adc_bits,
     )
-
-
-def _displaced(T: Floats, by: Floats) -> Floats:
-    """A frame moved by a vector of the frame that it is expressed in."""
-    moved = T.copy()
-    moved[:3, 3] += by
-    return moved

@@ -16,66 +16,52 @@ from canprobe.scene.checks import MismatchError, convert
 from canprobe.scene.hardware import MOST_JOINTS, JointSettings
 from canprobe.scene.model import TOUCH_KINDS, Scene
 
-_MAY, _DEFAULT = ("may", ""), ("default", "")
-
-SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
-    # section: (need, why). need: "must" be given, "default" when left out, "may" be given, "never"
+_USUALLY = {
+    "arm": ("may", ""),
+    "sensor": ("may", ""),
+    "probe": ("default", ""),
+    "object": ("may", ""),
+    "shape": ("default", ""),
+    "servo": ("default", ""),
+    "plant": ("default", ""),
+    "emulate": ("default", ""),
+}
+_BESIDES = {
     "scan": {
         "arm": ("must", "a scan moves the probe"),
-        "joints": ("must", "a scan moves the probe"),
-        "sensor": ("must", "a scan follows what it feels"),
-        "probe": _DEFAULT,
-        "object": _MAY,
-        "shape": _DEFAULT,
-        "servo": _DEFAULT,
-        "plant": _DEFAULT,
-        "emulate": _DEFAULT,
+        "sensor": ("must", "a scan follows the contact that it measures"),
     },
     "press": {
         "arm": ("must", "a press moves the probe"),
-        "joints": ("must", "a press moves the probe"),
-        "sensor": ("must", "a press holds the force it feels"),
-        "probe": _DEFAULT,
-        "object": _MAY,
+        "sensor": ("must", "a press holds the force that it measures"),
         "shape": ("never", "one touch without motion shows no shape"),
-        "servo": _DEFAULT,
-        "plant": _DEFAULT,
-        "emulate": _DEFAULT,
     },
     "calibrate": {
         "arm": ("must", "a calibration moves the probe"),
-        "joints": ("must", "a calibration moves the probe"),
-        "sensor": ("must", "a calibration feels the ball"),
-        "probe": _DEFAULT,
-        "object": _MAY,
+        "sensor": ("must", "a calibration measures where the ball is touched"),
         "shape": ("never", "the ball's shape is known"),
         "servo": ("never", "no surface is followed"),
-        "plant": _DEFAULT,
-        "emulate": _DEFAULT,
     },
     "listen": {
         "arm": ("never", "listening moves nothing"),
         "joints": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
-        "probe": _DEFAULT,
-        "object": _MAY,
         "shape": ("never", "without motion there is no shape to estimate"),
         "servo": ("never", "listening moves nothing"),
-        "plant": _DEFAULT,
-        "emulate": _DEFAULT,
     },
     "free": {
         "arm": ("must", "free motion moves the arm"),
-        "joints": ("must", "free motion moves the arm"),
-        "sensor": ("never", "free motion feels nothing"),
-        "probe": _MAY,
+        "sensor": ("never", "free motion measures no contact"),
+        "probe": ("may", ""),
         "object": ("never", "free motion touches nothing"),
         "shape": ("never", "without touch there is no shape to estimate"),
         "servo": ("never", "there is no touch to control"),
-        "plant": _DEFAULT,
-        "emulate": _DEFAULT,
     },
 }
+SECTIONS_OF_TASK: Mapping[str, Mapping[str, tuple[str, str]]] = {
+    task: {**_USUALLY, "joints": besides["arm"], **besides} for task, besides in _BESIDES.items()
+}
+"""For each task and section (need, why). Need: "must" be given, "default" when left out, "may" be given, "never"."""
 
 _Complaint = Iterator[tuple[str, str]]
 _RULES: list[tuple[tuple[str, ...], Callable[..., _Complaint]]] = []
@@ -123,7 +109,7 @@ def _duplicate_node(joints: Mapping[str, JointSettings], sensor: int | None) -> 
         node_id = joint.node_id or number
         other = owners.setdefault(node_id, name)
         if other == "sensor":
-            yield "sensor.node_id", f"expected a node id of its own, got {node_id}, which joints.{name} has too"
+            yield "sensor.node_id", f"expected a node id that no joint has, got {node_id}, as joints.{name}"
         elif other != name:
             yield f"joints.{name}.node_id", f"expected node ids all different, got {node_id}, as joints.{other} has"
 
@@ -137,7 +123,7 @@ def _object_missing(kind: str, sensor: bool, obj: object) -> _Complaint:
 @_across("task.kind", "arm.emulated", "sensor.emulated")
 def _half_emulated(kind: str, arm: bool, sensor: bool) -> _Complaint:
     if kind in TOUCH_KINDS and arm and not sensor:
-        why = "a real sensor cannot feel what an emulated arm touches; emulate both, or only the sensor"
+        why = "a real sensor cannot measure what an emulated arm touches; emulate both, or only the sensor"
         yield "sensor.emulated", f"expected true: {why}"
 
 
@@ -239,12 +225,14 @@ def with_values(section: _Section, **values: object) -> _Section:
     Raises:
         UsageError: naming the key, what was expected and what was got.
     """
-    given = {key: value for key, value in values.items() if value is not None}
-    if not given:
-        return section
-    annotations = typing.get_type_hints(type(section), include_extras=True)
-    changes = {key: _checked(key, value, annotations[key]) for key, value in given.items()}
-    return replace(section, **changes)  # type: ignore[type-var]  # a dataclass, as all sections are
+    annotations, changes = typing.get_type_hints(type(section), include_extras=True), {}
+    for key, value in values.items():
+        if value is not None:
+            try:
+                changes[key] = convert(value.item() if isinstance(value, np.generic) else value, annotations[key])
+            except MismatchError as mismatch:
+                raise UsageError(f"{key}: expected {mismatch}, got {value!r}") from None
+    return replace(section, **changes) if changes else section  # type: ignore[type-var]  # a dataclass, as all are
 
 
 def with_choices(scene: Scene, choices: Mapping[str, str]) -> Scene:
@@ -259,10 +247,3 @@ def with_choices(scene: Scene, choices: Mapping[str, str]) -> Scene:
         value = tomllib.loads(f"value = {text}")["value"]
         scene = replace(scene, **{section: replace(getattr(scene, section), **{key: value})})
     return scene
-
-
-def _checked(key: str, value: object, annotation: Any) -> Any:
-    try:
-        return convert(value.item() if isinstance(value, np.generic) else value, annotation)
-    except MismatchError as mismatch:
-        raise UsageError(f"{key}: expected {mismatch}, got {value!r}") from None

@@ -36,15 +36,15 @@ from canprobe.touch.shapes import PlacedShape
 
 Floats = NDArray[np.float64]
 Bus = BusSettings
-BringUp = BringUpSettings
+BringUpTimes = BringUpSettings
 Bridges = BridgeSettings
 ArrayMode = TactileModeName
 Fidelity = Literal["ideal", "dynamic"]
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
-    """One joint drive.
+class Node:
+    """What every node has.
 
     Attributes:
         node_id: 1–126.
@@ -57,6 +57,11 @@ class Drive:
     eds: str
     emulated: bool
     serial: int | None
+
+
+@dataclass(frozen=True, slots=True)
+class Drive(Node):
+    """One joint drive."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,26 +89,18 @@ class Arm:
 
 
 @dataclass(frozen=True, slots=True)
-class Array:
+class Array(Node):
     """The tactile array.
 
     Attributes:
-        node_id: 1–126.
         channel: of its bus; None: the arm's.
-        eds: name or path of its EDS.
-        emulated: served by the emulator.
-        serial: what 1018h:04 must answer; None: anything.
         mode: what it sends.
         window: taxels along the window that follows the contact.
         rate_hz: of its frames.
         full_scale: pressure of a full count, Pa.
     """
 
-    node_id: int
     channel: str | None
-    eds: str
-    emulated: bool
-    serial: int | None
     mode: ArrayMode
     window: int | Auto
     rate_hz: float
@@ -212,15 +209,13 @@ class Scan:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Touch:
-    """Approach, touch, and follow the surface; without a scan hold the force.
+class Touching:
+    """What every task has that touches an object.
 
     Attributes:
         force: target, N.
-        duration_s: of the scan, or of the hold.
+        duration_s: of the scan, or of the hold; of a calibration what the plan reckons with.
         lag_s: of the drives behind a ramp.
-        gains: of the servo's surface.
-        shape: the estimator; None where no shape is estimated.
     """
 
     arm: Arm
@@ -230,32 +225,33 @@ class Touch:
     force: float
     duration_s: float
     lag_s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Touch(Touching):
+    """Approach, touch, and follow the surface; without a scan hold the force.
+
+    Attributes:
+        gains: of the servo's surface.
+        shape: the estimator; None where no shape is estimated.
+    """
+
     gains: SurfaceGains
     scan: Scan | None
     shape: Shape | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Calibrate:
+class Calibrate(Touching):
     """Touch a ball of known radius from several sides to find the probe's centre on the flange.
 
     Attributes:
-        force: of each touch, N.
-        duration_s: the scene's; what the plan reckons with.
-        lag_s: of the drives behind a ramp.
         ball_centre: expected (3,), base frame.
         ball_radius: m.
         ball_sigma: of the expected centre per axis, m.
         approaches: the touches in their order.
     """
 
-    arm: Arm
-    array: Array
-    probe: Probe
-    approach: Approach
-    force: float
-    duration_s: float
-    lag_s: float
     ball_centre: Floats
     ball_radius: float
     ball_sigma: float
@@ -353,7 +349,7 @@ class Setup:
         figures: whether its run is drawn.
         bus: interface, channel, bit rates and what a lockstep bus is like.
         rate_hz: of SYNC and servo.
-        realtime: SCHED_FIFO, a processor of its own, locked memory, on a real interface.
+        realtime: SCHED_FIFO, a reserved processor, locked memory, on a real interface.
         compute_ns: that the plan leaves to the controller in each cycle.
         kind: of the task, as scenes say it.
         truth: what is really there.
@@ -369,8 +365,8 @@ class Setup:
     realtime: bool
     compute_ns: int
     limits: SafetyLimits
-    bring_up: BringUp
-    bridge: Bridges | None
+    bring_up: BringUpTimes
+    bridge: Bridges
     arm: Arm | None
     array: Array | None
     probe: Probe
@@ -381,7 +377,12 @@ class Setup:
     @property
     def touch(self) -> Touch | Calibrate | None:
         """The task, where it touches an object."""
-        return self.task if isinstance(self.task, Touch | Calibrate) else None
+        return self.task if isinstance(self.task, Touching) else None
+
+    @property
+    def scan(self) -> Scan | None:
+        """The path; None where no surface is followed."""
+        return self.task.scan if isinstance(self.task, Touch) else None
 
     @property
     def shape(self) -> Shape | None:
@@ -394,18 +395,7 @@ class Setup:
         nodes = (*(self.arm.drives if self.arm is not None else ()), *((self.array,) if self.array is not None else ()))
         return tuple(sorted(node.node_id for node in nodes if node.emulated))
 
-    def with_bus(self, **values: Any) -> Setup:
-        """With other values of the bus."""
-        return replace(self, bus=replace(self.bus, **values))
-
-    def with_arm(self, **values: Any) -> Setup:
-        """With other values of the arm, in the task too."""
-        assert self.arm is not None and not isinstance(self.task, Listen)
-        arm = replace(self.arm, **values)
-        return replace(self, arm=arm, task=replace(self.task, arm=arm))
-
-    def with_array(self, **values: Any) -> Setup:
-        """With other values of the array, in the task too."""
-        assert self.array is not None and not isinstance(self.task, Free)
-        array = replace(self.array, **values)
-        return replace(self, array=array, task=replace(self.task, array=array))
+    def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
+        """With other values of one part, in the task too."""
+        new = {part: replace(getattr(self, part), **values)}
+        return replace(self, **new, task=replace(self.task, **new) if hasattr(self.task, part) else self.task)

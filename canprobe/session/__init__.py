@@ -5,6 +5,13 @@ opens the buses, starts recording, makes the cell and, where nodes are emulated,
 lockstep bus, in a child (`children`) on a real one. It listens before it starts a child. Left, it stops everything in
 the reverse order: drives disabled, logs flushed, bus closed, children ended, truth kept.
 
-`emulation` serves nodes for other masters, `links` checks how the interfaces are set before anything is sent, `up` is
-what `canprobe up` needs besides. A session holds the `Scene`, because scenes cross processes as text.
+    target      the bus of a run or a command: interface, channels and bit rate, put into a scene by one function
+    links       how the interfaces are set, checked before anything is sent
+    session     one cell from bring-up to safe stop
+    children    the processes beside it: emulated nodes, bridges to other tools
+    up          a cell that is held for days, or whose joints are checked
+    looking     a bus without a cell: scan, node ids, monitor
+    emulation   emulated nodes for other masters
+
+A session holds the `Scene`, because scenes cross processes as text.
 """

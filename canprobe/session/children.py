@@ -22,16 +22,18 @@ from numpy.typing import NDArray
 
 from canprobe.bus.disk import write_text
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame
+from canprobe.cell.controller import Controller
 from canprobe.errors import BusError, NodeError
 from canprobe.planning.bridges import check_bridges
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import HEARTBEAT_BASE
 from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
+from canprobe.tasks.untouched import HoldTask
 
 # The emulated nodes of a run in a process of their own: started, awaited, and ended on every way out.
 
-TOLD_EVERY_S = 10.0
+REPORT_EVERY_S = 10.0
 END_TIMEOUT_S = 10.0
 TRUTH_SHARE = 0.2
 """Time that the nodes may take at their end to work out what was true, over the time that they ran."""
@@ -39,7 +41,7 @@ _PR_SET_PDEATHSIG = 1
 
 
 def end_with_parent(parent: int) -> None:
-    """In the child: be told to stop when the parent is killed. Linux only, and only a second line of defence.
+    """In the child: get SIGTERM when the parent is killed. Linux only, and only a second line of defence.
 
     Args:
         parent: its process id; if it has gone already, this process stops at once.
@@ -53,7 +55,7 @@ def end_with_parent(parent: int) -> None:
 class EmulatorChild:
     """``canprobe emulate`` as a child process.
 
-    It gets a session of its own, so that Ctrl-C reaches only the master, which stops the drives before their process.
+    It runs in another session, so that Ctrl-C reaches only the master, which stops the drives before their process.
 
     Args:
         scene: the resolved scene.
@@ -116,7 +118,7 @@ class EmulatorChild:
 
         Args:
             port: of the nodes' bus.
-            say: is told now and then how long it has taken.
+            say: called every 10 s with how long it has taken.
             hear: gets all that arrives meanwhile: another master may begin, or a node report an error.
 
         Raises:
@@ -128,16 +130,16 @@ class EmulatorChild:
         clock = port.clock
         start = clock.now_ns()
         deadline = start + round(self._scene.bring_up.emulated_s * 1e9)
-        tell = start + round(TOLD_EVERY_S * 1e9)
+        report = start + round(REPORT_EVERY_S * 1e9)
         while waiting:
             now = clock.now_ns()
             if self._process.poll() is not None:
                 raise BusError(self._last_words() or f"the emulated nodes ended with status {self._process.returncode}")
             if now >= deadline:
                 self._raise_late(min(waiting))
-            if now >= tell:
+            if now >= report:
                 say(f"the emulated nodes are still starting, after {(now - start) * 1e-9:.0f} s")
-                tell += round(TOLD_EVERY_S * 1e9)
+                report += round(REPORT_EVERY_S * 1e9)
             port.wait(min(deadline, now + 50_000_000))
             frames = port.drain()
             hear(frames)
@@ -237,12 +239,20 @@ class Bridges:
     ) -> None:
         self.end(None)
 
-    @property
-    def requests(self) -> tuple[Any, ...]:
-        """Where requests of other tools arrive; empty where none are allowed."""
+    def open_to_requests(self, task: Controller | None, make: Callable[[], Controller] | None = None) -> Controller:
+        """The task, which other tools may start, stop and set where the scene allows that.
+
+        Args:
+            task: None holds the arm still.
+            make: makes a new task at every start; None where the task runs once, from the beginning.
+        """
         settings = self._plan.scene.bridge
-        allowed = settings is not None and settings.ros2_commands
-        return tuple(bridge.requests for bridge in self.observers) if allowed else ()
+        if settings is None or not settings.ros2_commands or not self.observers:
+            return task if task is not None else HoldTask()
+        from canprobe.tasks.from_plan import RequestedTask
+
+        requests = tuple(bridge.requests for bridge in self.observers)
+        return RequestedTask(task, make, requests, self._plan.sync.period_ns * 1e-9)
 
     def status(self) -> dict[str, dict[str, Any]] | None:
         """What stands in the summary of each bridge; None without any."""

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import os
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -14,21 +15,20 @@ from canprobe.bus.disk import write_npz
 from canprobe.errors import NodeError, UsageError
 from canprobe.protocol.frames import UNCONFIGURED
 from canprobe.scene.model import Scene
-from canprobe.session.links import Expected, check_links
-from canprobe.session.session import Say, data_bitrate, quiet, rehearse, resolve_scene
+from canprobe.session.links import Expected, check_links, data_bitrate
+from canprobe.session.session import Say, quiet, rehearse, resolve_scene
+from canprobe.session.target import Target
 
 if TYPE_CHECKING:
+    from canprobe.bus.lockstep import Participant
     from canprobe.bus.port import Port
     from canprobe.emulator.node.slave_node import SlaveNode
-    from canprobe.emulator.serve import Participant
 
 
 def emulate(
     scene: Scene,
+    target: Target,
     *,
-    interface: str,
-    channel: str,
-    bitrate: int,
     node_ids: tuple[int, ...],
     seed: int | None = None,
     truth_path: Path | None = None,
@@ -41,7 +41,7 @@ def emulate(
 
     Args:
         scene: whose nodes.
-        interface, channel, bitrate: of the bus.
+        target: the bus.
         node_ids: which nodes.
         seed: in the place of the scene's.
         truth_path: file for the plant's true values, written at the end.
@@ -54,22 +54,20 @@ def emulate(
         UsageError: the scene does not fit, or a file of `store_folder` is not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `truth_path` or `store_folder` cannot be there; told before anything is served.
+        OSError: `truth_path` or `store_folder` cannot be written; raised before anything is served.
     """
     from canprobe.emulator.world import make_world
     from canprobe.planning.make import make_plan
     from canprobe.scene.resolve import resolve
 
     split = scene.sensor is not None and scene.sensor.channel is not None  # then the scene says who is on which bus
-    name = None if split else channel
-    resolved = resolve_scene(scene, interface=interface, channel=name, bitrate=bitrate, seed=seed)
-    plan = make_plan(resolve(resolved))
-    fast = data_bitrate(plan.scene.bus)
+    of_scene = replace(target, channel=scene.bus.channel) if split else target
+    plan = make_plan(resolve(resolve_scene(scene, of_scene, seed=seed)))
+    wanted = Expected(target.bitrate, data_bitrate(plan.setup.bus))
     way_out = "end that node, or name others with --nodes"
     busy = tuple(node_id for node_id in node_ids if node_id not in without_id)
     _make_places(truth_path, store_folder)
-    wanted = Expected(bitrate, fast)
-    with _free_port(interface, channel, wanted, busy, way_out=way_out, say=say) as port:
+    with _free_port(target, wanted, busy, way_out=way_out, say=say) as port:
         rehearse(plan)
         world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
         if world.recorder is not None:
@@ -81,7 +79,7 @@ def emulate(
                 world.nodes,
                 port,
                 say=say,
-                in_realtime=resolved.cycle.realtime,
+                in_realtime=plan.setup.realtime,
                 cycles_kept=plan.cycles if truth_path is not None else 0,
             )
         finally:
@@ -91,10 +89,8 @@ def emulate(
 
 def emulate_eds(
     files: Sequence[tuple[str | Path, int]],
+    target: Target,
     *,
-    interface: str,
-    channel: str,
-    bitrate: int,
     store_folder: Path | None = None,
     serial_numbers: Sequence[int | None] = (),
     in_realtime: bool = False,
@@ -104,11 +100,11 @@ def emulate_eds(
 
     Args:
         files: (name or path of an EDS or DCF file, node id) of each node; 255: it waits for LSS to give it one.
-        interface, channel, bitrate: of the bus.
+        target: the bus.
         store_folder: as for :func:`emulate`.
         serial_numbers: 1018h:04 of each node; None or left out: as its file has it.
         in_realtime: SCHED_FIFO, a processor and locked memory, as far as permitted.
-        say: called with what is odd about the files, and when the nodes are there.
+        say: called with the number of warnings of each file, and when the nodes are served.
 
     Raises:
         EdsError: a file cannot be served; one line a fault.
@@ -116,7 +112,7 @@ def emulate_eds(
             not of its node.
         InterfaceError: no such interface.
         NodeError: somebody on the bus has one of the node ids already.
-        OSError: `store_folder` cannot be there.
+        OSError: `store_folder` cannot be written.
     """
     from canprobe.eds.packaged import check_eds
     from canprobe.emulator.world import make_eds_node
@@ -132,20 +128,20 @@ def emulate_eds(
         nodes.append(make_eds_node(od, node_id, eds=name if speaks_lss else None, serial=serial))
         if warnings := len(reading.warnings):
             check = f"canprobe eds check {name} --node-id {od.node_id}"
-            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` tells them")
+            say(f"{name}: {warnings} warning{'s' * (warnings > 1)}; `{check}` lists them")
     _check_addresses(nodes)
     _make_places(None, store_folder)
-    wanted, way_out = Expected(bitrate, of_scene=False), "end that node, or give another --node-id"
-    with _free_port(interface, channel, wanted, node_ids, way_out=way_out, say=say) as port:
+    wanted, way_out = Expected(target.bitrate, of_scene=False), "end that node, or give another --node-id"
+    with _free_port(target, wanted, node_ids, way_out=way_out, say=say) as port:
         for node in nodes:
             if node.lss is not None:
-                node.lss.bitrate = bitrate
+                node.lss.bitrate = target.bitrate
         _keep(nodes, store_folder)
         _serve(nodes, nodes, port, say=say, in_realtime=in_realtime)
 
 
 def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
-    """Where the files will go: what cannot be written at the end is told at the beginning."""
+    """Make the folders of the files, so that a place that cannot be written fails at the beginning."""
     if store_folder is not None:
         store_folder.mkdir(parents=True, exist_ok=True)
     if truth_path is not None:
@@ -156,18 +152,18 @@ def _make_places(truth_path: Path | None, store_folder: Path | None) -> None:
 
 @contextlib.contextmanager
 def _free_port(
-    interface: str, channel: str, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
+    target: Target, wanted: Expected, node_ids: tuple[int, ...], *, way_out: str, say: Say
 ) -> Iterator[Port]:
     """A port on a bus where nobody has these node ids; it waits for the bus as a device does."""
     from canprobe.bus.interfaces import open_port
     from canprobe.bus.network import answering_nodes
     from canprobe.bus.port import MonotonicClock, Reports
 
-    check_links(interface, {channel: wanted}, say)
+    check_links(target.interface, {target.channel: wanted}, say)
     port = open_port(
-        interface,
-        channel,
-        wanted.bitrate,
+        target.interface,
+        target.channel,
+        target.bitrate,
         MonotonicClock(),
         data_bitrate=wanted.data_bitrate,
         waits=True,
@@ -175,14 +171,14 @@ def _free_port(
     )
     try:
         if busy := answering_nodes(port, node_ids, 0.1):
-            raise NodeError(busy[0], f"is on {channel} already; its id is busy: {way_out}")
+            raise NodeError(busy[0], f"is on {target.channel} already; its id is busy: {way_out}")
         yield port
     finally:
         port.close()
 
 
 def _check_addresses(nodes: Sequence[SlaveNode]) -> None:
-    """Nodes without an id can only be told apart by their LSS addresses."""
+    """Nodes without an id differ only by their LSS addresses."""
     addresses = [node.lss.address for node in nodes if node.lss is not None and node.lss.unconfigured]
     for address in addresses:
         if addresses.count(address) > 1:
@@ -219,7 +215,7 @@ def _named(nodes: Sequence[SlaveNode]) -> str:
 
 
 def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
-    """Let each node keep what a master stores by 1010h in a file of its own."""
+    """Let each node keep what a master stores by 1010h in its file."""
     from canprobe.emulator.serve import keep_in_file
 
     if folder is not None:
@@ -228,7 +224,7 @@ def _keep(nodes: Iterable[SlaveNode], folder: Path | None) -> None:
 
 
 def _file_name(node: SlaveNode) -> str:
-    """By node id; one that has none yet is told by its serial number."""
+    """By node id, or by serial number where the node has no id yet."""
     if node.node_id != UNCONFIGURED:
         return f"node{node.node_id:03}.json"
     return f"serial{node.dictionary.number(0x1018, 4):08x}.json"

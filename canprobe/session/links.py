@@ -1,4 +1,4 @@
-"""How the SocketCAN interfaces of a cell are set, before it is brought up: warnings are said, an error ends it."""
+"""How the SocketCAN interfaces of a cell are set, before it is brought up: warnings and errors."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from canprobe.bus.link import (
 )
 from canprobe.errors import BusError, InterfaceError
 from canprobe.planning.model import Plan
+from canprobe.scene.model import BusSettings
 
 if TYPE_CHECKING:
     from canprobe.bus.port import Port
 
 
-# SocketCAN interfaces and CAN controllers: what is wrong with them is said, or ends what was begun.
+# SocketCAN interfaces and CAN controllers: a wrong setting gives a warning or an error.
 
 SOCKETCAN = "socketcan"
 
@@ -51,8 +52,8 @@ def check_links(
     for channel, expected in channels.items():
         link = read_link(channel)
         if link is None:
-            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not tell it")
-        elif link.is_up:  # else it cannot be opened either, which is told with the line to type
+            say(f"{channel}: its setting is not checked: `ip` of iproute2 does not show it")
+        elif link.is_up:  # else opening it fails, with the line to type
             for remark in check_link(link, expected):
                 if must and remark.is_error:
                     errors.append(f"{channel}: {remark.text}")
@@ -81,7 +82,7 @@ def need_controllers(interface: str, ports: Mapping[str, Port], error: BaseExcep
     troubles: list[str] = []
     for channel, port in ports.items():
         link = (read_link(channel) if interface == SOCKETCAN else None) or LinkState(channel)
-        if link.state is None:  # a virtual one, another interface, or no `ip`: as the last error frame told
+        if link.state is None:  # a virtual one, another interface, or no `ip`: as of the last error frame
             state = port.state
             link = replace(link, state="BUS-OFF" if state is ControllerState.BUS_OFF else f"ERROR-{state.name}")
         if (trouble := controller_trouble(link, typed=interface == SOCKETCAN)) is not None:
@@ -125,16 +126,20 @@ class Expected:
     of_scene: bool = True
 
 
+def data_bitrate(bus: BusSettings) -> int | None:
+    """Bit rate of the data phase of CAN FD frames; None where only classical frames are sent."""
+    return bus.data_bitrate if bus.fd is True else None
+
+
 def expected_of(plan: Plan) -> dict[str, Expected]:
     """What a plan wants of each of its channels.
 
     After a late cycle the frames of two go at once, each SYNC, heartbeat and every RPDO.
     """
     bus = plan.setup.bus
-    fast = bus.data_bitrate if bus.fd is True else None
     rpdos = {(pdo.channel, pdo.cob_id) for pdo in plan.pdos if pdo.direction == "rpdo"}
     numbers = {one.channel: sum(channel == one.channel for channel, _ in rpdos) for one in plan.buses}
-    return {channel: Expected(bus.bitrate, fast, 2 * (number + 2)) for channel, number in numbers.items()}
+    return {channel: Expected(bus.bitrate, data_bitrate(bus), 2 * (number + 2)) for channel, number in numbers.items()}
 
 
 def check_link(link: LinkState, expected: Expected) -> list[Remark]:
@@ -205,7 +210,7 @@ def _state(link: LinkState, _: Expected) -> Iterator[Remark]:
 
 
 def _symptom(link: LinkState) -> str:
-    """By its counters; a driver that does not tell them leaves both open."""
+    """From its counters; a driver without them leaves both causes open."""
     sent, heard = link.tx_errors or 0, link.rx_errors or 0
     unheard = "nobody acknowledges what it sends: nodes without power, another bit rate, a broken wire"
     broken = "frames arrive broken: another bit rate or sample point somewhere, or the termination"

@@ -6,11 +6,10 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
@@ -22,7 +21,6 @@ from canprobe.bus.disk import CandumpWriter, RecordingPort, write_npz, write_tex
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
-from canprobe.cell.assembly import make_cell
 from canprobe.cell.cell import Cell
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.cell.cycle import Observation, Observer, Observers
@@ -35,10 +33,11 @@ from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
 from canprobe.scene.load import dump_scene
-from canprobe.scene.model import BridgeSettings, BusSettings, Scene
+from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
-from canprobe.session.links import check_links, expected_of, need_controllers
+from canprobe.session.links import check_links, data_bitrate, expected_of, need_controllers
+from canprobe.session.target import LOCKSTEP, Target
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
@@ -49,18 +48,16 @@ if TYPE_CHECKING:
 
 
 class TrafficCounter:
-    """Counts frames and bits for the log's writer; bits without stuffing, as `canbusload -i` counts.
+    """Counts frames and bits of a bus in real time; bits without stuffing, as `canbusload -i` counts.
 
     Args:
-        write: of the log.
         speed_up: data bit rate of CAN FD over the nominal one.
 
     Attributes:
         error_frames: bus errors, to be counted by who hears of them.
     """
 
-    def __init__(self, write: Callable[[int, bytes, int], None], speed_up: float = 1.0) -> None:
-        self._write = write
+    def __init__(self, speed_up: float) -> None:
         self._by_length = [0] * 65
         self._speed_up = speed_up
         self.error_frames = 0
@@ -78,14 +75,8 @@ class TrafficCounter:
         return classic + round(sum(count * (bits.nominal + bits.data / self._speed_up) for count, bits in long))
 
     def write(self, can_id: int, data: bytes, t_ns: int) -> None:
-        """Count one frame and pass it on."""
+        """Count one frame."""
         self._by_length[len(data)] += 1
-        self._write(can_id, data, t_ns)
-
-
-def data_bitrate(bus: BusSettings) -> int | None:
-    """Of CAN FD frames, None where the scene has none."""
-    return bus.data_bitrate if bus.fd is True else None
 
 
 @contextmanager
@@ -141,53 +132,41 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
     return timed
 
 
-class Sink:
-    """What a RecordingPort writes to."""
-
-    def __init__(self, write: Callable[[int, bytes, int], None]) -> None:
-        self.write = write
-
-
 # A cell with everything round it: bus, recording, emulated nodes, and the way out of all of them.
 
 Array = NDArray[np.float64]
-LOCKSTEP = "lockstep"
 LEFT_BY_RUNS = (
-    *("bus.blf", "log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
+    *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
     *("surface.png", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
 Say = Callable[[str], None]
-"""Is told each step, in words."""
+"""Called with a line of text for each step."""
 
 
 def quiet(_: str) -> None:
-    """Tell nobody."""
+    """Report nothing."""
 
 
 def resolve_scene(
     scene: Scene,
+    target: Target | None = None,
     *,
-    interface: str | None = None,
-    channel: str | None = None,
-    bitrate: int | None = None,
     seed: int | None = None,
     duration_s: float | None = None,
-    sensor_channel: str | None = None,
     bridge: Sequence[str] = (),
 ) -> Scene:
-    """The scene with what the caller put in the place of its own values; None keeps them, bridges are added.
+    """The scene on another bus, and with what the caller put in the place of its own values; bridges are added.
 
     Raises:
         UsageError: this is no scene, or a value is none that its file could have.
     """
     need_scene(scene)
-    bus = with_values(scene.bus, interface=interface, channel=channel, bitrate=bitrate)
     info = with_values(scene.scene, seed=seed)
     task = with_values(scene.task, duration_s=duration_s)
-    sensor = scene.sensor if scene.sensor is None else with_values(scene.sensor, channel=sensor_channel)
-    return replace(scene, bus=bus, scene=info, task=task, sensor=sensor, bridge=_with_bridges(scene.bridge, bridge))
+    scene = replace(scene, scene=info, task=task, bridge=_with_bridges(scene.bridge, bridge))
+    return scene if target is None else target.applied_to(scene)
 
 
 def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> BridgeSettings | None:
@@ -200,16 +179,6 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
     return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
 
 
-def hush_canopen() -> None:
-    """Keep canopen's warnings off a terminal that asked for no log: errors are raised and said once, by us.
-
-    Where somebody has set up logging, nothing changes.
-    """
-    logger = logging.getLogger("canopen")
-    if not logger.handlers:
-        logger.addHandler(logging.NullHandler())
-
-
 class Session:
     """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
 
@@ -217,13 +186,12 @@ class Session:
         scene: what to bring up, resolved; or the plan of it.
         out: folder for ``bus.log``, ``scene.toml`` and ``truth.npz``; None keeps no files.
         say: called with each step.
-        observers: called after each cycle with what it saw, said and had on the bus.
+        observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
 
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
         unwritten: files that could not be written, each with the reason; they are among the cell's faults too.
-        joins: what of an emulated participant is attached to a lockstep bus: itself, or something round it.
     """
 
     def __init__(
@@ -250,13 +218,18 @@ class Session:
         self._ports: dict[str, Port] = {}
         self.unwritten: list[str] = []
         self._candump: CandumpWriter | None = None
-        self.world: World | None = None
-        self.joins: Callable[[Any], Any] = lambda participant: participant
         self.observers = Observers(observers) if observers else None
         self._say = say
         self._stack = ExitStack()
         self._entered = self._left = False
         self._cell: Cell | None = None
+
+    @cached_property
+    def world(self) -> World:
+        """The emulated nodes and their plant on a lockstep bus; their participants may be replaced until it opens."""
+        from canprobe.emulator.world import make_world
+
+        return make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
 
     @property
     def cell(self) -> Cell:
@@ -291,12 +264,11 @@ class Session:
             raise UsageError("a session is opened once: open another cell with open_cell(scene)")
         self._entered = True
         self.started_ns = elapsed_ns()
-        hush_canopen()
         for warning in self.plan.warnings:
             self._say(f"warning: {warning}")
         try:
             port = self._open()
-            self._cell = make_cell(
+            self._cell = Cell(
                 self.plan,
                 port,
                 say=self._say,
@@ -342,10 +314,10 @@ class Session:
             self.wall_ns = elapsed_ns() - self.started_ns
             self._note_unwritten(self._log_failure())
 
-    def _note_unwritten(self, told: str | None) -> None:
-        if told is not None and self._cell is not None:
-            self.unwritten.append(told)
-            self._note(told)
+    def _note_unwritten(self, failure: str | None) -> None:
+        if failure is not None and self._cell is not None:
+            self.unwritten.append(failure)
+            self._note(failure)
 
     def _note(self, fault: str) -> None:
         if self._cell is not None:
@@ -363,30 +335,28 @@ class Session:
         return self._open_lockstep() if self.scene.bus.interface == LOCKSTEP else self._open_real()
 
     def _writer(self, channel: str) -> Write:
-        write: Write = lambda _id, _data, _t: None  # noqa: E731
+        """What a bus is recorded with: its traffic is counted, written to the log and shown to the observers."""
+        write: Write | None = None
         if self.out is not None:
             if self._candump is None:
                 self.out.mkdir(parents=True, exist_ok=True)  # only now: where no bus opens nothing is left behind
                 self._candump = self._stack.enter_context(CandumpWriter(self.out / "bus.log", channel, self.origin_ns))
                 for name in LEFT_BY_RUNS:
                     (self.out / name).unlink(missing_ok=True)  # of an earlier run
-                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure told
+                with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
                     write_text(self.out / "scene.toml", dump_scene(self.scene))
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns
-            write = self.observers.tap(write)
-        if self.scene.bus.interface == LOCKSTEP:  # on a real bus it is set beside the plan afterwards, from the log
-            return self._metered(channel, write if self.out is not None or self.observers is not None else None)
-        counter = TrafficCounter(write, self.scene.bus.data_bitrate / self.scene.bus.bitrate)
-        self.traffic[channel] = counter
-        return counter.write
-
-    def _metered(self, channel: str, write: Write | None) -> Write:
-        meter = self.traffic[channel] = self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
-        if write is None:
-            return meter.write
-        count, pass_on = meter.write, write
+            write = self.observers.tap(write or (lambda _id, _data, _t: None))
+        if self.scene.bus.interface == LOCKSTEP:
+            self.meters[channel] = TrafficMeter(self.plan, channel, exact=False)
+            self.traffic[channel] = self.meters[channel]
+        else:  # set beside the plan afterwards, from the log
+            self.traffic[channel] = TrafficCounter(self.scene.bus.data_bitrate / self.scene.bus.bitrate)
+        count, pass_on = self.traffic[channel].write, write
+        if pass_on is None:
+            return count
 
         def both(can_id: int, data: bytes, t_ns: int) -> None:
             count(can_id, data, t_ns)
@@ -414,8 +384,6 @@ class Session:
             self.observers.frames_alone(port.clock.now_ns())
 
     def _open_lockstep(self) -> Port:
-        from canprobe.emulator.world import make_world
-
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
@@ -425,17 +393,14 @@ class Session:
             bus.recorder = self._writer(channel)
             bus.error_recorder = self._error_writer(channel)
         self.lockstep = buses[self.plan.buses[0].channel]
-        self.world = make_world(self.plan, self.scene.emulated_node_ids, truth=self.keeps_all)
+        participants = self.world.participants
         self._stack.callback(self._keep_truth)
-        channel_of = {node.node_id: node.channel for node in self.plan.nodes}
-        for node in self.world.nodes:
-            buses[channel_of[node.node_id]].attach(self.joins(node))
-        if self.world.recorder is not None:
-            self.lockstep.attach(self.joins(self.world.recorder))
+        bus_of = {node.node_id: buses[node.channel] for node in self.plan.nodes}
+        for participant in participants:
+            bus_of.get(getattr(participant, "node_id", 0), self.lockstep).attach(participant)
         return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:
-        assert self.world is not None
         if self.world.recorder is not None:
             self.truth = self.world.recorder.arrays()
             if self.out is not None:
@@ -459,7 +424,7 @@ class Session:
         real = self._ports = self._stack.enter_context(
             open_ports(self.plan, clock, lambda channel: Reports(self._error_writer(channel), self._note))
         )
-        return self._join({name: RecordingPort(port, Sink(self._writer(name))) for name, port in real.items()})
+        return self._join({name: RecordingPort(port, self._writer(name)) for name, port in real.items()})
 
     def _get_ready(self, port: Port) -> None:
         """For real time: the emulated nodes in their process, everything done once before, the processor's favour."""

@@ -1,9 +1,9 @@
-"""What `canprobe up` needs beside a session: the first motion of each joint, and what went wrong while it ran."""
+"""`canprobe up`: a cell that is held and supervised for days, or whose joints are checked one after the other."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,58 +13,93 @@ from canprobe.errors import NodeError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
+from canprobe.session.children import Bridges
 from canprobe.session.session import Say, Session, quiet, resolve_scene
+from canprobe.session.target import need_real_bus
+from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
     from canprobe.robot.kinematics import PumaModel
     from canprobe.tasks.untouched import JointFinding, Operator, Vector
 
+ROWS_OF_UP = 4000
+"""Cycles whose rows are kept: `up` runs for days."""
+
+
+def up(scene: Scene, *, bridge: Sequence[str] = (), say: Say = quiet) -> None:
+    """Bring the cell up, hold and supervise it until it is interrupted, then stop it safely.
+
+    Args:
+        scene: on a bus that other processes can reach.
+        bridge: names of bridges to other tools, besides those of the scene.
+        say: called with each step, and with each kind of fault when it is new and once more, counted, at the end.
+
+    Raises:
+        UsageError: the scene does not fit or is on a lockstep bus.
+        BusError, SafetyStop: as :func:`canprobe.run`.
+    """
+    need_real_bus(scene, "up")
+    plan = make_plan(resolve(resolve_scene(scene, bridge=bridge)))
+    with Bridges(plan, None, virtual=False, say=say) as bridges:
+        session = Session(plan, None, say, bridges.observers, ROWS_OF_UP)
+        with reporting_notes(session, say) as report_news:
+            say(f"the cell is up: nodes {', '.join(map(str, plan.node_ids))}; Ctrl-C stops it")
+            session.run(bridges.open_to_requests(None, lambda: make_task(plan)), report_news)
+
+
+@contextlib.contextmanager
+def reporting_notes(session: Session, say: Say) -> Iterator[Callable[[Measurement], None]]:
+    """Open the session; at its end report the faults that did not stop it, each kind with its number.
+
+    Yields:
+        A function to be called after each cycle, which reports each kind when it is new.
+    """
+    said = 0
+
+    def report_news(_: Measurement) -> None:
+        nonlocal said
+        notes = session.cell.notes
+        if len(notes) > said:
+            for line in notes.lines()[said:]:
+                say(f"noted: {line}")
+            said = len(notes)
+
+    try:
+        with session:
+            yield report_news
+    finally:
+        for line in session.cell.faults if session.started else ():
+            say(f"noted: {line}")
+
 
 # `canprobe up --check-joints`: the first motion of an arm, joint by joint, and the pose that its zeros make.
 
-ROWS_KEPT = 4000
 
-
-def check_joints(
-    scene: Scene,
-    *,
-    interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
-    bitrate: int | None = None,
-    operator: Operator | None = None,
-    say: Say = quiet,
-) -> list[JointFinding]:
+def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = quiet) -> list[JointFinding]:
     """Bring the cell up, turn each joint by 1 deg at 2 deg/s and back, and stop it safely.
 
     Args:
         scene: with an arm.
-        interface, channel, sensor_channel, bitrate: in the place of the scene's.
-        operator: asked before and after each motion; None asks nobody.
+        operator: asked before and after each motion; None leaves the questions out.
         say: called with each step and each finding.
 
     Returns:
-        What was found, a joint each; all of them are well.
+        One finding for each joint, all without a fault.
 
     Raises:
         UsageError: the scene does not fit or has no arm.
-        NodeError: a joint is not as it must be; it names all of them.
+        NodeError: a joint has a fault; it names all of them.
         BusError, SafetyStop: as :func:`canprobe.run`.
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.cell.assembly import limits_of
     from canprobe.robot.kinematics import MODELS
     from canprobe.tasks.untouched import JointCheck
 
-    plan = make_plan(
-        resolve(
-            resolve_scene(scene, interface=interface, channel=channel, sensor_channel=sensor_channel, bitrate=bitrate)
-        )
-    )
-    check = JointCheck(MODELS[scene.arm.model], limits_of(plan), plan.sync.period_ns * 1e-9, operator)
+    plan = make_plan(resolve(scene))
+    check = JointCheck(plan, operator)
     try:
-        with Session(plan.scene, None, say, (), ROWS_KEPT) as session:
+        with Session(plan, None, say, (), ROWS_OF_UP) as session:
             session.run(check)
     finally:
         for finding in check.findings:
@@ -89,31 +124,3 @@ def _zero_pose(model: PumaModel, start: Vector) -> str:
         f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
         " that with its marks; where it differs, a zero is wrong"
     )
-
-
-# What goes wrong in a cell that runs for days, told when it first happens and once more, counted, at the end.
-
-
-@contextlib.contextmanager
-def telling_notes(session: Session, say: Say) -> Iterator[Session]:
-    """Open the session; when it is over, tell what went wrong in it and was lived with."""
-    try:
-        with session:
-            yield session
-    finally:
-        for line in session.cell.faults if session.started else ():
-            say(f"noted: {line}")
-
-
-def news_teller(session: Session, say: Say) -> Callable[[Measurement], None]:
-    """A function to be called after each cycle, which tells each kind of note once."""
-    notes, told = session.cell.notes, 0
-
-    def tell(_: Measurement) -> None:
-        nonlocal told
-        if len(notes) > told:
-            for line in notes.lines()[told:]:
-                say(f"noted: {line}")
-            told = len(notes)
-
-    return tell

@@ -1,13 +1,13 @@
-"""Studies: what canprobe reaches, measured, each with a table, CSV, JSON and a picture.
+"""Studies: accuracy, limits, faults and timing of canprobe, each with a table, CSV, JSON and a picture.
 
-`harness` is what a study is, its files and the store of its finished cells; `sweep` runs many independent cells on
-all cores or on a cluster, and takes the rest up again after an interruption. `figure` has what the pictures of
-studies share.
+`canprobe study NAME` imports the module of that name and calls `run(quick=…, sweep=…) → StudyResult`. A study lists its
+cases; the sweep measures each case once, in any process; the study makes rows and findings of the answers, and a
+function that draws them. `--quick` takes fewer cases and repeats. No other room imports a study.
+
+`harness` has the result of a study, its files, and the store of finished cells. `sweep` computes cells on all cores or
+on a cluster, keeps what is finished, and lists the studies.
 
 Estimators: `estimators` (error against run time), `bound` (error and coverage over the Cramér–Rao bound), `pipeline`
 (coverage with the whole sensor). Plant and loop: `workprec`, `workprec_cell`, `stability` with `stability_runs`.
 Robustness: `faults` with `fault_scores`, `faults_vcan`. Real time: `realtime` with `realtime_cases`, `soak`.
-`array_calibration` calibrates the emulated array.
-
-Every study runs as `canprobe study NAME`, with `--quick` for a first look. Nothing in the package imports a study.
 """

@@ -1,11 +1,11 @@
-"""Study `bound`: how near to the Cramér–Rao bound `ml` and `recursive` come, and whether their regions cover.
+"""Study `bound`: errors of `ml` and `recursive` over the Cramér–Rao bound, and the coverage of their 95 % regions.
 
-Each case is a surface, a size, a path, its length and a noise; every seed is one path felt anew and one answer, scored
-on (K11, K12, K22) at its end. Both estimators and the bound have the same prior, weak over the extent of the path; the
-memory of `recursive` is the length of the path, starting from nothing.
+A case is a surface, a size, a path, its length and a noise. A seed draws the noise on the path once; the answer is
+scored on (K11, K12, K22) at its end. Both estimators and the bound have the same prior, weak over the extent of the
+path; the memory of `recursive` is the length of the path.
 
-The bound is a limit of what unbiased estimators can do. Where the true c13, c23, c33 happen to be what the prior takes
-them for (planes, large radii) an estimate with that prior is better than it, and its ratio is below 1.
+The bound is the limit of unbiased estimators. Where the true c13, c23, c33 equal the mean of the prior (planes, large
+radii) an estimate with that prior is better, and its ratio is below 1.
 """
 
 from __future__ import annotations
@@ -22,11 +22,21 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 from canprobe.results.picture import BLUE, INK, ORANGE, SHADE, legend, picture
-from canprobe.studies.harness import SIGMA_COLUMNS, Column, StudyResult, as_json, measuring_facts, sigma_values
+from canprobe.studies.harness import (
+    CHI2_95_OF_3,
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Array,
+    Column,
+    Row,
+    StudyResult,
+    as_json,
+    measuring_facts,
+    sigma_values,
+)
 from canprobe.studies.sweep import Sweep
 from canprobe.touch.estimate.answer import SurfaceEstimate
 from canprobe.touch.estimate.fit import fit_surface
@@ -34,21 +44,19 @@ from canprobe.touch.estimate.likelihood import cramer_rao
 from canprobe.touch.estimate.noise import Prior
 from canprobe.touch.surface import SurfaceMatrix
 
-# The picture of study `bound`.
-
 RATIOS, COVERAGES = (0.0, 2.0), (0.85, 1.0)
-"""What is shown; a case beyond is drawn at the edge."""
+"""Scales of the picture; a case beyond is drawn at the edge."""
 
 
-def draw_bound(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Error over bound, and coverage, of every case: a row of panels a method."""
+def draw_bound(rows: Sequence[Row], path: Path) -> None:
+    """Error over bound, and coverage, of every case: two panels for each method."""
     methods = list(dict.fromkeys(r["method"] for r in rows))
     surfaces = list(dict.fromkeys(r["surface"] for r in rows))
     title = (
         "Error of K over the Cramér–Rao bound, and share of 95 % regions that hold the truth: one mark a case\n"
         "filled: inside the region where a local quadratic bound means something; open: outside\n"
         "on each surface from left to right: 5 mm, 40 mm, 1 m in size, each with more and more noise\n"
-        "shade: as it should be; what is beyond the scale is drawn at its edge"
+        "shade: target; values beyond the scale are drawn at its edge"
     )
     with picture(path, title, 1.3 + 3.3 * len(methods)) as figure:
         grid = figure.subplots(2 * len(methods), 1, squeeze=False, sharex=True)[:, 0]
@@ -65,9 +73,7 @@ def draw_bound(rows: Sequence[dict[str, Any]], path: Path) -> None:
         legend(figure)
 
 
-def _draw(
-    axes: Axes, rows: Sequence[dict[str, Any]], surfaces: Sequence[str], key: str, limits: tuple[float, float]
-) -> None:
+def _draw(axes: Axes, rows: Sequence[Row], surfaces: Sequence[str], key: str, limits: tuple[float, float]) -> None:
     for inside, colour in ((False, ORANGE), (True, BLUE)):
         for path, marker in (("weave", "o"), ("circle", "s")):
             mine = [r for r in rows if r["inside"] == inside and r["path"] == path]
@@ -82,17 +88,16 @@ def _draw(
     axes.grid(visible=False, axis="x")
 
 
-def _place(row: dict[str, Any], surfaces: Sequence[str]) -> float:
+def _place(row: Row, surfaces: Sequence[str]) -> float:
     """Smaller sizes to the left, more noise to the right."""
     size = 0.11 * (np.log10(row["size_mm"]) - 1.85)
     return surfaces.index(row["surface"]) + 2.2 * float(size) + 0.04 * float(np.log2(row["sigma_point_um"] / 20.0))
 
 
-# Exact ground for the estimators: surfaces of any size, paths over them, noise on what is felt.
+# Exact ground for the estimators: surfaces of any size, paths over them, noise on the contacts.
 #
 # Every path ends at the origin of a contact frame (z = inward normal), where the answer is scored.
 
-Array = NDArray[np.float64]
 SURFACES = ("plane", "cylinder", "sphere", "ellipsoid", "saddle", "hyperboloid", "torus")
 PATHS = ("weave", "circle")
 _AXES = {"ellipsoid": (1.6, 1.2, 0.93), "hyperboloid": (1.6, 1.2, 0.93)}
@@ -104,10 +109,6 @@ WAVES, _AMPLITUDE = 1.6, 5.0 / 12.0
 """Waves of a weave, and its amplitude over the length of a wave."""
 _OFF_AXIS = 0.4
 """Turn of the principal directions against the path, rad, so that no entry of K is special."""
-
-
-FROBENIUS = np.array([1.0, 2.0, 1.0])
-"""Weights of (K11², K12², K22²) in ‖K‖²."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -139,10 +140,10 @@ class Ground:
         return points, normals / np.linalg.norm(normals, axis=1, keepdims=True)
 
     def error(self, T_frame_contact: Array, K: Array) -> Array:
-        """(3,) K11, K12, K22 of an estimate less the truth at the place that it speaks of, in its contact frame, 1/m.
+        """(3,) K11, K12, K22 of an estimate less the truth at its contact point, in its contact frame, 1/m.
 
-        An estimate is for the foot of the last *measured* point, which is off by that point's noise; on a tight surface
-        the true curvature differs there by as much as the bound.
+        An estimate holds at the foot of the last *measured* point, which is off by that point's noise; on a tight
+        surface the true curvature differs there by as much as the bound.
         """
         axes = T_frame_contact[:3, :2]
         delta = K - axes.T @ self.tensor(T_frame_contact[:3, 3]) @ axes
@@ -154,7 +155,7 @@ def make_ground(surface: str, size: float, path: str, length: float, samples: in
 
     Args:
         surface: one of `SURFACES`.
-        size: radius, or the length that its radii follow, m; of no effect on a plane.
+        size: radius, or the length that its radii follow, m; without effect on a plane.
         path: one of `PATHS`.
         length: along the path as seen from above, m.
         samples: equally spaced points.
@@ -249,20 +250,18 @@ def _on_torus(tube: float, x: Array, y: Array, length: float) -> Ground:
     return Ground(points @ axes, normals @ axes, SurfaceMatrix.from_curvature(K), length, tensor)
 
 
-# The cases of study `bound`, and the region in which a local quadratic bound means something.
+# The cases, and the region in which a local quadratic bound has a meaning.
 
 SIZES_M, LONGEST_M, SAMPLES = (0.005, 0.04, 1.0), 0.02, 160
 NOISES = ((5e-6, 2e-4), (20e-6, 1e-3), (100e-6, 5e-3))
 LEAST_SIZE = 50.0
-"""A surface's size of K below which its bound is measured by this, 1/m."""
+"""A ‖K‖ below this counts as this, 1/m."""
 REGION: Mapping[str, float] = MappingProxyType(
     {"path": 1.0, "bound": 0.2, "κσ": 5e-3, "cubic": 1.0 / 3.0, "spread": 0.25}
 )
 """Largest path over the radius, bound on an entry of K over its size, κσ_p (turn of the normal over the noise of a
 point, rad), error of the quadric without noise (its prior, and cubic terms of the surface) over the bound, and noise of
 a point over the spread of the points where that is narrowest: beyond, a path is not well excited.
-
-From what a local quadric can mean.
 """
 
 
@@ -302,7 +301,7 @@ def quick_cases() -> Iterator[Case]:
 
 
 def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[str, float]:
-    """What `REGION` limits, of a case."""
+    """The values of a case that `REGION` limits."""
     size = float(np.linalg.norm(ground.K))
     return {
         "path": 0.0 if case.surface == "plane" else case.length / case.size,
@@ -313,24 +312,18 @@ def criteria(case: Case, ground: Ground, C: Array, model_bias: float) -> dict[st
     }
 
 
-def reasons_outside(values: Mapping[str, float]) -> list[str]:
-    """Why a local quadratic bound means little in a case with such `criteria`; empty inside the region."""
-    return [name for name, limit in REGION.items() if not values[name] <= limit * (1.0 + 1e-9)]
-
-
-# From answers to rows of study `bound`: error, bias and coverage over the bound, what is wrong, what is found.
+# From answers to rows: error, bias and coverage over the bound, and the verdict.
 
 METHODS = ("ml", "recursive")
 POOLED_RATIO, CASE_RATIO = {"ml": 1.1, "recursive": 1.25}, {"ml": 1.25, "recursive": 1.4}
 LARGEST_BIAS = 1.0 / 3.0
 """Of K over the bound."""
-CHI2_95_OF_3 = 7.815
 Answer = list[float] | None
-"""Error of K11, K12, K22, its squared length in standard deviations, and the claimed ‖·‖²; None where not observed."""
+"""Error of K11, K12, K22, its squared length in standard deviations, and the stated ‖·‖²; None where not observed."""
 
 
 def answer_of(ground: Ground, estimate: SurfaceEstimate) -> Answer:
-    """What of an estimate is scored."""
+    """The scored figures of an estimate."""
     if estimate.rank < 3:
         return None
     e, C = ground.error(estimate.T_frame_contact, estimate.K), estimate.covariance
@@ -338,7 +331,7 @@ def answer_of(ground: Ground, estimate: SurfaceEstimate) -> Answer:
 
 
 def score(answers: Sequence[Answer], bound: float) -> dict[str, Any]:
-    """Error, claimed error and bias over the bound on ‖K‖ (1/m), coverage, and the share observed."""
+    """Error, stated error and bias over the bound on ‖K‖ (1/m), coverage, and the share observed."""
     seen = np.array([a for a in answers if a is not None])
     if not len(seen):
         return dict.fromkeys(("ratio", "claimed", "bias", "coverage")) | {"observed": 0.0}
@@ -358,11 +351,11 @@ def length(error: Array) -> float:
     return math.sqrt(float(FROBENIUS @ error**2))
 
 
-def verdict(row: dict[str, Any], seeds: int) -> str:
-    """What a row shows: `good`, or what is wrong with it.
+def verdict(row: Row, seeds: int) -> str:
+    """`good`, or the figures of a row that are out of line.
 
-    With few seeds the limits are wider by what that many leave open: three standard deviations of the coverage
-    (where that is more than 5 %), one of the mean error and two of its size (1/√(6n): three entries, sum of squares).
+    With few seeds the limits are wider: by three standard deviations of the coverage (where that is more than 5 %), one
+    of the mean error and two of its size (1/√(6n): three entries, sum of squares).
     """
     if row["ratio"] is None:
         return "not observed" if row["inside"] else "good"
@@ -382,8 +375,8 @@ def verdict(row: dict[str, Any], seeds: int) -> str:
     return ", ".join(wrong) or "good"
 
 
-def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Pooled figures inside the region, what is wrong there, and what is outside."""
+def findings(rows: Sequence[Row]) -> list[str]:
+    """Pooled figures inside the region, the cases out of line there, and the count outside."""
     said = []
     for method in METHODS:
         mine = [r for r in rows if r["method"] == method]
@@ -402,17 +395,15 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     return said
 
 
-def _named(row: dict[str, Any]) -> str:
+def _named(row: Row) -> str:
     return (
         f"{row['surface']} {row['size_mm']:.0f} mm, {row['path']}, {row['sigma_point_um']:.0f} µm "
         f"(error {row['ratio']:.2f}, bias {row['bias']:.2f}, cover {row['coverage']:.3f})"
     )
 
 
-# Study `bound`: how near to the Cramér–Rao bound `ml` and `recursive` come, and whether their regions cover.
-
 SEEDS, BLOCK = 200, 20
-"""Seeds a case, and how many of them make a cell of the sweep."""
+"""Seeds of a case, and how many of them make a cell of the sweep."""
 MODEL = ("touch", "studies/bound.py")
 AT = "at_"
 """Before the names of `criteria` in a row."""
@@ -442,23 +433,15 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
 
 def measure_all(cases: list[Case], seeds: int, sweep: Sweep, *, quick: bool = False) -> StudyResult:
     """The study of some cases with so many seeds each."""
-    rows = measure_rows(cases, range(seeds), sweep)
-
-    def draw(path: Path) -> None:
-        draw_bound(rows, path)
-
-    return StudyResult("bound", COLUMNS, rows, findings(rows), measuring_facts(quick, seeds, MODEL), draw)
-
-
-def measure_rows(cases: list[Case], seeds: range, sweep: Sweep) -> list[dict[str, Any]]:
-    """The table of some cases with these seeds each."""
-    sweep.say(f"{len(cases)} cases, {len(seeds)} seeds each")
-    blocks = [(first, min(BLOCK, seeds.stop - first)) for first in seeds[::BLOCK]]
+    sweep.say(f"{len(cases)} cases, {seeds} seeds each")
+    blocks = [(first, min(BLOCK, seeds - first)) for first in range(0, seeds, BLOCK)]
     cells = [(case, method, *block) for block in blocks for case in cases for method in METHODS]
     answers: dict[tuple[Case, str], list[Answer]] = {(case, method): [] for case in cases for method in METHODS}
     for (case, method, *_), found in zip(cells, sweep.map(measure, cells, model=MODEL), strict=True):
         answers[case, method] += found
-    return [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
+    rows = [row for case in cases for row in _rows(case, {m: answers[case, m] for m in METHODS})]
+    facts = measuring_facts(quick, seeds, MODEL)
+    return StudyResult("bound", COLUMNS, rows, findings(rows), facts, partial(draw_bound, rows))
 
 
 def measure(cell: tuple[Case, str, int, int]) -> list[Answer]:
@@ -476,7 +459,7 @@ def _fitter(case: Case) -> partial[Any]:
     return partial(fit_surface, prior=prior, sigma_point=case.sigma_point, sigma_normal=case.sigma_normal)
 
 
-def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[dict[str, Any]]:
+def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[Row]:
     """One row for each method."""
     ground, fit = case.ground, _fitter(case)
     C = cramer_rao(ground.points, ground.normals, ground.surface, **fit.keywords)
@@ -484,7 +467,7 @@ def _rows(case: Case, answers: dict[str, list[Answer]]) -> Iterator[dict[str, An
     exact = fit(ground.points, ground.normals, quadric=True)
     model_bias = length(ground.error(exact.T_frame_contact, exact.K)) / bound
     values = criteria(case, ground, C, model_bias)
-    why = reasons_outside(values)
+    why = [name for name, limit in REGION.items() if not values[name] <= limit * (1.0 + 1e-9)]
     shared = {
         "surface": case.surface, "path": case.path, "size_mm": case.size * 1e3, "length_mm": case.length * 1e3,
         **sigma_values(case.sigma_point, case.sigma_normal),

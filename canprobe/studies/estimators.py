@@ -1,9 +1,9 @@
 """Study `estimators`: error against run time for every estimator, window, lag and noise.
 
-A probe goes on in a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
-contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (the
-loop's 40 ms), with the garbage collector off, medians over the turns, the first turn left out. They are times of the
-processor: what else the machine does meanwhile hardly counts.
+A probe moves along a weave at 25 mm/s, 200 tactile frames a second; after 60 mm the answer is scored at the last
+contact. Costs are measured apart from errors: all estimators take turns at eight frames and an answer (40 ms of the
+loop), garbage collector off, medians over the turns without the first. They are processor times: other work of the
+machine has little influence.
 """
 
 from __future__ import annotations
@@ -12,17 +12,26 @@ import gc
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from statistics import median
 from time import process_time
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from canprobe.results.picture import INK, METHOD_COLOURS, SHADE, legend, log_scale, picture
-from canprobe.studies.bound import FROBENIUS, Array, Ground, make_ground
-from canprobe.studies.harness import SIGMA_COLUMNS, Column, StudyResult, measuring_facts, sigma_values
+from canprobe.studies.bound import Ground, make_ground
+from canprobe.studies.harness import (
+    FROBENIUS,
+    SIGMA_COLUMNS,
+    Array,
+    Column,
+    Row,
+    StudyResult,
+    measuring_facts,
+    sigma_values,
+)
 from canprobe.studies.sweep import Sweep
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.fit import make_estimator
@@ -73,7 +82,6 @@ class Setting:
             self.method,
             sigma_point=sigma_point,
             sigma_normal=sigma_normal,
-            probe_radius=PROBE_M,
             memory_m=self.window * STEP_M,
             window=self.window,
             lag=self.lag or 10,
@@ -103,11 +111,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
             found = zip(settings(quick), times, zip(*by_seed, strict=True), strict=True)
             rows += [_row(name, ground, noise, *one) for one in found]
     facts = measuring_facts(quick, seeds, MODEL) | {"turns": turns}
-
-    def draw(path: Path) -> None:
-        draw_estimators(rows, path)
-
-    return StudyResult("estimators", COLUMNS, rows, findings(rows), facts, draw)
+    return StudyResult("estimators", COLUMNS, rows, findings(rows), facts, partial(draw_estimators, rows))
 
 
 def on_the_move(surface: str, size: float) -> Ground:
@@ -150,7 +154,9 @@ def measure_costs(cell: tuple[Noise, bool, int]) -> list[list[tuple[float, float
         for sample in samples:
             estimator.add(sample)
     times: list[list[tuple[float, float]]] = [[] for _ in estimators]
-    more = contacts(*_back_and_forth(ground, noise, SHARE * (turns + 1)), first=SAMPLES)
+    points, normals = ground.felt(*noise, np.random.default_rng(100))  # the path again, back from its end
+    back = -2 - np.arange(SHARE * (turns + 1)) % (SAMPLES - 2)
+    more = contacts(points[back], normals[back], first=SAMPLES)
     gc.collect()
     gc.disable()
     try:
@@ -172,13 +178,6 @@ def _timed(estimator: Estimator, block: Sequence[ContactSample]) -> tuple[float,
     return (added - start) / len(block) * 1e6, (process_time() - added) * 1e6
 
 
-def _back_and_forth(ground: Ground, noise: Noise, n: int) -> tuple[Array, Array]:
-    """The path back from its end, felt anew."""
-    points, normals = ground.felt(*noise, np.random.default_rng(100))
-    index = -2 - np.arange(n) % (SAMPLES - 2)
-    return points[index], normals[index]
-
-
 def _row(  # noqa: PLR0917 - one row of a table
     surface: str,
     ground: Ground,
@@ -186,9 +185,9 @@ def _row(  # noqa: PLR0917 - one row of a table
     setting: Setting,
     times: Sequence[tuple[float, float]],
     errors: Sequence[Array | None],
-) -> dict[str, Any]:
+) -> Row:
     size = float(np.linalg.norm(ground.K))
-    # the filter's memory fades, it has no window: it is held against all that it was given
+    # the filter's memory fades, it has no window: its bound is that of all samples
     last = slice(None if setting.method == "recursive" else -setting.window, None)
     C = cramer_rao(
         ground.points[last], ground.normals[last], ground.surface, sigma_point=noise[0], sigma_normal=noise[1]
@@ -214,7 +213,7 @@ def _row(  # noqa: PLR0917 - one row of a table
     }
 
 
-def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
+def findings(rows: Sequence[Row]) -> list[str]:
     """Ratios to `chen1996`, written into the rows, and the sentences that follow from the table."""
     by = {(r["surface"], r["sigma_point_um"], r["method"], r["window_samples"], r["lag_samples"]): r for r in rows}
     for r in rows:
@@ -236,13 +235,11 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     return said
 
 
-# The picture of study `estimators`.
-
 BUDGET_MS = 5.0
 
 
-def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Error over the time of a frame with an answer: a row of panels a surface, a column a noise level."""
+def draw_estimators(rows: Sequence[Row], path: Path) -> None:
+    """Error over the time of a frame with an answer: a row of panels for each surface, a column for each noise."""
     surfaces = list(dict.fromkeys(r["surface"] for r in rows))
     noises = list(dict.fromkeys((r["sigma_point_um"], r["sigma_normal_mrad"]) for r in rows))
     title = (
@@ -263,7 +260,7 @@ def draw_estimators(rows: Sequence[dict[str, Any]], path: Path) -> None:
         legend(figure)
 
 
-def _draw_panel(axes: Axes, rows: Sequence[dict[str, Any]]) -> None:
+def _draw_panel(axes: Axes, rows: Sequence[Row]) -> None:
     ends: list[tuple[float, float, str]] = []
     for method, lag in dict.fromkeys((r["method"], r["lag_samples"]) for r in rows):
         line = [r for r in rows if r["method"] == method and r["lag_samples"] == lag]

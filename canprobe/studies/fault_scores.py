@@ -1,25 +1,24 @@
-"""What a run of the fault campaign may not have done, and who watches it: forces, motion and power after the stop,
-the log.
+"""The score of a run with faults: force, motion and power after the stop, the summary, the log.
 
-The force is judged where the cell presses, as it truly is in the plant and against the limit of the run's own scene
-(`limits.force_max_n`, 3 N here, 5 N by default). Two criteria hold at once, whatever the fault: it may not stay above
-the limit for longer than the reaction to a measured force and the way back take (`force` in the table of conditions,
-and `RELEASE_NS`); and it may never exceed what a probe can reach that nobody controls until the cell reacts.
+The force is judged in runs that press: the true force of the plant against the limit of the scene
+(`limits.force_max_n`, 3 N here, 5 N by default). Two criteria hold for every fault. The force stays above the limit no
+longer than the reaction to a measured force and the way back take (`force` in the table of conditions, and
+`RELEASE_NS`). It never exceeds the peak that the probe can reach until the cell reacts.
 
 The peak of the force.
-Between a fault and the reaction the probe is driven on in one of two ways:
+Between a fault and the reaction the probe moves on in one of these ways:
 
 - blind: without tactile frames the approach goes on, at `approach_speed`, until `sensor_stale` lets the probe retreat;
 - torn: k drives stand still and the others follow their targets, until `drive_silent` stops them. Joint i alone moves
   the probe into the object by cᵢ = n·Jᵢ q̇ᵢ, so that without the set S it sinks in at Σcᵢ − Σ_S cᵢ: at most Σcᵢ and
   the k most negative cᵢ turned round. The greatest of any cycle counts, over the targets of a run without faults.
-- wrong: one drive is given a target that was corrupted. Further away than 607Fh allows it is not followed (reference
-  limit); nearer, the motor i goes that far, ωᵢ T for one cycle, and the probe by n·Jᵢ ωᵢ T.
+- wrong: one drive gets a corrupted target. Beyond what 607Fh allows it does not follow (reference limit); nearer, the
+  motor i moves that far, ωᵢ T for one cycle, and the probe by n·Jᵢ ωᵢ T.
 
-To the first two times belong one cycle until the last target is reached and the drives' lag behind a ramp, 2 ζ/ω. The
+The first two times include one cycle until the last target is reached and the drives' lag behind a ramp, 2 ζ/ω. The
 force grows with the square of the indentation, F = (δ/δ₁)² with δ₁ at 1 N, and may be at its limit at the fault:
 
-    F ≤ (√F_limit + d / δ₁)²,  d the longest of the ways for one fault, their sum for more.
+    F ≤ (√F_limit + d / δ₁)²,  d the longest of these ways for one fault, their sum for more.
 
 The contact's damping adds α δ̇, a hundredth at these speeds, which is left out.
 Source: Hunt and Crossley 1975 for the damping; `canprobe.touch.contact.indentation_from_force` for δ₁.
@@ -36,14 +35,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_candump
-from canprobe.cell.assembly import limits_of
+from canprobe.bus.lockstep import Participant
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.configuration import motor_speed_limit
-from canprobe.cell.controller import Controller
-from canprobe.cell.supervision import Limits
+from canprobe.cell.controller import Controller, Measurement
+from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
-from canprobe.errors import CanprobeError
+from canprobe.errors import CanprobeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.results.summary import summarise
@@ -55,24 +54,23 @@ from canprobe.tasks.probing import Phase
 from canprobe.tasks.task import record_of
 from canprobe.touch.contact import indentation_from_force
 
-# What a run of the fault campaign may not have done: forces, motion and power after the stop, the log.
-
-Vector = NDArray[np.float64]
 RELEASE_NS = 100_000_000
 """Time that the retreat has, from its command, to bring the force below the limit."""
 AT_REST_RAD = 2e-4
+LONGEST_S = 15.0
+"""Virtual time after which a run hangs: nominal runs take two seconds, every time-out in them less than ten."""
 
 
 @dataclass(frozen=True, slots=True)
 class Peak:
-    """What a probe can reach until the cell reacts.
+    """How deep a probe can sink in until the cell reacts.
 
     Attributes:
         force_limit: N.
         depth_at_1n: m.
-        blind: how far the probe sinks in without the sensor, m.
-        torn: how far it does with 0, 1, 2, … drives standing still, m.
-        wrong: how far it does by one wrong target, m.
+        blind: depth without the sensor, m.
+        torn: depth with 0, 1, 2, … drives that stand still, m.
+        wrong: depth by one wrong target, m.
     """
 
     force_limit: float
@@ -82,7 +80,7 @@ class Peak:
     wrong: float = 0.0
 
     def force(self, faults: int, wrong_targets: bool = False) -> float:
-        """The highest force of a run with so many faults, N; with frames to drives corrupted, or not."""
+        """The highest force of a run with so many faults, N; `wrong_targets`: frames to drives are corrupted."""
         torn = self.torn[min(faults, len(self.torn) - 1)]
         ways = (self.blind, torn, self.wrong if wrong_targets else 0.0)
         sinks = max(ways) if faults < 2 else sum(ways)
@@ -90,16 +88,15 @@ class Peak:
 
 
 def peak_of(session: Session) -> Peak | None:
-    """Of a run without faults that is over; None where nothing presses."""
+    """The peak of a scenario, from a finished run without faults; None where nothing presses."""
     scene, limits = session.scene, limits_of(session.plan)
     if scene.arm is None or scene.object is None or scene.probe is None:
         return None
     lag_s = limits.period_ns * 1e-9 + (scene.servo or ServoSettings()).drive_lag_ms * 1e-3
-    blind_s, torn_s = (_within(key)(limits) * 1e-9 + lag_s for key in ("sensor_stale", "drive_silent"))
-    assert session.world is not None
+    blind_s, torn_s = (reaction_ns(key, limits) * 1e-9 + lag_s for key in ("sensor_stale", "drive_silent"))
     kappa = session.world.plant.truth()["kappa"]
     return Peak(
-        limits.force_max,
+        limits.safety.force_max,
         indentation_from_force(1.0, scene.probe.stiffness_n_m3, scene.probe.radius_mm * 1e-3, kappa),
         scene.task.approach_mm_s * 1e-3 * blind_s,
         tuple((_torn_speeds(session) * torn_s).tolist()),
@@ -108,7 +105,7 @@ def peak_of(session: Session) -> Peak | None:
 
 
 def _wrong_reach(session: Session) -> float:
-    """How far (m) the probe sinks in where one motor goes as far in a cycle as its drive lets it."""
+    """How far (m) the probe sinks in where one motor moves as far in a cycle as its drive allows."""
     scene, period_ns = session.scene, session.plan.sync.period_ns
     assert scene.arm is not None and scene.probe is not None
     model, share = MODELS[scene.arm.model], scene.limits.joint_speed_share
@@ -119,8 +116,8 @@ def _wrong_reach(session: Session) -> float:
     return float(np.abs(T[:3, 2] @ J[:3] @ model.joints_per_count * counts).max())
 
 
-def _torn_speeds(session: Session) -> Vector:
-    """Greatest speeds (7,), m/s, at which the probe sinks in while 0…6 joints stand still and the others go on."""
+def _torn_speeds(session: Session) -> NDArray[np.float64]:
+    """Greatest speeds (7,), m/s, at which the probe sinks in while 0…6 joints stand still and the others move."""
     scene = session.scene
     assert scene.arm is not None and scene.probe is not None
     model, flange_probe = MODELS[scene.arm.model], T_flange_probe(scene.probe)
@@ -137,32 +134,39 @@ def _torn_speeds(session: Session) -> Vector:
     return greatest
 
 
-def _within(key: str) -> Callable[[Limits], int]:
+def reaction_ns(key: str, limits: Limits) -> int:
+    """Time to the reaction to a condition of the supervision, ns."""
     within = BY_KEY[key].within
     assert within is not None
-    return within
+    return within(limits)
+
+
+def longest_above(rows: Sequence[tuple[int, float]], limit: float) -> int:
+    """Longest time without a break for which the force of (t_ns, force) rows is above the limit, ns."""
+    longest = 0
+    since: int | None = None
+    for t_ns, force in rows:
+        if force <= limit:
+            since = None
+            continue
+        since = t_ns if since is None else since
+        longest = max(longest, t_ns - since)
+    return longest
 
 
 def score_force(
     rows: Sequence[tuple[int, float]], limits: Limits, bound_n: float | None
 ) -> tuple[float, int, list[str]]:
-    """Highest force, N; longest time above the limit, ns; failures. Without a bound nothing can fail."""
-    longest = 0
-    since: int | None = None
-    for t_ns, force in rows:
-        if force <= limits.force_max:
-            since = None
-            continue
-        since = t_ns if since is None else since
-        longest = max(longest, t_ns - since)
+    """Highest force, N; longest time above the limit, ns; failures, which need a bound."""
+    longest = longest_above(rows, limits.safety.force_max)
     highest = max((force for _, force in rows), default=0.0)
     if bound_n is None:
         return highest, longest, []
     failures = []
-    if longest > _within("force")(limits) + RELEASE_NS:
+    if longest > reaction_ns("force", limits) + RELEASE_NS:
         failures.append(f"force above the limit for {longest * 1e-6:.0f} ms, up to {highest:.2f} N")
     if highest > bound_n:
-        failures.append(f"force of {highest:.2f} N, at most {bound_n:.2f} N are possible until the cell reacts")
+        failures.append(f"force of {highest:.2f} N, expected at most {bound_n:.2f} N until the cell reacts")
     return highest, longest, failures
 
 
@@ -178,18 +182,18 @@ def score_rest(moved_rad: float, nodes: Sequence[SlaveNode]) -> list[str]:
 
 
 def score_summary(session: Session, task: Controller, reason: str) -> list[str]:
-    """What came of the run can be summed up and written down, whatever happened in it."""
+    """A summary of the run can be made and written, whatever happened in it."""
     if not session.started:
         return []
     try:
         json.dumps(summarise(session, record_of(task), {}, reason or None), allow_nan=False)
-    except Exception as error:  # whatever it is, a user would have lost the run's summary by it
+    except Exception as error:  # of any kind: a user would have lost the summary of the run
         return [f"summary: {type(error).__name__}: {error}"]
     return []
 
 
 def score_log(session: Session, steps: int) -> list[str]:
-    """Every cycle has its row; where frames are written down, every one that was on the bus is in the file."""
+    """Every cycle has its row in the log; every frame of the bus is in `bus.log`, where one is written."""
     failures = []
     if session.opened and (rows := len(session.cell.log)) < steps:
         failures.append(f"log: {rows} rows of {steps} cycles")
@@ -203,38 +207,15 @@ def score_log(session: Session, steps: int) -> list[str]:
     return failures if lines == frames else [*failures, f"log: {lines} lines of {frames} frames"]
 
 
-# Who looks at the plant of a fault campaign's run, and who stands in for those that are not needed in it.
-
-LONGEST_S = 15.0
-"""Virtual time after which a run hangs: nominal runs take two seconds, every time-out in them less than ten."""
+# A run to its end, and the witness of it.
 
 
 class HangError(Exception):
-    """The run did not come to its end."""
+    """The run did not end."""
 
 
-class Silent:
-    """In the place of a participant that is not needed."""
-
-    name = "silent"
-    next_deadline_ns: int | None = None
-    listens: frozenset[int] = frozenset()
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing to say."""
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """Nothing to hear."""
-        return ()
-
-    def advance(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing to do."""
-        return ()
-
-
-class Witness(Silent):
-    """Looks at the plant every so often, also where the master sends no SYNC any more.
+class Witness(Participant):
+    """A participant of the bus that looks at the plant periodically, also when the master sends no SYNC any more.
 
     Args:
         plant: of the run.
@@ -244,7 +225,8 @@ class Witness(Silent):
         rows: (t_ns, force in N) of each look.
     """
 
-    name = "witness"
+    listens = frozenset[int]()
+    next_deadline_ns: int | None = None
 
     def __init__(self, plant: Plant, period_ns: int) -> None:
         self.rows: list[tuple[int, float]] = []
@@ -257,5 +239,23 @@ class Witness(Silent):
         self._plant.advance(t_ns)
         self.rows.append((t_ns, float(self._plant.truth()["force"])))
         if t_ns > LONGEST_S * 1e9:
-            raise HangError(f"not at its end after {LONGEST_S:g} s")
+            raise HangError(f"no end after {LONGEST_S:g} s")
         return ()
+
+
+def run_to_end(
+    session: Session, task: Controller, progress: Callable[[Measurement], None] = lambda _: None
+) -> tuple[str, Exception | None]:
+    """Bring the cell up and run its task; the outcome in words, and the exception that ended the run."""
+    try:
+        with session:
+            session.run(task, progress=progress)
+    except SafetyStop as stop:
+        return "stopped for safety", stop
+    except CanprobeError as error:
+        return ("bus or node failure" if session.opened else "bring-up refused"), error
+    except HangError as hang:
+        return "hang", hang
+    except Exception as error:  # of any kind: it is a failure of ours, and the study continues
+        return "crash", error
+    return "completed", None

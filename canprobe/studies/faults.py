@@ -1,10 +1,10 @@
 """Study `faults`: ten thousand short touches in lockstep, each with faults drawn from its seed, each scored.
 
-A run is a press or a short scan over emulated nodes that drop, delay, double, corrupt and swap frames, fall mute or
+A run is a press or a short scan over emulated nodes that drop, delay, double, corrupt and swap frames, become mute or
 deaf, reboot, freeze, babble or send wrong data, at random times in bring-up, approach, scan, retreat and stop. It fails
-where the true force stays above the limit for longer than the reaction may take, where anything moves or is powered
-after the stop, where it does not end, where the log is not whole, or where anything but a plain error comes out.
-`canprobe study faults --seed N` carries out one run again and tells what happens in it.
+where the true force stays above the limit for longer than the reaction may take, where anything moves or has power
+after the stop, where it does not end, where the log is incomplete, or where it raises anything but an error of
+canprobe. `canprobe study faults --seed N` carries out one run again and prints what happens in it.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from __future__ import annotations
 import tempfile
 import traceback
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from random import Random
 from types import MappingProxyType
@@ -23,12 +23,10 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from canprobe.bus.port import VirtualClock
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.controller import Measurement
+from canprobe.cell.supervision import limits_of
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
-from canprobe.emulator.node.slave_node import SlaveNode
-from canprobe.errors import CanprobeError, SafetyStop
+from canprobe.errors import CanprobeError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, ORANGE, legend, log_scale, parts, picture
@@ -37,22 +35,21 @@ from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session
 from canprobe.studies.fault_scores import (
-    HangError,
     Peak,
-    Silent,
     Witness,
     peak_of,
+    run_to_end,
     score_force,
     score_log,
     score_rest,
     score_summary,
 )
-from canprobe.studies.harness import Column, Say, StudyResult, measuring_facts
+from canprobe.studies.harness import Column, Row, Say, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.probing import Phase
 
-# The scenes of the fault campaign: each as short as it can be with all its phases, planned once in a process.
+# The scenes: each as short as it can be with all its phases, planned once in a process.
 
 FORCE_MAX_N = 3.0
 _CLEARANCE_MM = 0.3
@@ -64,11 +61,11 @@ class Scenario:
 
     Attributes:
         share: of the runs.
-        scene: packaged scene that it is made of.
+        scene: packaged scene that it is derived from.
         rate_hz: of SYNC and sensor.
         duration_s: of the task itself.
-        mode: of the sensor; None where the scene has none.
-        speed_share: of the joints' speed limits, enough for the task: beyond it a drive takes a target for wrong.
+        mode: of the sensor; None where the scene has no sensor.
+        speed_share: of the joints' speed limits, enough for the task: a drive refuses faster targets.
     """
 
     share: float
@@ -88,12 +85,12 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
         "cylinder": Scenario(0.15, "cylinder", 200.0, 0.2, "window", 0.35),
     }
 )
-"""A lower rate than 400 Hz makes a run cheaper and the cell slower to react: reaction times are counted in cycles."""
+"""A lower rate than 400 Hz makes a run cheaper and the reactions slower: their times are counted in cycles."""
 
 
 @cache
 def scenario_scene(name: str, timed: bool) -> Scene:
-    """The scene of a scenario; on a bus where frames take their time, or none at all."""
+    """The scene of a scenario; `timed`: frames take time on the bus."""
     scenario = SCENARIOS[name]
     scene = load_scene(scenario.scene)
     task = replace(scene.task, duration_s=scenario.duration_s, clearance_mm=_CLEARANCE_MM)
@@ -113,7 +110,7 @@ def scenario_scene(name: str, timed: bool) -> Scene:
 
 @cache
 def scenario_plan(name: str, timed: bool) -> Plan:
-    """Its plan: the same for all seeds."""
+    """The plan of a scenario, the same for all seeds."""
     return make_plan(resolve(scenario_scene(name, timed)))
 
 
@@ -125,20 +122,18 @@ def seeded_plan(name: str, timed: bool, seed: int) -> Plan:
     return replace(plan, setup=replace(setup, scene=scene, seed=seed))
 
 
-# The picture of the fault campaign: what came of each kind of fault, and the true force over all runs.
-
 COLOURS = {
     "completed": (GREEN, ""),
     "stopped for safety": (AMBER, "//"),
     "bus or node failure": (BLUE, "\\\\"),
     "bring-up refused": (GREY, "xx"),
 }
-"""Colour and hatch."""
+"""Colour and hatch of each outcome; the others, `hang` and `crash`, are failures."""
 BIN_N, FEW = 0.05, 20
 
 
 def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw to ``path``."""
+    """How the runs with each kind of fault ended, and the true force over all runs."""
     failed = sum(bool(one["failures"]) for one in runs)
     title = f"{len(runs)} runs with random faults of nodes and links, {failed} failed; in brackets: runs with the fault"
     of_kind = {kind.value: [one["outcome"] for one in runs if kind.value in one["kinds"]] for kind in FaultKind}
@@ -171,11 +166,11 @@ def draw_faults(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
 
 
 def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Draw how long the master took to end, by what happened to it, to ``path``."""
+    """How long the master took to end, by what happened on vcan0."""
     kinds = list(dict.fromkeys(row["fault"] for row in rows))
     with picture(path, "How long the master took to end, by what happened on vcan0", 1.6 + 0.25 * len(kinds)) as figure:
         axes = figure.subplots()
-        for colour, mark, label, failed in ((BLUE, "o", "as it should be", False), (ORANGE, "X", "failed", True)):
+        for colour, mark, label, failed in ((BLUE, "o", "no failure", False), (ORANGE, "X", "failed", True)):
             some = [row for row in rows if bool(row["failures"]) == failed]
             places = [kinds.index(row["fault"]) for row in some]
             axes.plot([row["ended_s"] for row in some], places, mark, color=colour, label=label)
@@ -184,21 +179,21 @@ def draw_ends(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
         legend(figure)
 
 
-# What a seed of the fault campaign stands for: a scenario, and one to three faults at random times in its phases.
+# The case of a seed: a scenario, and one to three faults at random times in its phases.
 
 PHASES = ("bring-up", "approach", "scan", "retreat", "stop")
-"""`listen` knows no approach and no retreat, `free` no retreat; what it has before its motion is the enabling."""
+"""`listen` has no approach and no retreat, `free` no retreat; the approach of `free` is the enabling."""
 FILES_EVERY = 8
-"""One run in so many writes its frames down, and is scored on that."""
+"""One run in so many writes its log, and is scored on that."""
 SENSOR_SHARE = 0.3
 Windows = Mapping[str, tuple[int, int]]
 """Phase → when it begins and ends in a run without faults, ns."""
 _KINDS = tuple(FaultKind)
 _BOTH_WAYS = (FaultKind.DROP, FaultKind.DELAY, FaultKind.DUPLICATE, FaultKind.CORRUPT)
-"""A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; one that is corrupted here stands for
-what goes wrong behind it: in a controller's memory, a driver, a gateway."""
+"""A frame that the wire corrupts is dropped for its CRC-15, all but one in 10¹⁰; a frame that is corrupted here stands
+for errors behind it: in a controller's memory, a driver, a gateway."""
 _NEED_TIME = (FaultKind.BABBLE, FaultKind.DELAY, FaultKind.REORDER)
-"""Kinds whose effect is that of frames in each other's way, or of their order."""
+"""Kinds that act by the time that frames take on the bus, or by their order."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,8 +205,8 @@ class FaultCase:
         scenario: one of `SCENARIOS`.
         phase: in which the first fault begins.
         faults: what happens.
-        timed: frames take their time on the wire.
-        files: the frames are written down.
+        timed: frames take time on the bus.
+        files: the run writes its log.
     """
 
     seed: int
@@ -220,28 +215,6 @@ class FaultCase:
     faults: tuple[Fault, ...]
     timed: bool = False
     files: bool = True
-
-
-def draw_case_within(seed: int, windows_of: Callable[[str, bool], Windows]) -> FaultCase:
-    """The case of a seed.
-
-    Args:
-        seed: which.
-        windows_of: the windows of a scenario, timed or not.
-    """
-    rng = Random(f"fault campaign {seed}")
-    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
-    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
-    known = tuple(windows_of(scenario, True))
-    phases = [rng.choice(known) for _ in range(number)]
-    kinds = [rng.choice(_KINDS) for _ in range(number)]
-    # an untimed bus configures all nodes at one instant: no fault could begin within it
-    timed = "bring-up" in phases or any(kind in _NEED_TIME for kind in kinds) or rng.random() < 0.1
-    windows = windows_of(scenario, timed)
-    nodes = scenario_plan(scenario, timed).node_ids
-    drawn = zip(kinds, phases, strict=True)
-    faults = tuple(_draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
-    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
 
 
 def _draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tuple[int, int]) -> Fault:
@@ -258,54 +231,64 @@ def _draw_fault(rng: Random, kind: FaultKind, nodes: tuple[int, ...], window: tu
     )
 
 
-# One run of the fault campaign: drawn from a seed, carried out in lockstep, watched by a witness, and scored.
+# One run: drawn from a seed, carried out in lockstep, watched by a witness, and scored.
 
 AFTER_S = 0.3
-"""Time after the end of the run, and of its last fault, for which nothing may move."""
+"""Time after the end of the run, and of its last fault, in which nothing may move."""
 SETTLED_S = 0.1
 """Time after which everything must be at rest."""
 LOOK_NS = 5_000_000
 BRING_UP_NS = 100_000_000
 """Before the first SYNC: reset, configuration and start; before that the master only listens."""
 STOP_NS = 20_000_000
-"""Faults may begin for so long after the end too: on an untimed bus the nodes are let go at once."""
+"""Faults may begin for so long after the end too: an untimed bus stops all nodes at one instant."""
 
 
 @cache
 def phase_windows(scenario: str, timed: bool) -> Windows:
-    """When each phase that a scenario has begins and ends in a run without faults, ns."""
-    run = _Run(FaultCase(0, scenario, "", (), timed, files=False)).result(None)
-    first, begun, end = run["first_sync_ns"], run["begun"], run["end_ns"]
-    task = begun.get(Phase.SETTLE, begun[Phase.SCAN])
+    """When each phase of a scenario begins and ends in a run without faults, ns."""
+    run = _Run(FaultCase(0, scenario, "", (), timed, files=False))
+    cycle, begun = run.session.cell.cycle, run.begun
+    assert cycle is not None
+    first, task = cycle.t_first_ns, begun.get(Phase.SETTLE, begun[Phase.SCAN])
     marks: dict[str, int | None] = {
         "bring-up": first - BRING_UP_NS,
-        "approach": first if task - first > 2 * run["period_ns"] else None,
+        "approach": first if task - first > 2 * run.plan.sync.period_ns else None,
         "scan": task,
         "retreat": begun.get(Phase.RETREAT),
         "stop": begun[Phase.DONE],
     }
     there = [(name, t_ns) for name in PHASES if (t_ns := marks[name]) is not None]
-    ends = [t_ns for _, t_ns in there[1:]] + [end + STOP_NS]
+    ends = [t_ns for _, t_ns in there[1:]] + [run.end_ns + STOP_NS]
     return {name: (t_ns, end_ns) for (name, t_ns), end_ns in zip(there, ends, strict=True)}
 
 
 @cache
 def peak(scenario: str) -> Peak | None:
-    """What the probe of a scenario can reach until the cell reacts; None where nothing presses."""
-    run = _Run(FaultCase(0, scenario, "", (), timed=False, files=False))
-    run.result(None)
-    return peak_of(run.session)
+    """How deep the probe of a scenario can sink in until the cell reacts; None where nothing presses."""
+    return peak_of(_Run(FaultCase(0, scenario, "", (), timed=False, files=False)).session)
 
 
 def draw_case(seed: int) -> FaultCase:
     """The case of a seed."""
-    return draw_case_within(seed, phase_windows)
+    rng = Random(f"fault campaign {seed}")
+    (scenario,) = rng.choices(tuple(SCENARIOS), [scenario.share for scenario in SCENARIOS.values()])
+    number = rng.choice((1, 1, 1, 1, 1, 1, 2, 2, 3))
+    known = tuple(phase_windows(scenario, True))
+    phases = [rng.choice(known) for _ in range(number)]
+    kinds = [rng.choice(_KINDS) for _ in range(number)]
+    # an untimed bus configures all nodes at one instant: no fault could begin within it
+    timed = "bring-up" in phases or any(kind in _NEED_TIME for kind in kinds) or rng.random() < 0.1
+    windows = phase_windows(scenario, timed)
+    nodes = scenario_plan(scenario, timed).node_ids
+    drawn = zip(kinds, phases, strict=True)
+    faults = tuple(_draw_fault(rng, kind, nodes, windows[phase]) for kind, phase in drawn)
+    return FaultCase(seed, scenario, phases[0], faults, timed, seed % FILES_EVERY == 0)
 
 
 def run_seed(seed: int) -> dict[str, Any]:
     """Draw, carry out and score the case of a seed."""
     case = draw_case(seed)
-    run = carry_out(case)
     return {
         "seed": seed,
         "scenario": case.scenario,
@@ -313,20 +296,12 @@ def run_seed(seed: int) -> dict[str, Any]:
         "phase": case.phase,
         "kinds": sorted({fault.kind.value for fault in case.faults}),
         "faults": [str(fault) for fault in case.faults],
-        "hits": run["hits"],
-        "outcome": run["outcome"],
-        "reason": run["reason"],
-        "force_max_n": run["force_max_n"],
-        "force_bound_n": run["force_bound_n"],
-        "above_ms": run["above_ns"] * 1e-6,
-        "moved_rad": run["moved_rad"],
-        "end_s": run["end_ns"] * 1e-9,
-        "failures": run["failures"],
+        **carry_out(case),
     }
 
 
 def carry_out(case: FaultCase) -> dict[str, Any]:
-    """Run a case to its end and a while beyond it; what came of it, with every failure in words."""
+    """Run a case to its end and a while beyond it; its outcome, its figures, and every failure in words."""
     reach = peak(case.scenario)
     wrong = any(fault.incoming and fault.kind is FaultKind.CORRUPT for fault in case.faults)
     bound = reach.force(len(case.faults), wrong) if reach is not None else None
@@ -337,90 +312,37 @@ def carry_out(case: FaultCase) -> dict[str, Any]:
 
 
 class _Run:
-    """One case being carried out."""
+    """One case, carried out.
+
+    Attributes:
+        begun: when each phase of the task began, ns.
+        end_ns: when the session was closed.
+    """
 
     def __init__(self, case: FaultCase, folder: Path | None = None) -> None:
         self.case = case
         self.plan = seeded_plan(case.scenario, case.timed, case.seed)
         self.session = Session(self.plan, folder)
-        self.session.joins = self._join
         self.task = make_task(self.plan)
-        self.limits = limits_of(self.plan)
-        self.emulated: list[SlaveNode] = []
-        self.nodes: list[FaultyNode] = []
-        self.witness: Witness | None = None
-        self.failures: list[str] = []
-        self.steps = self.stepped_ns = 0
         self.begun: dict[Phase, int] = {}
-
-    def _join(self, participant: Any) -> Any:
-        if not hasattr(participant, "node_id"):
-            return Silent()  # the witness sees what the recorder of the truth would, and more
-        self.emulated.append(participant)
-        if self.witness is None:
-            self._watch()
-        if all(fault.node_id != participant.node_id for fault in self.case.faults):
-            return participant
-        sensor = self.session.scene.sensor
-        ids: Sequence[int] = ()
-        if sensor is not None and participant.node_id == sensor.node_id:
-            ids = [pdo.cob_id for pdo in self.plan.pdos_of(sensor.node_id, "tpdo")]
-        node = FaultyNode(participant, self.case.faults, ids)
-        self.nodes.append(node)
-        return node
-
-    def _watch(self) -> None:
-        session = self.session
-        assert session.world is not None and session.lockstep is not None
-        self.witness = Witness(session.world.plant, LOOK_NS)
-        session.lockstep.attach(self.witness)
-        if session.out is None:
-            session.lockstep.recorder = None  # nothing is counted that nobody looks at
-
-    def result(self, bound_n: float | None) -> dict[str, Any]:
-        """Carry it out; without a bound (N) the force is not scored."""
-        outcome, reason = self._drive()
-        session = self.session
-        assert session.world is not None and session.lockstep is not None and self.witness is not None
-        clock = session.lockstep.clock
-        end_ns = clock.now_ns()
-        session.lockstep.recorder = None  # the log is closed
-        self.failures += score_log(session, self.steps) + score_summary(session, self.task, reason)
-        moved = self._rest(clock, end_ns) if outcome != "hang" else 0.0
-        force_max, above_ns, failures = score_force(self.witness.rows, self.limits, bound_n)
-        self.failures += failures
-        return {
-            "outcome": outcome,
-            "reason": reason,
-            "hits": sum(node.hits for node in self.nodes),
-            "force_max_n": force_max,
-            "force_bound_n": bound_n,
-            "above_ns": above_ns,
-            "moved_rad": moved,
-            "end_ns": end_ns,
-            "failures": self.failures,
-            "period_ns": self.limits.period_ns,
-            "begun": self.begun,
-            "first_sync_ns": session.cell.cycle.t_first_ns if session.opened and session.cell.cycle else None,
-        }
-
-    def _drive(self) -> tuple[str, str]:
-        try:
-            with self.session:
-                self.session.run(self.task, progress=self._count)
-        except SafetyStop as stop:
-            return "stopped for safety", str(stop)
-        except CanprobeError as error:
-            return ("bus or node failure" if self.session.opened else "bring-up refused"), str(error)
-        except HangError as hang:
-            self.failures.append(f"hang: {hang}")
-            return "hang", str(hang)
-        except Exception as error:  # whatever else it is, it is a failure of ours, and the campaign goes on
-            place = traceback.extract_tb(error.__traceback__)[-1]
-            self.failures.append(f"crash: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno})")
-            return "crash", str(error)
-        self.begun.setdefault(Phase.DONE, self.stepped_ns)
-        return "completed", ""
+        self.steps = self.stepped_ns = 0
+        world, sensor = self.session.world, self.plan.scene.sensor
+        self.witness = Witness(world.plant, LOOK_NS)
+        self.faulty: dict[int, FaultyNode] = {}
+        for node in world.nodes:
+            if all(fault.node_id != node.node_id for fault in case.faults):
+                continue
+            of_sensor = sensor is not None and node.node_id == sensor.node_id
+            ids = [pdo.cob_id for pdo in self.plan.pdos_of(node.node_id, "tpdo")] if of_sensor else ()
+            self.faulty[node.node_id] = FaultyNode(node, case.faults, ids)
+        # the witness sees what the recorder of the truth would, and more
+        world.participants[:] = [self.witness, *(self.faulty.get(node.node_id, node) for node in world.nodes)]
+        self.outcome, self.error = run_to_end(self.session, self.task, self._count)
+        assert self.session.lockstep is not None
+        self.clock = self.session.lockstep.clock
+        self.end_ns = self.clock.now_ns()
+        if self.outcome == "completed":
+            self.begun.setdefault(Phase.DONE, self.stepped_ns)
 
     def _count(self, _: Measurement) -> None:
         assert self.session.lockstep is not None
@@ -428,34 +350,58 @@ class _Run:
         self.stepped_ns = self.session.lockstep.clock.now_ns()
         self.begun.setdefault(getattr(self.task, "phase", Phase.SCAN), self.stepped_ns)
 
-    def _rest(self, clock: VirtualClock, end_ns: int) -> float:
-        """Let time go on without a master; how far a joint moves once everything must be at rest (rad)."""
-        assert self.session.world is not None
-        if self.session.scene.arm is None:
-            return 0.0
-        plant = self.session.world.plant
-        over_ns = max(end_ns, *(fault.end_ns for fault in self.case.faults), 0)
+    def result(self, bound_n: float | None) -> dict[str, Any]:
+        """The score; without a bound (N) the force is not judged."""
+        session, reason, failures = self.session, str(self.error or ""), []
+        assert session.lockstep is not None
+        session.lockstep.recorder = None  # the log is closed
+        if self.outcome == "hang":
+            failures.append(f"hang: {reason}")
+        elif self.outcome == "crash":
+            assert self.error is not None
+            place = traceback.extract_tb(self.error.__traceback__)[-1]
+            where = f"{Path(place.filename).name}:{place.lineno}"
+            failures.append(f"crash: {type(self.error).__name__}: {self.error} ({where})")
+        failures += score_log(session, self.steps) + score_summary(session, self.task, reason)
+        moved = 0.0
+        if self.outcome != "hang" and session.scene.arm is not None:
+            moved, found = self._rest()
+            failures += found
+        force_max, above_ns, found = score_force(self.witness.rows, limits_of(self.plan), bound_n)
+        return {
+            "hits": sum(node.hits for node in self.faulty.values()),
+            "outcome": self.outcome,
+            "reason": reason,
+            "force_max_n": force_max,
+            "force_bound_n": bound_n,
+            "above_ms": above_ns * 1e-6,
+            "moved_rad": moved,
+            "end_s": self.end_ns * 1e-9,
+            "failures": failures + found,
+        }
+
+    def _rest(self) -> tuple[float, list[str]]:
+        """Let time pass without a master: how far a joint moves (rad) once all must be at rest, and failures."""
+        plant, nodes = self.session.world.plant, self.session.world.nodes
+        over_ns = max(self.end_ns, *(fault.end_ns for fault in self.case.faults), 0)
         try:
-            clock.sleep_until_ns(end_ns + int(SETTLED_S * 1e9))
+            self.clock.sleep_until_ns(self.end_ns + int(SETTLED_S * 1e9))
             before = np.array(plant.truth()["q"])
-            clock.sleep_until_ns(over_ns + int(AFTER_S * 1e9))
+            self.clock.sleep_until_ns(over_ns + int(AFTER_S * 1e9))
         except CanprobeError as error:
-            self.failures.append(f"crash after the end: {error}")
-            return 0.0
+            return 0.0, [f"crash after the end: {error}"]
         moved = float(np.abs(plant.truth()["q"] - before).max())
-        self.failures += score_rest(moved, self.emulated)
-        return moved
+        return moved, score_rest(moved, nodes)
 
 
-# Study `faults`: ten thousand short touches in lockstep, each with faults drawn from its seed, each scored.
+# The campaign, its table and its findings.
 
 RUNS, QUICK_RUNS, SEEDS_A_CELL = 10_000, 8, 20
-OUTCOMES = ("completed", "stopped for safety", "bus or node failure", "bring-up refused")
 COLUMNS = (
     Column("fault", "fault"),
     Column("runs", "runs", "d"),
     *(Column(phase, phase, "d") for phase in PHASES),
-    *(Column(outcome, outcome, "d") for outcome in OUTCOMES),
+    *(Column(outcome, outcome, "d") for outcome in COLOURS),
     Column("force_max_n", "highest force N", ".2f"),
     Column("above_ms", "longest above limit ms", ".0f"),
     Column("failures", "failures", "d"),
@@ -464,7 +410,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Seeds:
-    """One cell of the sweep: some runs in a row, so that a process does not load everything for one."""
+    """One cell of the sweep: some runs in a row, so that a process does not load everything for a single one."""
 
     first: int
     count: int
@@ -481,23 +427,17 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     size = min(total, SEEDS_A_CELL)
     cells = [Seeds(first, min(size, total - first)) for first in range(0, total, size)]
     runs = [one for answer in sweep.map(measure, cells) for one in answer]
-    return StudyResult(
-        "faults",
-        COLUMNS,
-        table_rows(runs),
-        findings(runs),
-        measuring_facts(quick, total),
-        lambda path: _draw(runs, path),
-    )
+    facts = measuring_facts(quick, total)
+    return StudyResult("faults", COLUMNS, table_rows(runs), findings(runs), facts, partial(draw_faults, runs))
 
 
-def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def table_rows(runs: Sequence[Mapping[str, Any]]) -> list[Row]:
     """A row for each kind of fault (a run with two kinds is in both), and one for all."""
     kinds = [(kind.value, [r for r in runs if kind.value in r["kinds"]]) for kind in FaultKind]
     return [_row(name, some) for name, some in [*kinds, ("all", list(runs))]]
 
 
-def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> Row:
     phases = Counter(one["phase"] for one in runs)
     pressing = pressing_runs(runs)
     outcomes = Counter(one["outcome"] for one in runs)
@@ -505,7 +445,7 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "fault": name,
         "runs": len(runs),
         **{phase: phases[phase] for phase in PHASES},
-        **{outcome: outcomes[outcome] for outcome in OUTCOMES},
+        **{outcome: outcomes[outcome] for outcome in COLOURS},
         "force_max_n": max((one["force_max_n"] for one in pressing), default=0.0),
         "above_ms": max((one["above_ms"] for one in pressing), default=0.0),
         "failures": sum(bool(one["failures"]) for one in runs),
@@ -513,12 +453,12 @@ def _row(name: str, runs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def pressing_runs(runs: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """Those in which the cell presses, and its force is judged: in `listen` it is somebody else's."""
+    """Runs in which the cell presses and its force is judged: in `listen` somebody else presses."""
     return [one for one in runs if one["force_bound_n"] is not None]
 
 
 def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What the campaign says, and every failure with the command that shows it again."""
+    """The figures of the campaign, and every failure with the command that runs it again."""
     failed = [one for one in runs if one["failures"]]
     hit = sum(one["hits"] > 0 for one in runs)
     pressing = pressing_runs(runs)
@@ -537,7 +477,7 @@ def findings(runs: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def replay(seed: int, say: Say) -> dict[str, Any]:
-    """Carry out the run of one seed again and tell what happens in it."""
+    """Carry out the run of one seed again and report what happens in it."""
     case = draw_case(seed)
     say(f"seed {seed}: {case.scenario}")
     for fault in case.faults:
@@ -548,7 +488,3 @@ def replay(seed: int, say: Say) -> dict[str, Any]:
     for failure in outcome["failures"]:
         say(f"  FAILURE: {failure}")
     return outcome
-
-
-def _draw(runs: Sequence[Mapping[str, Any]], path: Path) -> None:
-    draw_faults(runs, path)

@@ -1,8 +1,8 @@
 """Study `faults` on a real vcan0: processes are killed or stalled, the interface goes down and comes back.
 
 `canprobe vcan -- canprobe study faults --vcan`. A run fails where a drive has power or moves two seconds after the
-fault, where the master does not end by itself, or where it leaves no readable log behind. The nodes are a process of
-their own, which outlives the master: they must stop by themselves. Nodes whose interface goes down end with it.
+fault, where the master does not end, or where it leaves no readable log. The nodes are a separate process, which
+outlives the master: they must stop by themselves. Nodes whose interface goes down end with it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,14 @@ import tempfile
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from random import Random
-from typing import Any
 
 from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
-from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.network import PumpedNetwork, hold_dialogues, upload
 from canprobe.bus.port import MonotonicClock, Port
-from canprobe.bus.sdo_client import hold_dialogues, upload
 from canprobe.bus.socketcan import check_interface
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState, state_of
@@ -33,24 +31,33 @@ from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import resolve_scene
-from canprobe.studies.faults import scenario_scene
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
+from canprobe.session.target import Target
+from canprobe.studies.faults import draw_ends, scenario_scene
+from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.studies.realtime_cases import LATE_PERCENT, patient, with_real_nodes
 from canprobe.studies.sweep import Sweep
 
-# One run of the fault campaign on a real vcan0: master and emulated nodes are processes, and one of them is killed.
-
-CHANNEL = "vcan0"
+RUNS = 40
 SCENARIO, HOLD_S = "press, features", 3.0
-PATIENCE = {"missed_syncs": 20, "late_cycles_max_percent": 100}
-"""Of drives and master: a guest stands still for tens of milliseconds, which is no fault of the cell."""
+MISSED_SYNCS = 20
+"""Of the drives: a guest stands still for tens of milliseconds, which is no fault of the cell."""
 PATIENCE_S = 60.0
 REACTION_S = 2.0
-"""After the fault, until drives that are left alone must have stopped; theirs are 0.2 s, the rest is the guest's."""
+"""After the fault, until drives without a master must have stopped: theirs are 0.2 s, the rest is for a slow guest."""
 STALL_S = 1.0
 APART_S = 0.3
 """Between two looks at the positions."""
 MOST_COUNTS = 8
 _TPDO1 = 0x181
+COLUMNS = (
+    Column("seed", "seed", "d"),
+    Column("fault", "fault"),
+    Column("after_s", "after s", ".2f"),
+    Column("status", "master's status"),
+    Column("ended_s", "ended within s", ".2f"),
+    Column("drives", "drives afterwards"),
+    Column("failures", "failures"),
+)
 
 
 class ProcessFault(Enum):
@@ -68,9 +75,9 @@ class ProcessCase:
     """One run.
 
     Attributes:
-        seed: names it.
+        seed: its number.
         fault: what happens.
-        after_s: since the drives were enabled.
+        after_s: from the enabling of the drives to the fault.
     """
 
     seed: int
@@ -78,43 +85,63 @@ class ProcessCase:
     after_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessRun:
-    """What came of it.
+def draw_process_case(seed: int) -> ProcessCase:
+    """The case of a seed: the kinds take turns, the time is random, from the enabling to beyond the retreat."""
+    kinds = tuple(ProcessFault)
+    return ProcessCase(seed, kinds[seed % len(kinds)], Random(f"vcan {seed}").uniform(0.0, HOLD_S + 1.0))
 
-    Attributes:
-        status: of the master, None where it had to be killed.
-        ended_s: from the fault to its end.
-        drives: how the drives were found afterwards.
-        failures: in words.
-    """
 
-    status: int | None
-    ended_s: float
-    drives: str
-    failures: tuple[str, ...]
+def run(*, quick: bool, sweep: Sweep) -> StudyResult:
+    """Carry out the campaign: forty runs, or one of each kind with `quick`."""
+    check_interface(CHANNEL)
+    rows = []
+    total = len(ProcessFault) if quick else RUNS
+    for seed in range(total):
+        rows.append(row_of(draw_process_case(seed)))
+        sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'no failure'}")
+    patience = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
+    facts = measuring_facts(quick, total) | {"interface": CHANNEL, **patience}
+    return StudyResult("faults", COLUMNS, rows, findings(rows), facts, partial(draw_ends, rows))
+
+
+def findings(rows: Sequence[Mapping[str, object]]) -> list[str]:
+    """The number of failures, and each of them."""
+    failed = [row for row in rows if row["failures"]]
+    return [
+        f"{len(rows)} runs on {CHANNEL}, {len(failed)} failed.",
+        *(f"seed {row['seed']}, {row['fault']}: {row['failures']}" for row in failed),
+    ]
+
+
+# One run: master and emulated nodes are processes, and one of them is killed.
 
 
 @cache
 def served_scene() -> Scene:
-    """A press whose nodes are a process of their own, which outlives the master."""
-    scene = resolve_scene(scenario_scene(SCENARIO, True), interface="socketcan", channel=CHANNEL, duration_s=HOLD_S)
-    assert scene.arm is not None
-    limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
-    return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)
+    """A press whose nodes are a separate process, which outlives the master."""
+    scene = scenario_scene(SCENARIO, True)
+    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=HOLD_S)
+    return patient(scene, MISSED_SYNCS)
 
 
-def carry_out(case: ProcessCase, folder: Path) -> ProcessRun:
-    """Bring the cell up, let the fault happen, and look at what is left."""
-    scene = served_scene()
-    child = EmulatorChild(scene, None, CHANNEL)
-    run = _Run(case, child, folder)
-    try:
-        return run.result(scene)
-    finally:
-        link("up")
-        run.close()
-        child.end()
+def row_of(case: ProcessCase) -> Row:
+    """Bring the cell up, let the fault happen, and look at what is left: the row of the case."""
+    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
+        run = _Run(case, EmulatorChild(served_scene(), None, CHANNEL), Path(folder))
+        try:
+            status, ended_s, drives = run.carry_out()
+        finally:
+            link("up")
+            run.close()
+    return {
+        "seed": case.seed,
+        "fault": case.fault.value,
+        "after_s": case.after_s,
+        "status": status,
+        "ended_s": ended_s,
+        "drives": drives,
+        "failures": "; ".join(run.failures),
+    }
 
 
 class _Run:
@@ -126,32 +153,39 @@ class _Run:
         self.master: subprocess.Popen[bytes] | None = None
         self.failures: list[str] = []
 
-    def result(self, scene: Scene) -> ProcessRun:
+    def carry_out(self) -> tuple[int | None, float, str]:
+        """Status of the master (None: killed after a hang), seconds from the fault to its end, states of the drives."""
         port = self._open()
         try:
             self.child.start()
             self.child.await_boot_ups(port)
-            self.master = self._start_master(scene)
-            if not self._await_enabled(port):
-                return ProcessRun(self.master.poll(), 0.0, "", ("the drives were never enabled",))
+            self.master = self._start_master()
+            if not self._await_enabled(port, self.master):
+                self.failures.append("the drives were never enabled")
+                return self.master.poll(), 0.0, ""
             self._sleep(self.case.after_s)
         finally:
             port.close()
         fault_ns = self.clock.now_ns()
-        self._let_happen()
-        status = self._await_end()
+        self._let_happen(self.master)
+        status = None
+        try:
+            status = self.master.wait(PATIENCE_S)
+        except subprocess.TimeoutExpired:
+            self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
         ended_s = (self.clock.now_ns() - fault_ns) * 1e-9
         self._sleep(REACTION_S - ended_s)
         link("up")
         drives = self._look()
-        self._score(status)
-        return ProcessRun(status, ended_s, drives, tuple(self.failures))
+        self.failures += score_end(self.case.fault, status, self.folder)
+        return status, ended_s, drives
 
     def close(self) -> None:
-        """Leave no master behind."""
+        """Leave no process behind."""
         if self.master is not None and self.master.poll() is None:
             self.master.kill()
             self.master.wait()
+        self.child.end()
 
     def _open(self) -> Port:
         return open_port("socketcan", CHANNEL, 1_000_000, self.clock)
@@ -159,25 +193,18 @@ class _Run:
     def _sleep(self, seconds: float) -> None:
         self.clock.sleep_until_ns(self.clock.now_ns() + max(0, round(seconds * 1e9)))
 
-    def _start_master(self, scene: Scene) -> subprocess.Popen[bytes]:
-        assert scene.arm is not None and scene.sensor is not None
-        real = replace(
-            scene,
-            scene=replace(scene.scene, figures=False),
-            arm=replace(scene.arm, emulated=False),
-            sensor=replace(scene.sensor, emulated=False),
-        )
+    def _start_master(self) -> subprocess.Popen[bytes]:
+        scene = with_real_nodes(served_scene())
         path = self.folder / "scene.toml"
-        path.write_text(dump_scene(real), encoding="utf-8")
+        path.write_text(dump_scene(replace(scene, scene=replace(scene.scene, figures=False))), encoding="utf-8")
         command = [sys.executable, "-m", "canprobe", "run", str(path), "--out", str(self.folder / "run")]
         with (self.folder / "stderr").open("wb") as errors:
             return subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=errors)
 
-    def _await_enabled(self, port: Port) -> bool:
-        """Until the first drive tells that operation is enabled."""
-        assert self.master is not None
+    def _await_enabled(self, port: Port, master: subprocess.Popen[bytes]) -> bool:
+        """Wait until the first drive reports operation enabled."""
         deadline_ns = self.clock.now_ns() + round(PATIENCE_S * 1e9)
-        while self.clock.now_ns() < deadline_ns and self.master.poll() is None:
+        while self.clock.now_ns() < deadline_ns and master.poll() is None:
             port.wait(self.clock.now_ns() + 50_000_000)
             for can_id, data, _ in port.drain():
                 word = int.from_bytes(data[:2], "little")
@@ -185,15 +212,14 @@ class _Run:
                     return True
         return False
 
-    def _let_happen(self) -> None:
-        assert self.master is not None
+    def _let_happen(self, master: subprocess.Popen[bytes]) -> None:
         match self.case.fault:
             case ProcessFault.MASTER_KILLED:
-                self.master.kill()
+                master.kill()
             case ProcessFault.MASTER_STALLED:
-                self.master.send_signal(signal.SIGSTOP)
+                master.send_signal(signal.SIGSTOP)
                 self._sleep(STALL_S)
-                self.master.send_signal(signal.SIGCONT)
+                master.send_signal(signal.SIGCONT)
             case ProcessFault.NODES_KILLED:
                 os.kill(self.child.pid, signal.SIGKILL)
             case ProcessFault.LINK_DOWN:
@@ -202,18 +228,8 @@ class _Run:
                 link("down")
                 link("up")
 
-    def _await_end(self) -> int | None:
-        assert self.master is not None
-        try:
-            return self.master.wait(PATIENCE_S)
-        except subprocess.TimeoutExpired:
-            self.failures.append(f"hang: the master still runs {PATIENCE_S:g} s after the fault")
-            return None
-
-    # what is left
-
     def _look(self) -> str:
-        """Ask the drives, where their process is still there."""
+        """The states of the drives, where their process still answers."""
         if not Path(f"/proc/{self.child.pid}").exists() or not self._answers():
             if self.case.fault in (ProcessFault.MASTER_KILLED, ProcessFault.MASTER_STALLED):
                 self.failures.append("the nodes ended with a master that is not their parent")
@@ -228,7 +244,7 @@ class _Run:
             if abs(_signed(after[node_id]) - _signed(before[node_id])) > MOST_COUNTS:
                 self.failures.append(f"node {node_id} moves after the stop")
         codes = self._ask(0x603F) if DriveState.FAULT in states.values() else {}
-        return ", ".join(sorted({_told(state, codes.get(node_id)) for node_id, state in states.items()}))
+        return ", ".join(sorted({_text_of(state, codes.get(node_id)) for node_id, state in states.items()}))
 
     def _answers(self) -> bool:
         try:
@@ -249,22 +265,25 @@ class _Run:
             port.close()
         return answers if len(answers) == len(arm.node_ids) else {}
 
-    def _score(self, status: int | None) -> None:
-        killed = self.case.fault is ProcessFault.MASTER_KILLED
-        if status is not None and not killed and status not in (1, 3):
-            self.failures.append(f"the master ended with status {status}, expected 1 or 3")
-        errors = (self.folder / "stderr").read_text(encoding="utf-8", errors="replace")
-        if "Traceback" in errors:
-            self.failures.append(f"crash: {errors.strip().splitlines()[-1]}")
-        out = self.folder / "run"
-        try:
-            frames = sum(1 for _ in read_candump(out / "bus.log", whole=True))
-            if not frames:
-                self.failures.append("log: bus.log is empty")
-            if not killed and json.loads((out / "summary.json").read_text(encoding="utf-8"))["completed"]:
-                self.failures.append("the summary says that the run was completed")
-        except (CanprobeError, OSError, ValueError) as error:
-            self.failures.append(f"log: {error}")
+
+def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:
+    """Failures in what a master left: its status, `stderr`, and `run/bus.log` and `run/summary.json` in `folder`."""
+    failures = []
+    killed = fault is ProcessFault.MASTER_KILLED
+    if status is not None and not killed and status not in (1, 3):
+        failures.append(f"the master ended with status {status}, expected 1 or 3")
+    errors = (folder / "stderr").read_text(encoding="utf-8", errors="replace")
+    if "Traceback" in errors:
+        failures.append(f"crash: {errors.strip().splitlines()[-1]}")
+    try:
+        if not sum(1 for _ in read_candump(folder / "run" / "bus.log", whole=True)):
+            failures.append("log: bus.log is empty")
+        summary = folder / "run" / "summary.json"
+        if not killed and json.loads(summary.read_text(encoding="utf-8"))["completed"]:
+            failures.append("the summary says that the run was completed")
+    except (CanprobeError, OSError, ValueError) as error:
+        failures.append(f"log: {error}")
+    return failures
 
 
 def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generator[bytes | None, bytes, None]:
@@ -276,7 +295,7 @@ def _read(index: int, node_id: int, keep: Callable[[int, int], None]) -> Generat
         return
 
 
-def _told(state: DriveState, code: int | None) -> str:
+def _text_of(state: DriveState, code: int | None) -> str:
     return f"{state.name} {code:04X}h" if state is DriveState.FAULT and code is not None else state.name
 
 
@@ -287,71 +306,3 @@ def _signed(value: int) -> int:
 def link(state: str) -> None:
     """Take the interface down or up."""
     subprocess.run(["ip", "link", "set", CHANNEL, state], check=True, capture_output=True)
-
-
-# Study `faults` on a real vcan0: processes are killed or stalled, the interface goes down and comes back.
-
-RUNS = 40
-COLUMNS = (
-    Column("seed", "seed", "d"),
-    Column("fault", "fault"),
-    Column("after_s", "after s", ".2f"),
-    Column("status", "master's status"),
-    Column("ended_s", "ended within s", ".2f"),
-    Column("drives", "drives afterwards"),
-    Column("failures", "failures"),
-)
-
-
-def draw_process_case(seed: int) -> ProcessCase:
-    """The case of a seed: the kinds take turns, the time is random, from the enabling to beyond the retreat."""
-    kinds = tuple(ProcessFault)
-    return ProcessCase(seed, kinds[seed % len(kinds)], Random(f"vcan {seed}").uniform(0.0, HOLD_S + 1.0))
-
-
-def run(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Carry out the campaign: forty runs, or one of each kind with `quick`."""
-    check_interface(CHANNEL)
-    rows = []
-    total = len(ProcessFault) if quick else RUNS
-    for seed in range(total):
-        rows.append(row_of(draw_process_case(seed)))
-        sweep.say(f"{seed + 1} of {total}: {rows[-1]['fault']}: {rows[-1]['failures'] or 'as it should be'}")
-    return StudyResult(
-        "faults",
-        COLUMNS,
-        rows,
-        findings(rows),
-        measuring_facts(quick, total) | {"interface": CHANNEL, **PATIENCE},
-        lambda path: _draw(rows, path),
-    )
-
-
-def row_of(case: ProcessCase) -> dict[str, Any]:
-    """Carry out one case."""
-    with tempfile.TemporaryDirectory(prefix="canprobe-faults-") as folder:
-        result = carry_out(case, Path(folder))
-    return {
-        "seed": case.seed,
-        "fault": case.fault.value,
-        "after_s": case.after_s,
-        "status": result.status,
-        "ended_s": result.ended_s,
-        "drives": result.drives,
-        "failures": "; ".join(result.failures),
-    }
-
-
-def findings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """What the campaign says."""
-    failed = [row for row in rows if row["failures"]]
-    return [
-        f"{len(rows)} runs on {CHANNEL}, {len(failed)} failed.",
-        *(f"seed {row['seed']}, {row['fault']}: {row['failures']}" for row in failed),
-    ]
-
-
-def _draw(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
-    from canprobe.studies.faults import draw_ends
-
-    draw_ends(rows, path)

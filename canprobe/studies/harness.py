@@ -1,9 +1,8 @@
-"""What a study is: a table with its facts and findings, and a picture; its files, and the store of its finished
-cells.
-"""
+"""What a study is: a table with its facts and findings, and a picture; its files; the store of its finished cells."""
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import csv
 import dataclasses
@@ -14,23 +13,34 @@ import importlib.util
 import json
 import math
 import platform
+import re
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import canprobe
 from canprobe.bus.disk import whole_file, write_text
+from canprobe.eds.packaged import eds_file
 from canprobe.errors import ResultsError, StudyError
-
-# What a study is: a table with its facts and findings, and a picture. `canprobe study` runs and writes them.
+from canprobe.scene.model import Scene
 
 Say = Callable[[str], None]
-Row = Mapping[str, Any]
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+"""A row of a table, by the keys of its columns."""
+CHANNEL = "vcan0"
+"""The interface of studies in real time."""
+CHI2_95_OF_3 = 7.815
+FROBENIUS = np.array([1.0, 2.0, 1.0])
+"""Weights of (K11², K12², K22²) in ‖K‖²."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,10 +66,10 @@ class StudyResult:
         name: of the study.
         columns: of the table.
         rows: one a case; None where a value does not apply.
-        findings: plain sentences with figures, right or wrong ones.
+        findings: sentences with figures.
         facts: what it was measured with.
         draw: writes the picture to a path; needs matplotlib.
-        more: further tables of the study, each with findings, files and a picture of its own.
+        more: further tables of the study, each with its findings, files and picture.
     """
 
     name: str
@@ -71,12 +81,12 @@ class StudyResult:
     more: Sequence[StudyResult] = ()
 
 
-# Finished cells of a sweep on disk: one line each, checked when read, found again by what made them.
+# Finished cells of a sweep on disk.
 #
 # A line of `cells.jsonl` is the SHA-256 of its document, a space, and the document: the cell's key, what it was
 # measured by and at, and the answer. Lines are added whole and at once; one that was cut short or changed is left out
-# and counted. The key is a digest of the measuring function, the cell and the model (`model_digest`), so that an answer
-# of other code is never taken for one of this code.
+# and counted. The key is a digest of the measuring function, the cell and the model (`model_digest`): an answer of
+# other code is not found.
 
 PACKAGE = Path(canprobe.__file__).parent
 _SOURCES = (".py", ".toml", ".eds")
@@ -119,7 +129,7 @@ def model_digest(parts: tuple[str, ...] = ()) -> str:
 
 
 def cell_key(measure: str, cell: object, model: str) -> str:
-    """What an answer is found by."""
+    """The key of an answer."""
     return hashlib.sha256(as_json([measure, cell, model]).encode()).hexdigest()[:32]
 
 
@@ -127,12 +137,12 @@ class CellStore:
     """The finished cells in a folder; open in one process at a time.
 
     Args:
-        folder: made if it is not there.
+        folder: made if it does not exist.
         fresh: forget what is kept.
 
     Attributes:
         path: of the file.
-        damaged: lines that were left out because they were cut short or changed.
+        damaged: number of lines that were left out because they were cut short or changed.
 
     Raises:
         StudyError: another process has it open.
@@ -157,20 +167,20 @@ class CellStore:
         self._read()
 
     def close(self) -> None:
-        """Let others open it."""
-        with contextlib.suppress(OSError):  # `put` has told of it
+        """Close the file; others may open it."""
+        with contextlib.suppress(OSError):  # `put` has reported it
             self._file.close()
 
     def keys(self) -> Set[str]:
-        """Of all answers."""
+        """The keys of all answers."""
         return self._answers.keys()
 
     def get(self, key: str) -> str | None:
-        """The answer as JSON text, None where there is none."""
+        """The answer as JSON text; None for an unknown key."""
         return self._answers.get(key)
 
     def put(self, key: str, what: object, answer: str) -> None:
-        """Keep an answer (JSON text) together with what it is an answer to.
+        """Keep an answer (JSON text) with what it answers.
 
         Raises:
             ResultsError: it cannot be written; what was kept before is whole.
@@ -192,7 +202,7 @@ class CellStore:
                 continue
             found = json.loads(document)
             self._answers[found["key"]] = as_json(found["answer"])
-        if not last.endswith("\n"):  # the next answer must not be written on to what was cut short
+        if not last.endswith("\n"):  # cut short: the next answer begins a new line
             self._file.write("\n")
             self._file.flush()
 
@@ -201,7 +211,7 @@ def _checksum(document: str) -> str:
     return hashlib.sha256(document.encode()).hexdigest()[:16]
 
 
-# A study's result as text, CSV, JSON and picture, and the facts that go with every measurement.
+# A study's result as text, CSV, JSON and picture, and the facts of every measurement.
 
 SIGMA_COLUMNS = (
     Column("sigma_point_um", "σp µm", ".0f"),
@@ -212,13 +222,20 @@ SIGMA_COLUMNS = (
 
 def measuring_facts(quick: bool, seeds: int, model: Sequence[str] = ()) -> dict[str, Any]:
     """Machine, versions and settings of a study; `model` as for `Sweep.map`."""
+    commit, names = "", [platform.machine()]
+    with contextlib.suppress(OSError, subprocess.TimeoutExpired):
+        command = ["git", "-C", str(PACKAGE), "describe", "--always", "--dirty"]
+        commit = subprocess.run(command, capture_output=True, text=True, check=False, timeout=5.0).stdout.strip()
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")] or names
     return {
         "canprobe": canprobe.__version__,
-        "commit": _commit(),
+        "commit": commit or None,
         "model": model_digest(tuple(model)),
         "python": platform.python_version(),
         "numpy": np.__version__,
-        "machine": _processor(),
+        "machine": names[0],
         "quick": quick,
         "seeds": seeds,
     }
@@ -230,7 +247,7 @@ def sigma_values(sigma_point: float, sigma_normal: float) -> dict[str, float]:
 
 
 def table_lines(result: StudyResult) -> list[str]:
-    """The table, one line a row, numbers flush right."""
+    """The table, a line for each row, numbers flush right."""
     cells = [[c.heading for c in result.columns]]
     cells += [[_shown(row.get(c.key), c.form) for c in result.columns] for row in result.rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -244,7 +261,7 @@ def table_lines(result: StudyResult) -> list[str]:
 
 
 def text_of(result: StudyResult) -> str:
-    """Facts, table and findings, of all its tables."""
+    """Facts, table and findings of all its tables."""
     facts = ", ".join(f"{name} {value}" for name, value in result.facts.items() if value is not None)
     own = [f"study {result.name}: {facts}", "", *table_lines(result), "", *result.findings, ""]
     return "\n".join([*own, *(f"\n{text_of(more)}" for more in result.more)])
@@ -273,8 +290,10 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
     """
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"{result.name}.{end}" for end in ("csv", "txt", "json")]
+    keys = list(dict.fromkeys(key for row in result.rows for key in row))
     with whole_file(paths[0]) as part, part.open("w", newline="", encoding="utf-8") as file:
-        _write_csv(csv.writer(file), result)
+        lines = [["" if (v := _plain(row.get(key))) is None else v for key in keys] for row in result.rows]
+        csv.writer(file).writerows([keys, *lines])
     write_text(paths[1], text_of(result))
     document = json.dumps(as_document(result), indent=1, allow_nan=False, ensure_ascii=False)
     write_text(paths[2], document + "\n")
@@ -282,13 +301,6 @@ def write_study(result: StudyResult, out: Path) -> list[Path]:
         paths.append(out / f"{result.name}.png")
         result.draw(paths[-1])
     return [*paths, *(path for more in result.more for path in write_study(more, out))]
-
-
-def _write_csv(writer: Any, result: StudyResult) -> None:
-    keys: Sequence[str] = list(dict.fromkeys(key for row in result.rows for key in row))
-    writer.writerow(keys)
-    for row in result.rows:
-        writer.writerow(["" if (v := _plain(row.get(key))) is None else v for key in keys])
 
 
 def _shown(value: Any, form: str) -> str:
@@ -304,22 +316,24 @@ def _plain(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _commit() -> str | None:
-    where = Path(canprobe.__file__).parent
-    try:
-        done = subprocess.run(
-            ["git", "-C", str(where), "describe", "--always", "--dirty"],
-            capture_output=True, text=True, check=False, timeout=5.0,
-        )  # fmt: skip
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
+# A bus that no CAN is: virtual, or faster than a real one, to measure what comes beyond the bus.
 
 
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.machine()
+def on_any_bitrate(scene: Scene, bitrate: int) -> Scene:
+    """The scene with a bit rate (bit/s) that no CAN has, and copies of its EDS files that list no bit rates."""
+    assert scene.arm is not None and scene.sensor is not None
+    return replace(
+        scene,
+        bus=replace(scene.bus, bitrate=bitrate),
+        arm=replace(scene.arm, eds=_eds_for_any_bitrate(scene.arm.eds)),
+        sensor=replace(scene.sensor, eds=_eds_for_any_bitrate(scene.sensor.eds)),
+    )
+
+
+@functools.cache
+def _eds_for_any_bitrate(eds: str) -> str:
+    folder = Path(tempfile.mkdtemp(prefix="canprobe-eds-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    copy = folder / eds_file(eds).name
+    copy.write_bytes(re.sub(rb"(?m)^(BaudRate_\w+)=1", rb"\1=0", eds_file(eds).read_bytes()))
+    return str(copy)

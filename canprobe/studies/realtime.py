@@ -1,14 +1,15 @@
-"""How well the cycle keeps time on a real SocketCAN interface, emulated nodes in a process of their own.
+"""Study `realtime`: how well the cycle keeps time on a real SocketCAN interface, emulated nodes in a child process.
 
-Four questions: the whole controller at 400 Hz for minutes; the same cycle written plainly with canopen-python; a loop
-that does nothing at all, for what the machine itself misses; and the highest rate that is held, for each mode of the
-sensor, with a controller that only holds the joints.
+Four measurements: the whole controller at 400 Hz for minutes; the same cycle with plain canopen-python; a loop that
+does nothing, for the lateness of the machine; and the highest rate that is held, for each mode of the sensor, with a
+controller that only holds the joints.
 Needs a `vcan0`; `canprobe vcan --realtime -- canprobe study realtime` runs it where the kernel has none.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +20,8 @@ from matplotlib.figure import SubFigure
 from canprobe.bus.socketcan import check_interface
 from canprobe.results.picture import BLUE, GREY, INK, ORANGE, SKY, legend, log_scale, parts, picture
 from canprobe.scene.model import TactileModeName
-from canprobe.studies.harness import Column, Row, StudyResult, measuring_facts
+from canprobe.studies.harness import CHANNEL, Column, Row, Say, StudyResult, measuring_facts
 from canprobe.studies.realtime_cases import (
-    CHANNEL,
     PATIENCE,
     CycleTimes,
     Measured,
@@ -36,7 +36,7 @@ from canprobe.studies.sweep import Sweep
 RATES_HZ = (100, 200, 250, 400, 500, 625, 1000)
 MODES: tuple[TactileModeName, ...] = ("features", "window", "image")
 HELD_PER_10000 = 1.0
-"""Overruns a rate may have to count as held."""
+"""Most overruns of a rate that counts as held."""
 COLUMNS = (
     Column("case", "case"),
     Column("sensor", "sensor"),
@@ -73,18 +73,13 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     measured.append(measure_bare(bare_s))
     for mode in MODES:
         measured += _climb(mode, hold_s, (400,) if quick else RATES_HZ, say)
-    facts = measuring_facts(quick, 1) | {
-        "interface": CHANNEL,
-        "controller": "scan of cylinder; hold elsewhere",
-        **PATIENCE,
-    }
-    return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, _drawer(measured))
+    what = {"interface": CHANNEL, "controller": "scan of cylinder; hold elsewhere", **PATIENCE}
+    facts, draw = measuring_facts(quick, 1) | what, partial(draw_realtime, measured)
+    return StudyResult("realtime", COLUMNS, [_row(m) for m in measured], findings(measured), facts, draw)
 
 
-def _climb(
-    mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Callable[[str], None]
-) -> list[Measured]:
-    """Ever higher rates, until one loses a tenth of its cycles."""
+def _climb(mode: TactileModeName, seconds: float, rates_hz: Iterable[float], say: Say) -> list[Measured]:
+    """Rising rates, until one loses a tenth of its cycles."""
     climbed = []
     for rate_hz in rates_hz:
         say(f"hold with {mode} at {rate_hz:g} Hz, {seconds:g} s")
@@ -127,7 +122,7 @@ def per_10000(times: CycleTimes) -> float:
 
 
 def findings(measured: list[Measured]) -> list[str]:
-    """What the figures say, against what was hoped for."""
+    """The figures beside the goals."""
     scan, plain, bare = measured[:3]
     lines = [
         f"whole controller at {scan.rate_hz:g} Hz for {scan.times.seconds:.0f} s: {per_10000(scan.times):.1f} overruns"
@@ -152,18 +147,9 @@ def findings(measured: list[Measured]) -> list[str]:
             f"{mode}: {f'{max(held):g} Hz held without overruns' if held else 'no rate held without overruns'}"
             f" of {', '.join(f'{m.rate_hz:g}' for m in mine)} Hz; {best:.0f} cycles a second at most"
         )
-    lines.append("a real bus of 1 Mbit/s ends at 639 Hz with six drives alone, whatever the software (worst-case bits)")
+    lines.append("a real bus of 1 Mbit/s ends at 639 Hz with six drives alone, with any software (worst-case bits)")
     return lines
 
-
-def _drawer(measured: list[Measured]) -> Callable[[Path], None]:
-    def draw(path: Path) -> None:
-        draw_realtime(measured, path)
-
-    return draw
-
-
-# The picture of study `realtime`: histograms of the cycle, and the rates that were held.
 
 LINES = ((BLUE, "-"), (ORANGE, "--"), (SKY, ":"))
 

@@ -6,8 +6,9 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import canopen
@@ -18,8 +19,7 @@ from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
 from canprobe.bus.port import Clock, MonotonicClock
 from canprobe.bus.scheduling import MASTER_PRIORITY, realtime
-from canprobe.cell.bringup import NodeSetup
-from canprobe.cell.configuration import make_setups
+from canprobe.cell.configuration import NodeSetup, make_setups
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.errors import CanprobeError
 from canprobe.planning.make import make_plan
@@ -30,76 +30,59 @@ from canprobe.scene.model import Scene, TactileModeName
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import EmulatorChild
 from canprobe.session.session import Session, resolve_scene
+from canprobe.session.target import Target
+from canprobe.studies.harness import CHANNEL, on_any_bitrate
 from canprobe.tasks.from_plan import make_task
-
-# What a cycle on a real interface took: lateness of SYNC, computing time, and how late the last TPDO was in.
 
 Times = NDArray[np.int64]
 
 
-@dataclass(frozen=True, slots=True)
+def _nothing() -> Times:
+    return np.zeros(0, np.int64)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class CycleTimes:
-    """One run.
+    """Times of the cycles of one run; empty arrays where a time was not measured.
 
     Attributes:
         period_ns: of SYNC, as asked.
         lateness_ns: of each SYNC behind its deadline (n,), ns.
-        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
-        compute_ns: the same with the controller's work once the RPDOs are out (m,), ns.
-        latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
-        overruns: cycles woken more than half a period late.
-        missed: TPDOs that a cycle did without.
         seconds: from the first SYNC to the last.
+        response_ns: from the last TPDO to the RPDOs, of every fifth cycle (m,), ns.
+        compute_ns: the same with the controller's work after the RPDOs (m,), ns.
+        latency_ns: from each SYNC to the last of the drives' TPDOs that answer it (k,), ns.
+        missed: TPDOs that a cycle did without.
         processor_share: processor time of the master's process over `seconds`; None where it cannot be measured.
     """
 
     period_ns: int
     lateness_ns: Times
-    response_ns: Times
-    compute_ns: Times
-    latency_ns: Times
-    overruns: int
-    missed: int
     seconds: float
-    processor_share: float | None
+    response_ns: Times = field(default_factory=_nothing)
+    compute_ns: Times = field(default_factory=_nothing)
+    latency_ns: Times = field(default_factory=_nothing)
+    missed: int = 0
+    processor_share: float | None = None
 
-    @classmethod
-    def of_wakes(
-        cls,
-        period_ns: int,
-        lateness: Sequence[int],
-        seconds: float,
-        *,
-        missed: int = 0,
-        processor_share: float | None = None,
-    ) -> CycleTimes:
-        """Of a loop of which no more is known than how late it woke each time, ns."""
-        nothing = np.zeros(0, np.int64)
-        return cls(
-            period_ns=period_ns,
-            lateness_ns=np.array(lateness, np.int64),
-            response_ns=nothing,
-            compute_ns=nothing,
-            latency_ns=nothing,
-            overruns=sum(late > period_ns // 2 for late in lateness),
-            missed=missed,
-            seconds=seconds,
-            processor_share=processor_share,
-        )
+    @property
+    def overruns(self) -> int:
+        """Cycles woken more than half a period late."""
+        return int(np.count_nonzero(self.lateness_ns > self.period_ns // 2))
 
     @property
     def cycles(self) -> int:
-        """Cycles that were begun."""
+        """Number of cycles."""
         return len(self.lateness_ns)
 
     @property
     def rate_hz(self) -> float:
-        """Cycles a second, as held."""
+        """Cycles per second that were held."""
         return (self.cycles - 1) / self.seconds if self.seconds > 0 else 0.0
 
 
 def woken(clock: Clock, period_ns: int, cycles: int, lateness: list[int]) -> Iterator[int]:
-    """Wake at so many deadlines, a period apart, and add how late each was (ns); missed ones are passed over.
+    """Wake at so many deadlines, a period apart, and append the lateness of each (ns); missed ones are skipped.
 
     Yields:
         The deadline, ns, or the last one that has passed by then.
@@ -122,7 +105,7 @@ def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -
         period_ns: of SYNC.
 
     Returns:
-        One number for each SYNC that all of them answered (k,), ns, to the log's microsecond.
+        One number for each SYNC that all of them answered (k,), ns, in whole microseconds.
     """
     syncs: list[int] = []
     arrivals: dict[int, list[int]] = {can_id: [] for can_id in feedback_ids}
@@ -132,7 +115,7 @@ def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -
         elif can_id in arrivals:
             arrivals[can_id].append(t_ns)
     if not syncs or not arrivals:
-        return np.zeros(0, np.int64)
+        return _nothing()
     begins = np.array(sorted(syncs), np.int64)
     last = np.full(len(begins), -1, np.int64)
     complete = np.ones(len(begins), bool)
@@ -144,31 +127,26 @@ def answer_latencies(path: Path, feedback_ids: frozenset[int], period_ns: int) -
     return last[complete]
 
 
-def processor_seconds() -> float:
-    """Processor time of this process so far, s."""
-    times = os.times()
-    return times.user + times.system
-
-
-def share_of(used_before_s: float, passed_s: float) -> float | None:
-    """Processor share since `processor_seconds` gave `used_before_s`; None in a guest, which counts whole ticks."""
+def processor_share(used_before_s: float, passed_s: float) -> float | None:
+    """Processor share since `process_time` gave `used_before_s`; None in a guest, which counts whole ticks."""
     if os.environ.get("CANPROBE_VCAN") == "guest" or passed_s <= 0:
         return None
-    return (processor_seconds() - used_before_s) / passed_s
+    return (process_time() - used_before_s) / passed_s
 
 
-# The cases of study `realtime`: one run each on a real SocketCAN interface, emulated nodes in their own process.
+# The cases, one run each.
 
-CHANNEL = "vcan0"
-PATIENCE = {"missed_syncs": 250, "late_cycles_max_percent": 100}
-"""Of the cases' scenes: what cannot be held is measured, and ended neither by a drop-out nor by late cycles."""
+RATE_HZ = 400.0
+MISSED_SYNCS, LATE_PERCENT = 250, 100
+PATIENCE = {"missed_syncs": MISSED_SYNCS, "late_cycles_max_percent": LATE_PERCENT}
+"""Of the cases' scenes: neither a drop-out nor late cycles end a run at a rate that cannot be held."""
 WIRE_BITRATE = 50_000_000
-"""Of the sweep's plans: a virtual bus has no bit rate, and what a real one allows is the plan's business."""
+"""Of the plans at any rate: a virtual bus has no bit rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A case and what was measured; `ended` tells why it ended early."""
+    """A case and its times; `ended`: why it ended early."""
 
     case: str
     sensor: str
@@ -183,65 +161,64 @@ def measure_scan(seconds: float) -> Measured:
     return _measured("whole controller", scene, lambda session: make_task(session.plan))
 
 
-def measure_plain(seconds: float, rate_hz: float = 400.0) -> Measured:
+def measure_plain(seconds: float) -> Measured:
     """The cycle of `run_plain` with the same nodes."""
-    scene = holding_scene("window", rate_hz)
-    with served(CHANNEL, in_realtime=True), realtime(MASTER_PRIORITY, _unheard):
-        times = run_plain(make_plan(resolve(scene)), CHANNEL, seconds)
-    return Measured("plain canopen", "window", rate_hz, times)
+    plan = make_plan(resolve(holding_scene("window", RATE_HZ)))
+    with served(), realtime(MASTER_PRIORITY, _unheard):
+        return Measured("plain canopen", "window", RATE_HZ, run_plain(plan, seconds))
 
 
-def measure_bare(seconds: float, rate_hz: float = 400.0) -> Measured:
-    """A loop that wakes at every deadline and does nothing: what the machine itself misses."""
-    period_ns, lateness = round(1e9 / rate_hz), list[int]()
+def measure_bare(seconds: float) -> Measured:
+    """A loop that wakes at every deadline and does nothing: the machine's own lateness."""
+    period_ns, lateness = round(1e9 / RATE_HZ), list[int]()
     with realtime(MASTER_PRIORITY, _unheard):
-        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * rate_hz), lateness))
-    times = CycleTimes.of_wakes(period_ns, lateness, (deadlines[-1] - deadlines[0]) * 1e-9)
-    return Measured("bare clock", "none", rate_hz, times)
+        deadlines = list(woken(MonotonicClock(), period_ns, round(seconds * RATE_HZ), lateness))
+    times = CycleTimes(period_ns, np.array(lateness, np.int64), (deadlines[-1] - deadlines[0]) * 1e-9)
+    return Measured("bare clock", "none", RATE_HZ, times)
 
 
 def measure_hold(mode: TactileModeName, rate_hz: float, seconds: float) -> Measured:
-    """The joints held where they stand, at any rate."""
+    """The joints hold their position, at any rate."""
     scene = holding_scene(mode, rate_hz)
-    with served(CHANNEL, in_realtime=True):
+    with served():
         return _measured("hold", scene, lambda _: Hold(int(seconds * rate_hz)))
 
 
 def holding_scene(mode: TactileModeName, rate_hz: float) -> Scene:
-    """Six drives and the sensor at half their rate, none of them started by the session."""
-    scene = _scene()
-    scene = replace(scene, bus=replace(scene.bus, bitrate=WIRE_BITRATE))  # no CAN has it, so no scene may ask for it
+    """Six drives and the sensor at half their rate; the session starts none of them."""
+    scene = on_any_bitrate(_scene(), WIRE_BITRATE)
     real = with_real_nodes(replace(scene, cycle=replace(scene.cycle, rate_hz=rate_hz)))
     assert real.sensor is not None
     return replace(real, sensor=replace(real.sensor, mode=mode, rate_hz=rate_hz / 2))
 
 
 def with_real_nodes(scene: Scene) -> Scene:
-    """The scene with arm and sensor left to somebody else."""
+    """The scene with arm and sensor in another process."""
     assert scene.arm is not None and scene.sensor is not None
     arm, sensor = replace(scene.arm, emulated=False), replace(scene.sensor, emulated=False)
     return replace(scene, arm=arm, sensor=sensor)
 
 
-def _scene(seconds: float | None = None, channel: str = CHANNEL, *, in_realtime: bool = True) -> Scene:
-    """The scene `cylinder`, patient; in real time with the processor and the memory, as far as they are to be had."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=channel, duration_s=seconds)
-    return replace(patient(scene), cycle=replace(scene.cycle, realtime=in_realtime))
+def _scene(seconds: float | None = None) -> Scene:
+    """The scene `cylinder`, patient; with real-time priority and locked memory where they are permitted."""
+    scene = load_scene("cylinder")
+    scene = resolve_scene(scene, Target.over(scene, "socketcan", CHANNEL), duration_s=seconds)
+    return replace(patient(scene), cycle=replace(scene.cycle, realtime=True))
 
 
-def patient(scene: Scene) -> Scene:
-    """The scene with drives that wait for their master, and a master that is never too late."""
+def patient(scene: Scene, missed_syncs: int = MISSED_SYNCS) -> Scene:
+    """The scene with drives that tolerate missed SYNCs, and a master that no late cycles stop."""
     assert scene.arm is not None
-    limits = replace(scene.limits, late_cycles_max_percent=PATIENCE["late_cycles_max_percent"])
-    return replace(scene, arm=replace(scene.arm, missed_syncs=PATIENCE["missed_syncs"]), limits=limits)
+    limits = replace(scene.limits, late_cycles_max_percent=LATE_PERCENT)
+    return replace(scene, arm=replace(scene.arm, missed_syncs=missed_syncs), limits=limits)
 
 
 def _unheard(_: str) -> None:
-    """What is not permitted was said by the first case."""
+    """Drop what is not permitted: the first case has reported it."""
 
 
 class Hold(Controller):
-    """Keep the joints where they were found, for some cycles."""
+    """Hold the joints at their first position for some cycles."""
 
     def __init__(self, cycles: int) -> None:
         self._cycles = cycles
@@ -256,11 +233,11 @@ class Hold(Controller):
 
 
 @contextmanager
-def served(channel: str, child: EmulatorChild | None = None, *, in_realtime: bool = False) -> Iterator[None]:
-    """The nodes of `cylinder` in their process; they take rates and mappings from the master, not from their scene."""
-    scene = _scene(channel=channel, in_realtime=in_realtime)
-    child = child or EmulatorChild(scene, None, channel)
-    port = open_port("socketcan", channel, scene.bus.bitrate, MonotonicClock())
+def served(child: EmulatorChild | None = None) -> Iterator[None]:
+    """The nodes of `cylinder` in a child process; they take rates and mappings from the master."""
+    scene = _scene()
+    child = child or EmulatorChild(scene, None, CHANNEL)
+    port = open_port("socketcan", CHANNEL, scene.bus.bitrate, MonotonicClock())
     try:
         child.start()
         child.await_boot_ups(port)
@@ -278,7 +255,7 @@ def _measured(case: str, scene: Scene, make: Callable[[Session], Controller]) ->
         used_s = 0.0
         try:
             with session:
-                used_s = processor_seconds()
+                used_s = process_time()
                 session.run(make(session))
         except CanprobeError as error:
             if not session.opened:
@@ -295,37 +272,30 @@ def _times(session: Session, folder: Path, used_s: float) -> CycleTimes:
     return CycleTimes(
         period_ns=period_ns,
         lateness_ns=np.array(cycle.statistics.period_error_ns, np.int64),
+        seconds=seconds,
         response_ns=np.array(cycle.statistics.response_ns, np.int64),
         compute_ns=np.array(cycle.statistics.compute_ns, np.int64),
         latency_ns=answer_latencies(folder / "bus.log", cell.drives.feedback_ids, period_ns),
-        overruns=cycle.statistics.overruns,
         missed=cell.drives.missed,
-        seconds=seconds,
-        processor_share=share_of(used_s, seconds),
+        processor_share=processor_share(used_s, seconds),
     )
 
 
-# The same cycle written plainly with canopen-python: its Network, its threads, its PDO objects. A yardstick only.
+# The same cycle written with plain canopen-python: its Network, its threads, its PDO objects. A reference only.
 #
-# SYNC, wait for six TPDOs, read statusword, position and torque, write the targets, transmit six RPDOs; the sensor's
-# PDOs are read where they are there. Nothing is computed: the targets are where the joints stood.
+# SYNC, wait for six TPDOs, read statusword, position and torque, write the targets, transmit six RPDOs; read the
+# sensor's PDOs. Nothing is computed: the targets are the first positions.
 
 _ENABLING = (6, 7, 15)
 _CYCLES_A_STEP = 20
 _WAIT_SHARE = 0.6
-"""Of the period, the longest wait for TPDOs, as canprobe's own cycle waits."""
+"""Longest wait for TPDOs over the period, as in canprobe's cycle."""
 
 
-def run_plain(plan: Plan, channel: str, seconds: float) -> CycleTimes:
-    """Bring the nodes of a plan up, cycle for some time, stop them.
-
-    Args:
-        plan: with drives 1–6; its nodes are served on `channel`.
-        channel: a SocketCAN interface.
-        seconds: length of the timed part.
-    """
+def run_plain(plan: Plan, seconds: float) -> CycleTimes:
+    """Bring the nodes of a plan with drives 1–6 up, run the cycle for some time, stop them."""
     network = canopen.Network()
-    network.connect(interface="socketcan", channel=channel)
+    network.connect(interface="socketcan", channel=CHANNEL)
     try:
         nodes = [_configured(network, setup) for setup in make_setups(plan)]
         with _operational(network):
@@ -369,7 +339,7 @@ class _PlainCycle:
         self._clock = MonotonicClock()
 
     def run(self, word: int, cycles: int) -> list[int]:
-        """Cycle; returns the lateness of each SYNC, ns."""
+        """Run some cycles; returns the lateness of each SYNC, ns."""
         period_ns = self._plan.sync.period_ns
         lateness: list[int] = []
         for deadline_ns in woken(self._clock, period_ns, cycles, lateness):
@@ -398,14 +368,13 @@ class _PlainCycle:
                 _ = variable.raw
 
     def times(self, seconds: float) -> CycleTimes:
-        """Cycle for some time."""
+        """Run the cycle for some time."""
         period_ns, clock = self._plan.sync.period_ns, self._clock
         self.missed = 0
-        begin_ns, used_s = clock.now_ns(), processor_seconds()
+        begin_ns, used_s = clock.now_ns(), process_time()
         lateness: list[int] = []
         while (left_ns := seconds * 1e9 - (clock.now_ns() - begin_ns)) > 0:
             lateness += self.run(_ENABLING[-1], min(200, int(left_ns / period_ns) + 1))
         passed_s = (clock.now_ns() - begin_ns) * 1e-9
-        return CycleTimes.of_wakes(
-            period_ns, lateness, passed_s, missed=self.missed, processor_share=share_of(used_s, passed_s)
-        )
+        late, share = np.array(lateness, np.int64), processor_share(used_s, passed_s)
+        return CycleTimes(period_ns, late, passed_s, missed=self.missed, processor_share=share)

@@ -1,35 +1,35 @@
-"""An hour on a real SocketCAN interface: does memory stay flat, do the clocks stay together, do the counters agree.
+"""Study `soak`: memory, clocks and counters of a cell over an hour on a real SocketCAN interface.
 
-The cell is held as `canprobe up` holds it, emulated nodes in their process, all PDOs on the bus. For a nightly run:
+The cell is held as `canprobe up` holds it, emulated nodes in a child process, all PDOs on the bus. For a nightly run:
 `canprobe vcan --realtime -- canprobe study soak`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from canprobe.api import ROWS_OF_UP
 from canprobe.bus.socketcan import check_interface
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.results.picture import BLUE, ORANGE, legend, parts, picture
 from canprobe.scene.load import load_scene
 from canprobe.session.children import EmulatorChild
-from canprobe.session.session import Session, resolve_scene
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
-from canprobe.studies.realtime_cases import CHANNEL, PATIENCE, patient, served, with_real_nodes
+from canprobe.session.session import Session
+from canprobe.session.target import Target
+from canprobe.session.up import ROWS_OF_UP
+from canprobe.studies.harness import CHANNEL, Column, Row, StudyResult, measuring_facts
+from canprobe.studies.realtime_cases import PATIENCE, patient, served, with_real_nodes
 from canprobe.studies.sweep import Sweep
 
 HOUR_S = 3600.0
 SAMPLES = 60
 SETTLED = 0.25
-"""Share of the run after which memory is expected to have stopped growing."""
-
+"""Share of the run after which memory should be constant."""
 COLUMNS = (
     Column("t_s", "t s", ".0f"),
     Column("master_mib", "master MiB", ".2f"),
@@ -44,36 +44,11 @@ COLUMNS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """One look at the running cell.
-
-    Attributes:
-        t_s: since the first SYNC.
-        master_mib, nodes_mib: resident memory of the two processes.
-        cycles, overruns, missed_pdos, dropped_frames: since the start.
-        latency_us: from SYNC to the last TPDO in this cycle, by the kernel's stamp.
-        frames_counted: sent and received by the master since the start.
-        frames_on_bus: counted by the interface since the start.
-    """
-
-    t_s: float
-    master_mib: float
-    nodes_mib: float
-    cycles: int
-    overruns: int
-    missed_pdos: int
-    dropped_frames: int
-    latency_us: float
-    frames_counted: int
-    frames_on_bus: int
-
-
 class Soaker(Controller):
-    """The controller: holds the joints, and looks at everything now and then."""
+    """Holds the joints, and takes a sample periodically."""
 
     def __init__(self, session: Session, nodes_pid: int, seconds: float) -> None:
-        self.samples: list[Sample] = []
+        self.samples: list[Row] = []
         self._session, self._nodes_pid, self._seconds = session, nodes_pid, seconds
         self._next_s = 0.0
         self._q: Any = None
@@ -96,20 +71,18 @@ class Soaker(Controller):
         counted, packets = counters.sent + counters.received, packets_on(CHANNEL)
         if not self.samples:
             self._first_counted, self._first_packets = counted, packets
-        self.samples.append(
-            Sample(
-                t_s=t_s,
-                master_mib=resident_mib(os.getpid()),
-                nodes_mib=resident_mib(self._nodes_pid),
-                cycles=cycle.number,
-                overruns=cycle.statistics.overruns,
-                missed_pdos=drives.missed,
-                dropped_frames=counters.overruns,
-                latency_us=drives.answer_ns * 1e-3,
-                frames_counted=counted - self._first_counted,
-                frames_on_bus=packets - self._first_packets,
-            )
-        )
+        self.samples.append({
+            "t_s": t_s,
+            "master_mib": resident_mib(os.getpid()),
+            "nodes_mib": resident_mib(self._nodes_pid),
+            "cycles": cycle.number,
+            "overruns": cycle.statistics.overruns,
+            "missed_pdos": drives.missed,
+            "dropped_frames": counters.overruns,
+            "latency_us": drives.answer_ns * 1e-3,
+            "frames_counted": counted - self._first_counted,
+            "frames_on_bus": packets - self._first_packets,
+        })  # fmt: skip
 
 
 def run(*, quick: bool, sweep: Sweep) -> StudyResult:
@@ -117,17 +90,17 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     check_interface(CHANNEL)
     seconds = 10.0 if quick else HOUR_S
     sweep.say(f"hold the cell for {seconds:g} s")
-    samples = soak(seconds)
+    rows = soak(seconds)
     facts = measuring_facts(quick, 1) | {"interface": CHANNEL, "seconds": seconds, **PATIENCE}
-    rows = [asdict(sample) for sample in samples]
-    return StudyResult("soak", COLUMNS, rows, findings(samples), facts, _drawer(samples))
+    return StudyResult("soak", COLUMNS, rows, findings(rows), facts, partial(draw_soak, rows))
 
 
-def soak(seconds: float) -> list[Sample]:
-    """Hold the cell; a look every sixtieth of the time."""
-    scene = resolve_scene(load_scene("cylinder"), interface="socketcan", channel=CHANNEL)
+def soak(seconds: float) -> list[Row]:
+    """Hold the cell; a sample every sixtieth of the time."""
+    scene = load_scene("cylinder")
+    scene = Target.over(scene, "socketcan", CHANNEL).applied_to(scene)
     child = EmulatorChild(scene, None, CHANNEL, truth=False)
-    with served(CHANNEL, child):
+    with served(child):
         session = Session(with_real_nodes(patient(scene)), rows_kept=ROWS_OF_UP)
         soaker = Soaker(session, child.pid, seconds)
         with session:
@@ -142,62 +115,50 @@ def resident_mib(pid: int) -> float:
 
 
 def packets_on(channel: str) -> int:
-    """Frames that a network interface has counted."""
+    """Frames that the kernel has counted on an interface."""
     return int(Path(f"/sys/class/net/{channel}/statistics/tx_packets").read_text(encoding="ascii"))
 
 
-def findings(samples: Sequence[Sample]) -> list[str]:
-    """What an hour showed."""
+def findings(samples: Sequence[Row]) -> list[str]:
+    """Growth of memory, change of latency, frames and cycles."""
     first, last = samples[0], samples[-1]
-    settled = [s for s in samples if s.t_s >= SETTLED * last.t_s]
+    settled = [s for s in samples if s["t_s"] >= SETTLED * last["t_s"]]
     tenth = max(1, len(samples) // 10)
-    begin, end = (float(np.median([s.latency_us for s in part])) for part in (samples[:tenth], samples[-tenth:]))
-    gone = last.frames_on_bus - last.frames_counted
+    begin, end = (float(np.median([s["latency_us"] for s in part])) for part in (samples[:tenth], samples[-tenth:]))
+    counted, seen = last["frames_counted"], last["frames_on_bus"]
+    since = {name: last[name] - first[name] for name in ("dropped_frames", "cycles", "overruns", "missed_pdos")}
     return [
         f"memory of the master grew by {_growth(settled, 'master_mib'):+.2f} MiB/h, of the nodes by"
         f" {_growth(settled, 'nodes_mib'):+.2f} MiB/h, after the first quarter",
         f"SYNC → last TPDO by the kernel's stamps: {begin:.0f} µs in the first tenth, {end:.0f} µs in the last",
-        f"{last.frames_counted} frames counted by the master, {last.frames_on_bus} by the interface in the same time:"
-        f" {gone:+d} under way or lost, {last.dropped_frames - first.dropped_frames} dropped by the kernel",
-        f"{last.cycles - first.cycles} cycles, {last.overruns - first.overruns} overruns,"
-        f" {last.missed_pdos - first.missed_pdos} PDOs missed",
+        f"{counted} frames counted by the master, {seen} by the interface in the same time:"
+        f" {seen - counted:+d} under way or lost, {since['dropped_frames']} dropped by the kernel",
+        f"{since['cycles']} cycles, {since['overruns']} overruns, {since['missed_pdos']} PDOs missed",
     ]
 
 
-def _growth(samples: Sequence[Sample], name: str) -> float:
+def _growth(samples: Sequence[Row], name: str) -> float:
     """Slope, MiB/h."""
     if len(samples) < 2:
         return 0.0
-    t_h = np.array([s.t_s for s in samples]) / 3600
-    slope = np.polyfit(t_h, [getattr(s, name) for s in samples], 1)[0]
+    t_h = np.array([s["t_s"] for s in samples]) / 3600
+    slope = np.polyfit(t_h, [s[name] for s in samples], 1)[0]
     return round(float(slope), 2) + 0.0  # no minus zero
 
 
-def _drawer(samples: Sequence[Sample]) -> Callable[[Path], None]:
-    def draw(path: Path) -> None:
-        draw_soak(samples, path)
-
-    return draw
-
-
-# The picture of study `soak`: memory, answer latency and overruns over time.
-
-
-def draw_soak(samples: Sequence[Sample], path: Path) -> None:
-    """Three panels over the same time axis."""
-    with picture(path, f"The cell held for {samples[-1].t_s:.0f} s on vcan0", 6.6) as figure:
+def draw_soak(samples: Sequence[Row], path: Path) -> None:
+    """Memory, answer latency and overruns over time."""
+    with picture(path, f"The cell held for {samples[-1]['t_s']:.0f} s on vcan0", 6.6) as figure:
         panels = parts(figure, 3, 1)
         memory, latency, lost = (part.subplots() for part in panels)
-        minutes = [s.t_s / 60 for s in samples]
-        memory.plot(minutes, [s.master_mib for s in samples], color=BLUE, label="master")
-        memory.plot(minutes, [s.nodes_mib for s in samples], "--", color=ORANGE, label="emulated nodes")
-        memory.set_ylabel("resident\nmemory (MiB)")
-        latency.plot(minutes, [s.latency_us for s in samples], ".-", color=BLUE)
-        latency.set_ylabel("SYNC →\nlast TPDO (µs)")
-        lost.plot(minutes, [s.overruns for s in samples], color=BLUE, label="overruns")
-        lost.plot(minutes, [s.missed_pdos for s in samples], "--", color=ORANGE, label="PDOs missed")
-        lost.set_ylabel("number so far")
-        for axes, part in zip((memory, latency, lost), panels, strict=True):
+        minutes = [s["t_s"] / 60 for s in samples]
+        memory.plot(minutes, [s["master_mib"] for s in samples], color=BLUE, label="master")
+        memory.plot(minutes, [s["nodes_mib"] for s in samples], "--", color=ORANGE, label="emulated nodes")
+        latency.plot(minutes, [s["latency_us"] for s in samples], ".-", color=BLUE)
+        lost.plot(minutes, [s["overruns"] for s in samples], color=BLUE, label="overruns")
+        lost.plot(minutes, [s["missed_pdos"] for s in samples], "--", color=ORANGE, label="PDOs missed")
+        labels = ("resident\nmemory (MiB)", "SYNC →\nlast TPDO (µs)", "number so far")
+        for axes, part, label in zip((memory, latency, lost), panels, labels, strict=True):
             axes.set_ylim(bottom=-0.04 * axes.get_ylim()[1])
-            axes.set_xlabel("time (min)")
+            axes.set(xlabel="time (min)", ylabel=label)
             legend(part)

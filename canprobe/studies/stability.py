@@ -1,13 +1,13 @@
 """Study `stability`: where the force loop settles, predicted and carried out, and how every other case ends.
 
 The map goes over contact stiffness × force gain (`servo.surface_height_hz`) for pairs of servo rate and bus delay. Two
-servos are run on it: one that believes the stiffness it was told, as the linear loop of `stability_runs` does, and the
-real one that feels it. Prediction: the largest eigenvalue over one period of the sensor; and the stiffness at which the
-approach, still going on until the first sample of the touch is in, has gone over the force limit. Beside the map, one
+servos run on it: one that uses the stated stiffness, as the linear loop of `stability_runs` does ("told"), and the real
+one, which estimates it ("felt"). Prediction: the largest eigenvalue over one period of the sensor; and the stiffness at
+which the approach exceeds the force limit before the first sample of the touch is received. Beside the map there is one
 line of cases each over the drives' bandwidth, poses near singular ones, radii of probe and object, and speed.
 
-The stiffness is that of the contact at the wanted force, `dF/dδ = 2F/δ`; the layer that is really there is chosen to
-have it. Cases go beyond what a scene file may say (1e5…1e12 N/m³): what is not refused there is run here.
+The stiffness is that of the contact at the wanted force, `dF/dδ = 2F/δ`; the true layer is chosen for it. Cases go
+beyond the limits of a scene file (1e5…1e12 N/m³).
 """
 
 from __future__ import annotations
@@ -16,19 +16,18 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from canprobe.results.picture import AMBER, BLUE, GREY, INK, ORANGE, PINK, legend, log_scale, parts, picture
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
+from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.stability_runs import (
     HUNTING,
-    Array,
     Case,
     ForceLoop,
     carry_out,
@@ -51,7 +50,7 @@ WRISTS_DEG = (0.0, 3.0, 10.0)
 RADII_MM = (1.0, 5.0, 40.0, 10_000.0)
 SPEEDS_MM_S = (25.0, 50.0, 100.0, 250.0)
 SCAN_S = 1.5
-"""Of a scan: in the second half of it the curvature is known."""
+"""Of a scan: the curvature is known in its second half."""
 _AT = (-120.0, -122.5, 374.0)
 WIDE_PERCENT = 20.0
 ENDS = ("stable", "stopped", "refused")
@@ -91,7 +90,7 @@ def cases(quick: bool) -> list[Case]:
 
 
 def _quick_cases() -> list[Case]:
-    """One of every way to end."""
+    """A case for each way to end."""
     return [
         Case("told", 1e4, rate_hz=200.0, feels=False, hold_s=0.1),
         Case("told", 1e7, feels=False),
@@ -124,7 +123,7 @@ def _round(probe_mm: float, radius_mm: float) -> Case:
 
 
 def what_of(case: Case) -> str:
-    """What is special about a case, in words."""
+    """The special parameters of a case, in words."""
     scan = " scan" if case.speed_mm_s else ""
     pose = f"{math.hypot(*case.at_mm[:2]):.0f} mm from axis 1" + scan
     if case.normal[2] != 1.0:
@@ -143,24 +142,21 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
     todo = cases(quick)
     sweep.say(f"{len(todo)} touches")
     rows = [row_of(case, answer) for case, answer in zip(todo, sweep.map(carry_out, todo, model=MODEL), strict=True)]
-
-    def draw(path: Path) -> None:
-        draw_stability(rows, path)
-
-    return StudyResult("stability", COLUMNS, rows, findings(rows), measuring_facts(quick, 1, MODEL), draw)
+    facts = measuring_facts(quick, 1, MODEL)
+    return StudyResult("stability", COLUMNS, rows, findings(rows), facts, partial(draw_stability, rows))
 
 
-def row_of(case: Case, answer: dict[str, Any]) -> dict[str, Any]:
+def row_of(case: Case, answer: Row) -> Row:
     """The row of a cell: case, prediction, answer."""
     known = asdict(case)
     del known["at_mm"], known["normal"], known["posture_deg"]
     return {"what": what_of(case), **known, "eigenvalue": spectral_radius(loop_of(case)), **answer}
 
 
-def approach_limit(row: dict[str, Any], approach_m_s: float = 4e-3, force_max: float = 5.0) -> float:
-    """Contact stiffness (N/m) from which the approach goes over the force limit before it can be told to stop.
+def approach_limit(row: Row, approach_m_s: float = 4e-3, force_max: float = 5.0) -> float:
+    """Contact stiffness (N/m) from which the approach exceeds the force limit before it can be stopped.
 
-    The sample of the touch is taken, sent one frame later and taken in; a target takes two cycles and the drive's lag.
+    The sample of the touch is sent one frame later; a target takes two cycles and the drive's lag.
     """
     period, sample = 1.0 / row["rate_hz"], 1.0 / min(200.0, row["rate_hz"])
     late = 2.0 * math.floor(row["late_ms"] * 1e-3 / period + 1e-9) * period
@@ -168,8 +164,8 @@ def approach_limit(row: dict[str, Any], approach_m_s: float = 4e-3, force_max: f
     return float(2.0 * math.sqrt(force_max * row["force_n"]) / way)
 
 
-def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """How the cells end, whether the prediction holds, and every cell that ends in no way that it may."""
+def findings(rows: Sequence[Row]) -> list[str]:
+    """How the cells end, whether the prediction holds, and every cell that hunts or fails."""
     ends = Counter(str(row["ended"]) for row in rows)
     said = [f"{len(rows)} touches: " + ", ".join(f"{number} {end}" for end, number in ends.most_common()) + "."]
     told = [r for r in rows if r["view"] == "told" and r["ended"] != "refused" and r["contact_n_m"] >= 1e3]
@@ -182,22 +178,23 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
         wrong = sum(r["ended"] != "stable" for r in not_settling)
         early = sum(r["ended"] != "stable" and r["contact_n_m"] > approach_limit(r) for r in not_settling)
         said.append(
-            f"Servo that believes what it was told, from 1e+03 N/m up: of {len(settles)} touches whose eigenvalues lie "
-            f"inside the unit circle {right} are stable, {unheard} heard no image in time, {over} went over the force "
-            f"limit at the touch itself; of {len(not_settling)} outside {wrong} are not stable; {early} of "
-            "these are beyond the approach's own limit, and tell nothing about the loop."
+            f"Servo with the stated stiffness, from 1e+03 N/m up: of {len(settles)} touches whose eigenvalues lie "
+            f"inside the unit circle {right} are stable, {unheard} received no image in time, {over} exceeded the "
+            f"force limit at the touch itself; of {len(not_settling)} outside {wrong} are not stable; {early} of "
+            "these are beyond the limit of the approach, and say nothing about the loop."
         )
     felt = [r for r in rows if r["view"] == "felt" and r["ended"] != "refused"]
-    for name, group in (("believes what it was told", told), ("feels the stiffness", felt)):
+    for name, group in (("stated", told), ("estimated", felt)):
         stable = [r["contact_n_m"] for r in group if r["ended"] == "stable"]
         if stable:
-            said.append(f"The servo that {name} is stable from {min(stable):.0e} to {max(stable):.0e} N/m at best.")
+            span = f"{min(stable):.0e} to {max(stable):.0e} N/m"
+            said.append(f"The servo with the {name} stiffness is stable from {span} at best.")
     kept = [r["error_percent"] for r in rows if r["ended"] == "stable" and r["error_percent"] is not None]
     if kept:
         wide = sum(error > WIDE_PERCENT for error in kept)
         said.append(
             f"Stable touches err by {np.median(kept):.0f} % of the wanted force (median, RMS); {wide} of {len(kept)} "
-            f"by more than {WIDE_PERCENT:.0f} %: stable says that the force settles within its limit, no more."
+            f"by more than {WIDE_PERCENT:.0f} %: stable means only that the force settles within its limit."
         )
     longest = max((r for r in rows if r["above_ms"] is not None), key=lambda r: r["above_ms"], default=None)
     if longest is not None:
@@ -214,7 +211,7 @@ def findings(rows: Sequence[dict[str, Any]]) -> list[str]:
     return said
 
 
-def _named(row: dict[str, Any]) -> str:
+def _named(row: Row) -> str:
     what = f", {row['what']}" if row["what"] else ""
     return (
         f"{row['view']}, {row['contact_n_m']:.0e} N/m, {row['rate_hz']:.0f} Hz, {row['late_ms']:g} ms late, "
@@ -222,15 +219,12 @@ def _named(row: dict[str, Any]) -> str:
     )
 
 
-def _because(row: dict[str, Any]) -> str:
+def _because(row: Row) -> str:
     if row["ended"] == "hunting":
         return f", spread {row['spread_percent']:.0f} %, |λ| {row['eigenvalue']:.2f}"
     return f", {row['reason']}"
 
 
-# The picture of study `stability`.
-
-Row = dict[str, Any]
 END_MARKS = {
     "stable": (BLUE, "o", "stable within limits"),
     "stopped": (AMBER, "s", "stopped safely"),
@@ -239,7 +233,7 @@ END_MARKS = {
     "failed": (ORANGE, "v", "failed"),
 }
 """How a touch ended: colour, marker, words."""
-VIEWS = {"told": "believes what it was told", "felt": "feels the stiffness"}
+VIEWS = {"told": "servo with the stated stiffness", "felt": "servo that estimates the stiffness"}
 SIDES = {"drives": "bandwidth of the drives", "pose": "pose", "radii": "radii", "speed": "speed of a scan"}
 PANELS_IN_A_ROW = 3
 
@@ -250,14 +244,14 @@ def draw_stability(rows: Sequence[Row], path: Path) -> None:
     title = (
         "Force loop: largest eigenvalue over one period of the sensor, and how touches in lockstep end\n"
         "shade: the eigenvalue; black line: where it is 1, unstable to the right; marks: touches carried out\n"
-        "dotted: from here on the approach at 4 mm/s is over the force limit before its first sample can stop it"
+        "dotted: from here on the approach at 4 mm/s exceeds the force limit before its first sample can stop it"
     )
     lines = -(-len(buses) // PANELS_IN_A_ROW)
     with picture(path, title, 4.3 + 1.75 * lines * len(VIEWS)) as figure:
         *maps, lower = parts(figure, len(VIEWS) + 1, 1, height_ratios=(*[1.75 * lines] * len(VIEWS), 3.2))
         stiffness = np.geomspace(70.0, 1.5e7, 40)
         for part, (view, words) in zip(maps, VIEWS.items(), strict=True):
-            part.suptitle(f"servo that {words}", x=0.01, ha="left", fontsize="medium", fontweight="bold")
+            part.suptitle(words, x=0.01, ha="left", fontsize="medium", fontweight="bold")
             ratios = [loop_of(Case(view, float(k), feels=view == "felt")).depth_ratio for k in stiffness]
             grid = part.subplots(lines, min(PANELS_IN_A_ROW, len(buses)), squeeze=False, sharex=True, sharey=True)
             for axes in grid.flat[len(buses) :]:
@@ -301,7 +295,7 @@ def _mark(axes: Axes, row: Row, x: float, y: float) -> None:
 
 
 def _draw_side(axes: Axes, title: str, rows: Sequence[Row]) -> None:
-    """How the cases of one line end: a mark each, in a table of what they are."""
+    """How the cases of one line end: a table with a mark for each."""
     places = [_place(r) for r in rows]
     lines, columns = (list(dict.fromkeys(names)) for names in zip(*places, strict=True)) if places else ([], [])
     for row, (line, column) in zip(rows, places, strict=True):

@@ -1,8 +1,8 @@
-"""One cell of the stability map: what the linear loop predicts, a short touch in lockstep, and how it ended.
+"""One cell of the stability map: the prediction of the linear loop, a short touch in lockstep, and how it ended.
 
-`stable`: carried out to its end. `stopped`: let go and stopped, with the reason. `refused`: by the plan, with the
-reason. `hunting`: carried out, but the force did not settle. `failed`: what must never be (a hang, a NaN, an exception
-of ours, a force above the limit for longer than the stated reaction time and the retreat).
+`stable`: it ran to its end. `stopped`: released and stopped, with the reason. `refused`: by the plan, with the reason.
+`hunting`: it ran to its end, but the force did not settle. `failed`: a hang, a NaN, an exception of ours, or a force
+above the limit for longer than the stated reaction time and the retreat.
 """
 
 from __future__ import annotations
@@ -12,19 +12,15 @@ from collections import deque
 from collections.abc import Container, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from canprobe.cell.assembly import limits_of
-from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.supervision import Limits
+from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.faults import WrappedNode
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.ideal_arm import natural_frequency
-from canprobe.errors import CanprobeError, PlanError, SafetyStop
+from canprobe.errors import PlanError, SafetyStop
 from canprobe.protocol.frames import Frame
 from canprobe.robot.inverse import inverse_near
 from canprobe.robot.kinematics import MODELS, forward
@@ -32,18 +28,17 @@ from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
 from canprobe.session.session import Session, resolve_scene
-from canprobe.studies.fault_scores import RELEASE_NS, HangError, Witness
+from canprobe.studies.fault_scores import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
+from canprobe.studies.harness import Array, Row
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.touch import TouchTask
 from canprobe.touch.contact import indentation_from_force
 from canprobe.touch.patch.array_model import array_calibration
 
-# A node whose PDOs come late, attached to a lockstep bus in the node's place: the delay of a bus or a gateway.
-
 
 class LateNode(WrappedNode):
-    """Holds back some frames to and from a node, in their order; all others pass at once.
+    """Delays some frames to and from a node, as a bus or a gateway does, in their order; all others pass at once.
 
     Args:
         node: the node.
@@ -98,34 +93,32 @@ class LateNode(WrappedNode):
         return now
 
 
-# The force loop as a linear sampled system, and the eigenvalues that tell whether it settles.
+# The force loop as a linear sampled system.
 #
-# Along the contact's normal, about the wanted indentation, all is linear: measured force and wanted force become depths
-# by the same law, so the depth that is measured is the true one times `g`, the true slope of √F over the depth divided
-# by the one that the controller reckons with. With heights outward, 0 on the object, `a` of the servo's surface model
-# and `p` of the probe's tip less the wanted indentation:
+# Along the contact's normal, about the wanted indentation, the loop is linear: measured force and wanted force become
+# depths by the same law, so the measured depth is the true one times `g`, the true slope of √F over the depth divided
+# by the slope that the controller assumes. With heights outward, 0 on the object, `a` of the servo's surface model and
+# `p` of the probe's tip less the wanted indentation:
 #
 #     a ← (1 − H) a + H (1 − g) p of the sample's instant,   H = 1 − exp(−2π height_hz dt)
 #
-# `p` follows `a` as the cycle has it: a target is latched at the SYNC after the cycle that made it and reached by a
-# ramp at the next, with the second-order drive behind; an image is sampled at a trigger, sent at the next one and taken
-# in a cycle later. Frames that are late by more than a period make both later by whole cycles. The state's map over one
-# period of the sensor is one matrix. Stops being true where contact is lost, at encoder counts and joint limits, where
-# the array is saturated, and while the stiffness is still being felt. Damping of the layer (Hunt–Crossley) is left out.
-
-Array = NDArray[np.float64]
+# `p` follows `a` as in the cycle: a target is latched at the SYNC after the cycle that made it and reached by a ramp at
+# the next, with the second-order drive behind; an image is sampled at a trigger, sent at the next one and received a
+# cycle later. Frames that are late by more than a period delay both by whole cycles. The state's map over one period of
+# the sensor is one matrix. The model ends where contact is lost, at encoder counts and joint limits, where the array is
+# saturated, and while the stiffness is being estimated. Damping of the layer (Hunt–Crossley) is left out.
 
 
 @dataclass(frozen=True, slots=True)
 class ForceLoop:
-    """What decides whether the force settles.
+    """Parameters of the linear force loop.
 
     Attributes:
         depth_ratio: g, measured over true depth.
         period_s: of the cycle.
         sample_cycles: cycles between two tactile images.
         height_hz: bandwidth of the surface's height correction, the force gain.
-        late_s: by how much targets and tactile frames come late on the bus.
+        late_s: delay of targets and tactile frames on the bus.
         omega: undamped frequency of the drives, rad/s.
         damping: their damping ratio.
     """
@@ -140,7 +133,7 @@ class ForceLoop:
 
     @property
     def late_cycles(self) -> int:
-        """Whole cycles by which late frames delay what they say."""
+        """Whole cycles of the delay."""
         return math.floor(self.late_s / self.period_s + 1e-9)
 
 
@@ -193,18 +186,7 @@ def spectral_radius(loop: ForceLoop) -> float:
     return float(np.abs(np.linalg.eigvals(sample_map(loop))).max())
 
 
-def steepest_ratio(loop: ForceLoop, most: float = 1e6) -> float:
-    """The largest `depth_ratio` up to which the loop settles, by bisection of its logarithm; inf beyond `most`."""
-    low, high = 1.0, most
-    if spectral_radius(replace(loop, depth_ratio=most)) < 1.0:
-        return math.inf
-    while high / low > 1.0 + 1e-4:
-        middle = math.sqrt(low * high)
-        low, high = (middle, high) if spectral_radius(replace(loop, depth_ratio=middle)) < 1.0 else (low, middle)
-    return low
-
-
-# One cell of the stability map: a short touch in lockstep, watched by a witness, and how it ended.
+# A short touch in lockstep, watched by a witness.
 
 LOOK_NS = 1_250_000
 HUNTING = 0.2
@@ -217,13 +199,12 @@ class Case:
     """A cell of the map.
 
     Attributes:
-        view: the part of the map that it belongs to.
+        view: part of the map.
         contact_n_m: stiffness dF/dδ of the contact at the wanted force, N/m.
         rate_hz: of the servo.
-        late_ms: by how much targets and tactile frames come late.
+        late_ms: delay of targets and tactile frames.
         height_hz: the force gain.
-        feels: the servo learns the stiffness from the touch; else it believes what it was told.
-        told: the controller is told the true stiffness, not that of the default pad.
+        feels: the servo estimates the stiffness from the touch; else it uses that of the default pad.
         bandwidth_hz: of the drives.
         fidelity: of the plant.
         probe_mm: radius of the probe.
@@ -242,7 +223,6 @@ class Case:
     late_ms: float = 0.0
     height_hz: float = 8.0
     feels: bool = True
-    told: bool = False
     bandwidth_hz: float = 30.0
     fidelity: str = "ideal"
     probe_mm: float = 40.0
@@ -257,19 +237,19 @@ class Case:
 
 
 class StatedSensing(ContactSensing):
-    """Believes the stiffness that it was told, whatever is felt."""
+    """Uses the stiffness of the scene, not the one estimated from the touch."""
 
     def set_slope(self, slope: float) -> None:
-        """Leave it."""
+        """Ignore it."""
 
 
 def layer_stiffness(case: Case) -> float:
-    """K/h (N/m³) with which the contact has its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
+    """K/h (N/m³) that gives the contact its stiffness at the wanted force: `dF/dδ = 2F/δ`."""
     depth = 2.0 * case.force_n / case.contact_n_m
     return float(indentation_from_force(case.force_n, 1.0, case.probe_mm * 1e-3, _kappa(case)) / depth) ** 2
 
 
-def _kappa(case: Case) -> np.ndarray[Any, np.dtype[np.float64]]:
+def _kappa(case: Case) -> Array:
     place = true_object(_object(case))
     return np.maximum(place.closest(np.array(case.at_mm) * 1e-3).kappa, -0.9e3 / case.probe_mm)
 
@@ -310,13 +290,13 @@ def upright(normal: tuple[float, float, float], yaw_deg: float = 20.0) -> tuple[
 
 
 def full_scale_kpa(case: Case, stiffness: float) -> float:
-    """Of the array, kPa: the larger one where the wanted force would saturate the usual one, as in scene `steel`."""
+    """Full scale of the array, kPa: the larger one where the wanted force would saturate the other, as in `steel`."""
     peak_pa = stiffness * 2.0 * case.force_n / case.contact_n_m
     return 100.0 if peak_pa < 80e3 else 300.0
 
 
 def scene_of(case: Case) -> Scene:
-    """The scene that a case stands for; its layer may be harder and its radii wider than a file may say."""
+    """The scene of a case; its layer may be harder and its radii larger than a scene file allows."""
     scene = resolve_scene(load_scene("press" if case.speed_mm_s == 0.0 else "cylinder"), duration_s=case.hold_s)
     assert scene.arm is not None and scene.sensor is not None and scene.probe is not None
     stiffness = layer_stiffness(case)
@@ -335,11 +315,7 @@ def scene_of(case: Case) -> Scene:
             mode="features",
             full_scale_kpa=full_scale_kpa(case, stiffness),
         ),
-        probe=replace(
-            scene.probe,
-            radius_mm=case.probe_mm,
-            stiffness_n_m3=stiffness if case.told else scene.probe.stiffness_n_m3,
-        ),
+        probe=replace(scene.probe, radius_mm=case.probe_mm),
         object=_object(case),
         servo=replace(scene.servo or ServoSettings(), surface_height_hz=case.height_hz),
         plant=replace(
@@ -354,7 +330,7 @@ def scene_of(case: Case) -> Scene:
 
 
 def loop_of(case: Case) -> ForceLoop:
-    """The linear loop of a case, with the stiffness that the servo ends up with."""
+    """The linear loop of a case, with the servo's final stiffness."""
     scene = scene_of(case)
     assert scene.probe is not None
     radius, kappa = case.probe_mm * 1e-3, _kappa(case)
@@ -387,113 +363,58 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     )
 
 
-def carry_out(case: Case) -> dict[str, Any]:
+def carry_out(case: Case) -> Row:
     """Run a case to its end: `ended`, `reason` and figures of the force; None where there are none."""
+    names = ("force_max_n", "above_ms", "allowed_ms", "error_percent", "spread_percent")
     try:
-        return _Run(case).result()
-    except PlanError as error:
-        return {"ended": "refused", "reason": str(error).splitlines()[0], **_NO_FORCE}
+        session = Session(scene_of(case))
+        world = session.world
+    except PlanError as refusal:
+        return {"ended": "refused", "reason": str(refusal).splitlines()[0], **dict.fromkeys(names)}
+    task, limits = make_task(session.plan), limits_of(session.plan)
+    assert isinstance(task, TouchTask)
+    if not case.feels:
+        task.sensing = stated_sensing(session.plan.scene)
+    witness = Witness(world.plant, LOOK_NS)
+    if case.late_ms > 0.0:
+        assert session.scene.sensor is not None
+        late_ids = {pdo.cob_id for pdo in session.plan.pdos if pdo.direction == "rpdo"}
+        late_ids |= {pdo.cob_id for pdo in session.plan.pdos_of(session.scene.sensor.node_id, "tpdo")}
+        late = [LateNode(node, late_ids, round(case.late_ms * 1e6)) for node in world.nodes]
+        world.participants[: len(late)] = late
+    world.participants.insert(0, witness)
+    outcome, error = run_to_end(session, task)
+    ended = {"completed": "stable", "hang": "failed", "crash": "failed"}.get(outcome, "stopped")
+    plain = error is None or isinstance(error, SafetyStop)
+    reason = str(error or "") if plain else f"{type(error).__name__}: {error}"
+    force_error, spread = error_and_spread(session, task, case.force_n)
+    forces = np.array([force for _, force in witness.rows])
+    above_ns, allowed_ns = longest_above(witness.rows, limits.safety.force_max), allowed_above(limits, case.late_ms)
+    if not np.isfinite(forces).all():
+        ended, reason = "failed", "the force is not finite"
+    elif above_ns > allowed_ns:
+        ended, reason = "failed", f"force above the limit for {above_ns * 1e-6:.0f} ms; ended: {reason}"
+    elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
+        ended = "hunting"
+    figures = (float(forces.max()), above_ns * 1e-6, allowed_ns * 1e-6, force_error, spread)
+    return {"ended": ended, "reason": reason, **dict(zip(names, figures, strict=True))}
 
 
-_NO_FORCE: dict[str, Any] = {"force_max_n": None, "above_ms": None, "allowed_ms": None, "error_percent": None,
-                             "spread_percent": None}  # fmt: skip
-
-
-class _Run:
-    """One case being carried out."""
-
-    def __init__(self, case: Case) -> None:
-        self.case = case
-        self.session = Session(scene_of(case))
-        self.limits = limits_of(self.session.plan)
-        task = make_task(self.session.plan)
-        assert isinstance(task, TouchTask)
-        if not case.feels:
-            task.sensing = stated_sensing(self.session.plan.scene)
-        self.task = task
-        self.witness: Witness | None = None
-        late_ids = {pdo.cob_id for pdo in self.session.plan.pdos if pdo.direction == "rpdo"}
-        assert self.session.scene.sensor is not None
-        late_ids |= {pdo.cob_id for pdo in self.session.plan.pdos_of(self.session.scene.sensor.node_id, "tpdo")}
-        self._late_ids = late_ids
-        self.session.joins = self._join
-
-    def _join(self, participant: Any) -> Any:
-        if self.witness is None:
-            assert self.session.world is not None and self.session.lockstep is not None
-            self.witness = Witness(self.session.world.plant, LOOK_NS)
-            self.session.lockstep.attach(self.witness)
-        if not hasattr(participant, "node_id") or self.case.late_ms == 0.0:
-            return participant
-        return LateNode(participant, self._late_ids, round(self.case.late_ms * 1e6))
-
-    def result(self) -> dict[str, Any]:
-        ended, reason = self._drive()
-        assert self.witness is not None
-        times, forces = (np.array(column) for column in zip(*self.witness.rows, strict=True))
-        longest_ns = longest_above(times, forces, self.limits.force_max)
-        allowed_ns = allowed_above(self.limits, self.case.late_ms)
-        error, spread = self._error_and_spread()
-        if not np.isfinite(forces).all():
-            ended, reason = "failed", "the force is not finite"
-        elif longest_ns > allowed_ns:
-            ended, reason = "failed", f"force above the limit for {longest_ns * 1e-6:.0f} ms; ended: {reason}"
-        elif ended == "stable" and not (spread is not None and spread <= 100.0 * HUNTING):
-            ended = "hunting"
-        return {
-            "ended": ended,
-            "reason": reason,
-            "force_max_n": float(forces.max()),
-            "above_ms": longest_ns * 1e-6,
-            "allowed_ms": allowed_ns * 1e-6,
-            "error_percent": error,
-            "spread_percent": spread,
-        }
-
-    def _drive(self) -> tuple[str, str]:
-        try:
-            with self.session:
-                self.session.run(self.task)
-        except SafetyStop as stop:
-            return "stopped", str(stop)
-        except PlanError:  # what the plant needs of the arm beyond the plan: to stand above the approach
-            raise
-        except CanprobeError as error:
-            return "stopped", f"{type(error).__name__}: {error}"
-        except HangError as hang:
-            return "failed", f"hang: {hang}"
-        except Exception as error:  # whatever it is, it is a failure of ours, and the map goes on
-            return "failed", f"{type(error).__name__}: {error}"
-        return "stable", ""
-
-    def _error_and_spread(self) -> tuple[float | None, float | None]:
-        """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
-        cycles, truth = self.task.scan_cycles, self.session.truth
-        if cycles is None or "force" not in truth:
-            return None, None
-        half = truth["force"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / self.case.force_n
-        if not half.size:
-            return None, None
-        return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
-
-
-def longest_above(times_ns: Any, forces: Any, limit: float) -> int:
-    """Longest time without a break for which the force is above the limit, ns."""
-    longest, since = 0, None
-    for t_ns, force in zip(times_ns.tolist(), forces.tolist(), strict=True):
-        if force <= limit:
-            since = None
-            continue
-        since = t_ns if since is None else since
-        longest = max(longest, t_ns - since)
-    return int(longest)
+def error_and_spread(session: Session, task: TouchTask, force_n: float) -> tuple[float | None, float | None]:
+    """RMS error and standard deviation of the true force, second half of the hold, percent of the target."""
+    cycles, truth = task.scan_cycles, session.truth
+    if cycles is None or "force" not in truth:
+        return None, None
+    half = truth["force"][(cycles[0] + cycles[1]) // 2 : cycles[1]] / force_n
+    if not half.size:
+        return None, None
+    return 100.0 * float(np.sqrt(np.mean((half - 1.0) ** 2))), 100.0 * float(np.std(half))
 
 
 def allowed_above(limits: Limits, late_ms: float) -> int:
-    """How long a force may be above the limit: the stated reaction, by the force or by an array that hides it, what is
-    late on the bus both ways, the retreat.
+    """Longest time that a force may be above the limit, ns.
+
+    The stated reaction, by the force or by an array that hides it, the delay on the bus both ways, and the retreat.
     """
-    seen, hidden = BY_KEY["force"].within, BY_KEY["force_hidden"].within
-    assert seen is not None and hidden is not None
     late = 2 * math.ceil(late_ms * 1e6 / limits.period_ns) * limits.period_ns
-    return max(seen(limits), hidden(limits)) + late + RELEASE_NS
+    return max(reaction_ns("force", limits), reaction_ns("force_hidden", limits)) + late + RELEASE_NS

@@ -1,4 +1,4 @@
-"""Sweeps: many independent cells on all cores or on a cluster, what is finished kept, the rest taken up again.
+"""Sweeps: many independent cells on all cores or on a cluster; finished cells are kept, a new start computes the rest.
 
 A study is a module with `run(*, quick, sweep) -> StudyResult`. It names a function of the module that measures one cell
 and the cells; the sweep does the rest:
@@ -17,12 +17,12 @@ and the cells; the sweep does the rest:
         answers = sweep.map(measure, cases, model=("touch", "emulator", "studies/my_study.py"))
         costs = sweep.time(measure_cost, settings)             # one at a time, alone, on this machine
         ...
-        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), draw)
+        return StudyResult("my_study", COLUMNS, rows, findings(rows), measuring_facts(quick, 40), partial(draw, rows))
 
 Answers come back in the order of the cells and as JSON gives them, whether they were computed now or earlier: tuples
-and arrays are lists, keys of mappings are text. What decides an answer (parameters, seeds) belongs into the cell, and
-`model` names the files and folders of the package that it rests on (all of it by default): when one of them changes,
-its cells are computed again.
+and arrays are lists, keys of mappings are text. The cell holds all that decides an answer (parameters, seeds). `model`
+names the files and folders of the package that it rests on (all of it by default): when one of them changes, its cells
+are computed again.
 """
 
 from __future__ import annotations
@@ -54,20 +54,20 @@ from canprobe.studies.harness import CellStore, Say, StudyResult, as_json, cell_
 # Where cells are computed: a pool of processes on this machine, or the workers of a Dask cluster.
 
 THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
-"""What tells a BLAS how many threads to use, when it is loaded."""
+"""Variables that a BLAS reads when it is loaded."""
 _DASK_WAIT = "10s"
 _GRACE_S = 1.0
-"""For workers to end by themselves: what they compute may hear SIGTERM as a wish to stop a run, and go on."""
+"""For workers to end by themselves: a run catches SIGTERM, stops, and its worker continues."""
 
 
 @contextlib.contextmanager
 def process_pool(workers: int | None = None) -> Iterator[Executor]:
-    """A pool of processes with one BLAS thread each, ended with the block: at once where it is left by an exception.
+    """A pool of processes with one BLAS thread each, ended with the block; an exception ends it at once.
 
-    Workers never hear Ctrl-C (it is this process that decides), and end when this process is killed.
+    Workers ignore Ctrl-C: this process decides. They end when this process is killed.
 
     Args:
-        workers: processes; one for each core that this process may use by default.
+        workers: number of processes; one for each core that this process may use by default.
     """
     before = set(multiprocessing.active_children())
     pool = ProcessPoolExecutor(
@@ -77,7 +77,7 @@ def process_pool(workers: int | None = None) -> Iterator[Executor]:
         initargs=(os.getpid(),),
     )
     try:
-        with _environment(dict.fromkeys(THREADS, "1")):  # workers start when cells are submitted
+        with _one_blas_thread():  # workers start when cells are submitted
             yield _Deaf(pool)
     except BaseException:
         pool.shutdown(wait=False, cancel_futures=True)
@@ -95,8 +95,8 @@ def dask_executor(address: str) -> Iterator[Executor]:
         address: of the scheduler, such as "tcp://10.0.0.1:8786".
 
     Raises:
-        UsageError: package `distributed` is not there.
-        StudyError: that is no address, or no scheduler answers.
+        UsageError: package `distributed` is missing.
+        StudyError: not an address, or no scheduler answers.
     """
     try:
         from distributed import Client
@@ -117,7 +117,7 @@ def dask_executor(address: str) -> Iterator[Executor]:
 
 
 class _Deaf(Executor):
-    """Submits with SIGINT blocked: workers that this starts inherit it, from their first instruction on."""
+    """Submits with SIGINT blocked: workers inherit that from their first instruction on."""
 
     def __init__(self, pool: ProcessPoolExecutor) -> None:
         self._pool = pool
@@ -142,20 +142,16 @@ def _end(workers: Collection[BaseProcess]) -> None:
 
 
 @contextlib.contextmanager
-def _environment(values: dict[str, str]) -> Iterator[None]:
-    before = {name: os.environ.get(name) for name in values}
-    os.environ.update(values)
+def _one_blas_thread() -> Iterator[None]:
+    before = {name: os.environ[name] for name in THREADS if name in os.environ}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in THREADS:
+            del os.environ[name]
+        os.environ.update(before)
 
-
-# Sweeps: many independent cells on all cores or on a cluster, what is finished kept, the rest taken up again.
 
 Opener = Callable[[], AbstractContextManager[Executor]]
 Progress = Callable[[float, float], None]
@@ -170,18 +166,11 @@ class Sweep:
         store: finished cells.
         say: called with each step.
         progress: called after each cell.
-
-    Attributes:
-        computed: cells computed so far.
-        kept: cells found in the store so far.
     """
 
     def __init__(self, executor: Opener, store: CellStore, *, say: Say, progress: Progress | None = None) -> None:
         self.say = say
-        self.computed = self.kept = 0
-        self._executor = executor
-        self._store = store
-        self._progress = progress or _no_progress
+        self._executor, self._store, self._progress = executor, store, progress
         if store.damaged:
             say(f"{store.path}: {store.damaged} damaged lines left out; their cells are computed again")
 
@@ -194,14 +183,14 @@ class Sweep:
             model: files and folders of the package that the answers rest on; all by default.
 
         Raises:
-            StudyError: a cell failed, or a worker; the cells finished until then are kept.
+            StudyError: a cell or a worker failed; the cells that are finished by then are kept.
         """
         return self._all(measure, cells, tuple(model), None)
 
     def time(self, measure: Callable[[Any], object], cells: Sequence[Any], *, model: Sequence[str] = ()) -> list[Any]:
-        """The same for cells that measure run time: one after another in one process of this machine, nothing beside.
+        """The same for cells that measure run time: one after another, alone, in one process of this machine.
 
-        What was kept counts on the machine that it was measured on only.
+        A kept answer counts on the machine that measured it only.
         """
         return self._all(measure, cells, tuple(model), f"{platform.node()} {platform.processor()}")
 
@@ -213,14 +202,13 @@ class Sweep:
         todo = {key: cell for key, cell in zip(keys, cells, strict=True) if self._store.get(key) is None}
         total = len(set(keys))
         done = total - len(todo)
-        self.kept += done
         if done:
             self.say(f"{done} of {total} cells are kept in {self._store.path}")
 
         def keep(key: str, answer: str) -> None:
             self._store.put(key, {"measure": name, "cell": todo[key], "model": model, "machine": machine}, answer)
-            self.computed += 1
-            self._progress(total - len(todo.keys() - self._store.keys()), total)
+            if self._progress is not None:
+                self._progress(total - len(todo.keys() - self._store.keys()), total)
 
         if todo:
             with self._executor() if machine is None else process_pool(1) as executor:
@@ -231,43 +219,34 @@ class Sweep:
 
 @contextmanager
 def open_sweep(
-    folder: Path,
-    *,
-    say: Say,
-    progress: Progress | None = None,
-    workers: int | None = None,
-    dask: str | None = None,
-    fresh: bool = False,
+    folder: Path, *, workers: int | None = None, dask: str | None = None, fresh: bool = False, **watched: Any
 ) -> Iterator[Sweep]:
     """A sweep over the processes of this machine, or a Dask cluster, that keeps its cells in a folder.
 
     Args:
         folder: for `cells.jsonl`; what it holds is not computed again.
-        say: called with each step.
-        progress: called after each cell.
-        workers: processes, one for each core by default.
+        workers: number of processes, one for each core by default.
         dask: address of a Dask scheduler to use instead.
         fresh: forget what the folder holds.
+        watched: `say` and `progress` of the sweep.
 
     Raises:
         StudyError: another process uses the folder.
     """
     store = CellStore(folder, fresh=fresh)
     try:
-        yield Sweep(
-            partial(dask_executor, dask) if dask else partial(process_pool, workers), store, say=say, progress=progress
-        )
+        yield Sweep(partial(dask_executor, dask) if dask else partial(process_pool, workers), store, **watched)
     finally:
         store.close()
 
 
 def _compute(measure: Callable[[Any], object], parts: tuple[str, ...], model: str, cell: Any) -> tuple[bool, str]:
-    """In the worker: whether it went well, and the answer or what went wrong. Not every exception can be pickled."""
+    """In the worker: success, and the answer or the error as text. Not every exception can be pickled."""
     try:
         if (here := model_digest(parts)) != model:
             return False, f"the worker on {platform.node()} has another canprobe or numpy (model {here}, not {model})"
         return True, as_json(measure(cell))
-    except Exception as error:  # said again in the main process
+    except Exception as error:  # raised again in the main process
         frame = traceback.extract_tb(error.__traceback__)[-1]
         return False, f"{type(error).__name__}: {error} ({Path(frame.filename).name}:{frame.lineno})"
 
@@ -278,7 +257,7 @@ def _collect(
     cells: Mapping[str, Any],
     keep: Callable[[str, str], None],
 ) -> None:
-    """Compute cells and keep the answers as they come, those too that are ready when something goes wrong."""
+    """Compute cells and keep the answers as they come, also those that are ready when an exception ends it."""
     futures = {executor.submit(task, cell): key for key, cell in cells.items()}
     left = set(futures)
     try:
@@ -302,23 +281,19 @@ def _answer(future: Future[tuple[bool, str]], cell: Any) -> str:
     return text
 
 
-def _no_progress(_done: float, _total: float) -> None:
-    """Nobody watches."""
-
-
 STUDIES: Mapping[str, str] = MappingProxyType(
     {
         "estimators": "error of the shape estimators against their run time, with the Cramér–Rao bound",
-        "bound": "how near to the Cramér–Rao bound the estimators come, over surfaces, sizes, paths and noise",
-        "pipeline": "whether the online estimator's 95 % regions hold with the whole sensor pipeline on",
-        "workprec": "error of the dynamic plant against its run time, and of the whole cell against what it computes",
+        "bound": "error and coverage of the estimators over the Cramér–Rao bound: surfaces, sizes, paths and noise",
+        "pipeline": "whether the online estimator's 95 % regions hold the truth with the whole sensor pipeline on",
+        "workprec": "error of the dynamic plant against its run time, and of the whole cell against its computing time",
         "stability": "where the force loop settles, predicted and carried out, and how every other touch ends",
         "realtime": "how well the cycle keeps time on a real vcan0, against plain canopen-python; needs that interface",
         "soak": "an hour on a real vcan0: memory, clocks and counters; needs that interface",
-        "faults": "what the cell does about thousands of random faults of its nodes and their links",
+        "faults": "how the cell reacts to thousands of random faults of its nodes and their links",
     }
 )
-"""Name → what it shows. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
+"""Name → what it measures. The module of that name in this package has `run(*, quick, sweep) -> StudyResult`."""
 
 
 def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> StudyResult:
@@ -329,12 +304,7 @@ def run_study(name: str, *, quick: bool, sweep: Sweep, vcan: bool = False) -> St
         quick: fewer repeats and cases.
         sweep: computes its cells.
         vcan: its form with processes on a real vcan0, which `faults` has.
-
-    Raises:
-        UsageError: for an unknown name.
     """
-    if name not in STUDIES:
-        raise UsageError(f"study: expected one of {', '.join(STUDIES)}, got {name!r}")
     module = importlib.import_module(f"canprobe.studies.{name}_vcan" if vcan else f"canprobe.studies.{name}")
     result: StudyResult = module.run(quick=quick, sweep=sweep)
     return result

@@ -1,14 +1,13 @@
-"""Study `workprec`: what the dynamic plant's integrators cost and how wrong they are, over steps and stiffness.
+"""Study `workprec`: cost and error of the dynamic plant's integrators, over steps and stiffness.
 
-Each cell integrates the same sliding contact (`trial`) and is compared with scipy's Radau at rtol 1e-10, at
-which nothing is held. `held` cells keep mass matrix, bias and contact geometry over a cycle of 2.5 ms, as the plant
-does; the others evaluate them in every call. Where both have the same error, holding costs nothing. Cost is processor
-time a cycle, the best of several repeats, the first one apart. Errors are RMS over the cycles' ends:
-force relative to the reference's RMS force, position of the probe's centre, pressure of a taxel in counts of 1/255 of
-the full scale. Besides, each method and step must come to rest against a contact of 10 MN/m, the stiffest that the
-project looks at: explicit steps that are not short enough rattle there.
+Each cell integrates the same sliding contact (`trial`) and is compared with scipy's Radau at rtol 1e-10, which holds
+nothing. `held` cells keep mass matrix, bias and contact geometry over a cycle of 2.5 ms, as the plant does; the others
+evaluate them in every call. Cost is processor time per cycle, the best of several repeats without the first. Errors are
+RMS over the ends of the cycles: force relative to the reference's RMS force, position of the probe's centre, pressure
+of a taxel in counts of 1/255 of the full scale. Each method and step must also come to rest against a contact of
+10 MN/m, the stiffest here: explicit steps that are too long rattle there.
 
-The whole cell, of which the plant is a part, is measured by `workprec_cell`.
+`workprec_cell` measures the whole cell, of which the plant is a part.
 """
 
 from __future__ import annotations
@@ -16,14 +15,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from itertools import product
 from pathlib import Path
 from time import process_time
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from canprobe.emulator.plant.config import PlantConfig
@@ -35,17 +33,13 @@ from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK
 from canprobe.robot.inverse import inverse_near, probe_pose, start_posture
 from canprobe.robot.kinematics import UPENN, counts_per_radian, counts_to_joints, joints_to_counts, tool_z_offset
 from canprobe.scene.setup import Dynamics
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
+from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
 from canprobe.studies.workprec_cell import run_cell
 from canprobe.touch.objects import make_object
 
-# The motion that study `workprec` integrates: a sliding contact on the cylinder, and its reference solution.
-#
-# The probe starts at rest in contact and is led over the cylinder at 25 mm/s at the indentation of 2 N, by one straight
-# ramp a cycle, as the cell does. Drives, links, friction and contact are all on.
-
-Array = npt.NDArray[np.float64]
+# The motion: the probe starts at rest in contact and slides over the cylinder at 25 mm/s at the indentation of 2 N, one
+# straight ramp per cycle, as in the cell. Drives, links, friction and contact are on.
 
 CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0
@@ -55,15 +49,7 @@ _POINT, _TOOL, _RADIUS = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
 
 @cache
 def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
-    """The plant and its drives' targets.
-
-    Args:
-        stiffness_n_m3: of the layer.
-        cycles: of 2.5 ms.
-
-    Returns:
-        The configuration, and (cycles + 1, 6) whole counts at the ends of the cycles.
-    """
+    """The plant with a layer of a stiffness, and its drives' targets: (cycles + 1, 6) counts, one row per 2.5 ms."""
     pose = np.eye(4)
     pose[:3, 3] = _POINT
     shape = make_object("cylinder", T_base_object=pose, radius=_RADIUS)
@@ -105,13 +91,7 @@ def integrated(stiffness_n_m3: float, cycles: int, stepping: Stepping, held: boo
 
 
 def stands(stiffness_n_m3: float, cycles: int, stepping: Stepping) -> bool:
-    """Whether the arm comes to rest in contact after a nudge of one motor, as it does in truth.
-
-    Args:
-        stiffness_n_m3: of the layer.
-        cycles: of 2.5 ms.
-        stepping: how it is integrated.
-    """
+    """Whether the arm comes to rest in contact after a nudge of one motor, as a real one does."""
     config, _ = trial(stiffness_n_m3, 1)
     arm = DynamicArm(UPENN, config.q0, make_equations(config), stepping)
     start, fastest = arm.motor_counts(0), []
@@ -146,13 +126,7 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
 
 
 def observed(stiffness_n_m3: float, cycles: int, states: Array) -> dict[str, Array]:
-    """What the states mean: force (n,) N, probe centre (n, 3) m, taxel pressures (n, 256) Pa.
-
-    Args:
-        stiffness_n_m3: of the layer.
-        cycles: of the trial.
-        states: (n, 12) counts and rates.
-    """
+    """Force (n,) N, probe centre (n, 3) m and taxel pressures (n, 256) Pa of states (n, 12), counts and rates."""
     plant = Plant(trial(stiffness_n_m3, cycles)[0])
     at = [PlantState(0, tuple(row[:6].tolist()), tuple(row[6:].tolist())) for row in states]
     truths = [plant.truth(state) for state in at]
@@ -163,22 +137,20 @@ def observed(stiffness_n_m3: float, cycles: int, states: Array) -> dict[str, Arr
     }
 
 
-# Study `workprec`: what the dynamic plant's integrators cost and how wrong they are, over steps and stiffness.
-
 STIFFNESSES = (1.6e7, 1.27e8, 1.27e9, 1.27e11)
 """K/h of the layer, N/m³: foam, the default pad, steel, and a hundred times that. At 2 N: 3.3, 9.4, 30, 300 kN/m."""
 METHODS = ("semi-implicit", "rk4", "implicit", "rosenbrock", "exponential", "adaptive")
 STEPS_US = (2500.0, 1250.0, 625.0, 312.5, 156.25, 78.125)
 FULL_SCALE_PA = 100e3
 STIFFEST, REST_CYCLES = 1.4e14, 40
-"""K/h at which 2 N make a contact of 10 MN/m, and how long the arm has to come to rest there."""
+"""K/h at which 2 N make a contact of 10 MN/m, and the cycles in which the arm must come to rest there."""
 SPAN = STIFFNESSES[:3]
-"""What the cell is made for: the default must be accurate enough there."""
+"""Stiffnesses at which the default must be accurate enough."""
 LINEARLY_IMPLICIT = ("implicit", "rosenbrock")
 FREE_METHODS, FREE_STEPS_US = ("rk4", "rosenbrock"), (1250.0, 312.5, 78.125)
-"""Where the dynamics are not held: what tells the error of holding them."""
-ENOUGH = {"force": 1.0, "position": 2.9, "taxels": 0.29}
-"""Errors below which nothing is gained: 1 % of the force, and what encoders (10 µm) and ADC round off, RMS."""
+"""Cells in which the dynamics are not held."""
+ENOUGH = {"force_percent": 1.0, "position_um": 2.9, "taxel_counts": 0.29}
+"""Small enough errors: 1 % of the force, and the rounding of encoders (10 µm) and ADC, RMS."""
 MODEL = ("robot", "touch/objects.py", "touch/shapes.py", "emulator/plant", "studies/workprec.py")
 COLUMNS = (
     Column("stiffness_n_m3", "K/h N/m³", ".3g"),
@@ -196,7 +168,7 @@ COLUMNS = (
 
 @dataclass(frozen=True, slots=True)
 class Case:
-    """One integration; with `method` "radau" the reference, `step_us` then being its relative tolerance."""
+    """One integration; method "radau" is the reference, and `step_us` then its relative tolerance."""
 
     stiffness_n_m3: float
     method: str
@@ -235,11 +207,7 @@ def run(*, quick: bool, sweep: Sweep) -> StudyResult:
         broke = answer["states"] is None
         row |= dict.fromkeys(floors[k]) if broke else errors(truths[k], observed(k, cycles, np.array(answer["states"])))
         rows.append(row | {"verdict": verdict(row)})
-
-    def draw(path: Path) -> None:
-        draw_workprec(rows, floors, default_choice(), path)
-
-    facts = measuring_facts(quick, 0, MODEL)
+    facts, draw = measuring_facts(quick, 0, MODEL), partial(draw_workprec, rows, floors, default_choice())
     whole = run_cell(quick=quick, sweep=sweep)
     return StudyResult("workprec", COLUMNS, rows, findings(rows, floors), facts, draw, (whole,))
 
@@ -287,38 +255,27 @@ def _rms(values: Array) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
 
-def verdict(row: dict[str, Any]) -> str:
+def verdict(row: Row) -> str:
     """`enough`, `coarse`, or `broke down`."""
     if row["force_percent"] is None or not row["force_percent"] <= 100.0:
         return "broke down"
-    small = (row["force_percent"], row["position_um"], row["taxel_counts"])
-    return "enough" if all(e <= ENOUGH[name] for e, name in zip(small, ENOUGH, strict=True)) else "coarse"
+    return "enough" if all(row[name] <= most for name, most in ENOUGH.items()) else "coarse"
 
 
-def default_choice() -> dict[str, Any]:
-    """What the dynamic plant does by default."""
+def default_choice() -> Row:
+    """The default of the dynamic plant."""
     settings = Dynamics()
     return {"held": True, "method": settings.integrator, "step_us": settings.step_ns / 1000.0}
 
 
-def knee(rows: Sequence[dict[str, Any]], stiffness: float) -> dict[str, Any] | None:
+def knee(rows: Sequence[Row], stiffness: float) -> Row | None:
     """The cheapest integration that is accurate enough, of one stiffness."""
     good = [r for r in rows if r["stiffness_n_m3"] == stiffness and r["verdict"] == "enough"]
     return min(good, key=lambda r: float(r["cost_us"]), default=None)
 
 
-def choice(
-    rows: Sequence[dict[str, Any]], methods: Sequence[str] = LINEARLY_IMPLICIT
-) -> tuple[tuple[str, float], float] | None:
-    """Method and step that a default may have: accurate enough over the whole span, at rest at the stiffest contact.
-
-    Args:
-        rows: of the study.
-        methods: that may be it.
-
-    Returns:
-        The one that costs least over the span, and that cost.
-    """
+def choice(rows: Sequence[Row], methods: Sequence[str] = LINEARLY_IMPLICIT) -> tuple[tuple[str, float], float] | None:
+    """The cheapest method and step that is accurate enough over the span and stands, and its cost over the span."""
     cost: dict[tuple[str, float], float] = {}
     for kind in {(r["method"], r["step_us"]) for r in rows if r["held"] and r["method"] in methods}:
         mine = [r for r in rows if r["held"] and (r["method"], r["step_us"]) == kind and r["stiffness_n_m3"] in SPAN]
@@ -327,17 +284,13 @@ def choice(
     return min(cost.items(), key=lambda item: item[1], default=None)
 
 
-def is_default(row: dict[str, Any]) -> bool:
-    """Whether a row is the plant's default."""
-    return all(row[name] == value for name, value in default_choice().items())
-
-
-def findings(rows: Sequence[dict[str, Any]], floors: dict[float, dict[str, float]]) -> list[str]:
-    """The knee of every stiffness, the default beside it, what holding costs, and how good the reference is."""
+def findings(rows: Sequence[Row], floors: dict[float, dict[str, float]]) -> list[str]:
+    """The knee of every stiffness, the default beside it, the error of holding, and that of the reference."""
     said = [_chosen(rows)]
     for k, floor in floors.items():
         best = knee(rows, k)
-        mine = next((r for r in rows if is_default(r) and r["stiffness_n_m3"] == k), None)
+        default = default_choice() | {"stiffness_n_m3": k}
+        mine = next((r for r in rows if r | default == r), None)
         said.append(f"K/h {k:.3g} N/m³: cheapest that is accurate enough {_named(best)}.")
         if mine is not None and best is not None:
             share = mine["cost_us"] / best["cost_us"]
@@ -350,21 +303,18 @@ def findings(rows: Sequence[dict[str, Any]], floors: dict[float, dict[str, float
     return said
 
 
-def _chosen(rows: Sequence[dict[str, Any]]) -> str:
-    """Whether the default is the knee of those that may be it."""
+def _chosen(rows: Sequence[Row]) -> str:
+    """Whether the default is the cheapest of those that may be the default."""
     found, any_found, mine = choice(rows), choice(rows, METHODS), default_choice()
     default = f"{mine['method']} at {mine['step_us']:.0f} µs"
     if found is None or any_found is None:
         return f"No linearly implicit step here is accurate enough over the span and stands; the default is {default}."
     (method, step), cost = found
+    is_default = found[0] == (mine["method"], mine["step_us"])
     said = (
         f"Of the linearly implicit steps that are accurate enough over the span (K/h {SPAN[0]:.3g} to {SPAN[-1]:.3g} "
         f"N/m³) and stand at 10 MN/m the cheapest is {method} at {step:.0f} µs: "
-        + (
-            "the knee, and the default."
-            if found[0] == (mine["method"], mine["step_us"])
-            else f"not the default, {default}."
-        )
+        + ("the knee, and the default." if is_default else f"not the default, {default}.")
     )
     if any_found[0] == found[0]:
         return said
@@ -372,14 +322,12 @@ def _chosen(rows: Sequence[dict[str, Any]]) -> str:
     return f"{said} Of all steps that do so {method} at {step:.0f} µs costs least, {least / cost:.2f} × as much."
 
 
-def _holding(rows: Sequence[dict[str, Any]], stiffness: float) -> list[str]:
-    """What holding mass matrix, bias and geometry over a cycle costs: the error at the finest step of rosenbrock."""
+def _holding(rows: Sequence[Row], stiffness: float) -> list[str]:
+    """The error of holding mass matrix, bias and geometry over a cycle, at the finest step of rosenbrock."""
     fine = [r for r in rows if r["stiffness_n_m3"] == stiffness and r["method"] == "rosenbrock"]
     step = min((r["step_us"] for r in fine if not r["held"]), default=0.0)
     held, free = (next((r for r in fine if r["step_us"] == step and r["held"] is h), None) for h in (True, False))
-    if held is None or free is None:
-        return []
-    if held["force_percent"] is None or free["force_percent"] is None:
+    if held is None or free is None or held["force_percent"] is None or free["force_percent"] is None:
         return []
     return [
         f"  held over a cycle, step {step:.0f} µs: force {held['force_percent']:.2g} %, position "
@@ -388,57 +336,38 @@ def _holding(rows: Sequence[dict[str, Any]], stiffness: float) -> list[str]:
     ]
 
 
-def _named(row: dict[str, Any] | None) -> str:
+def _named(row: Row | None) -> str:
     if row is None:
         return "none is accurate enough"
     how = "held" if row["held"] else "not held"
-    wrong = (
-        ""
-        if row["force_percent"] is None
-        else (
-            f" (force {row['force_percent']:.2g} %, position {row['position_um']:.2g} µm, "
-            f"taxels {row['taxel_counts']:.2g} counts)"
-        )
-    )
-    return f"{row['method']} at {row['step_us']:.0f} µs, {how}, {row['cost_us']:.0f} µs a cycle{wrong}"
+    text = f"{row['method']} at {row['step_us']:.0f} µs, {how}, {row['cost_us']:.0f} µs a cycle"
+    if row["force_percent"] is None:
+        return text
+    error = f"force {row['force_percent']:.2g} %, position {row['position_um']:.2g} µm"
+    return f"{text} ({error}, taxels {row['taxel_counts']:.2g} counts)"
 
 
-# The picture of study `workprec`.
-
-COLOURS = {
-    "semi-implicit": AMBER,
-    "rk4": ORANGE,
-    "implicit": GREY,
-    "rosenbrock": BLUE,
-    "exponential": PINK,
-    "adaptive": GREEN,
-}
-MEASURES = (
-    ("force_percent", "force error (%)", "force"),
-    ("position_um", "position error (µm)", "position"),
-    ("taxel_counts", "taxel error (counts)", "taxels"),
-)
+COLOURS = dict(zip(METHODS, (AMBER, ORANGE, GREY, BLUE, PINK, GREEN), strict=True))
+LABELS = ("force error (%)", "position error (µm)", "taxel error (counts)")
 
 
-def draw_workprec(
-    rows: Sequence[dict[str, Any]], floors: Mapping[float, dict[str, float]], default: dict[str, Any], path: Path
-) -> None:
-    """Error against cost: a row of panels a measure, a column a stiffness."""
+def draw_workprec(rows: Sequence[Row], floors: Mapping[float, dict[str, float]], default: Row, path: Path) -> None:
+    """Error against cost: a row of panels for each measure, a column for each stiffness."""
     title = (
         "Dynamic plant: error against processor time a cycle of 2.5 ms, each dot a step size\n"
         "solid: mass matrix, bias and contact geometry held over a cycle; dotted: evaluated in every call\n"
         "ring: the default; open: rattles against a contact of 10 MN/m; shade: accurate enough"
     )
     with picture(path, title, 8.2) as figure:
-        grid = figure.subplots(len(MEASURES), len(floors), squeeze=False, sharex=True, sharey="row")
-        for line, (key, label, name) in zip(grid, MEASURES, strict=True):
+        grid = figure.subplots(len(ENOUGH), len(floors), squeeze=False, sharex=True, sharey="row")
+        for line, (key, enough), label in zip(grid, ENOUGH.items(), LABELS, strict=True):
             known = [r for r in rows if r[key] is not None]
             for axes, (stiffness, floor) in zip(line, floors.items(), strict=True):
                 _draw(axes, [r for r in known if r["stiffness_n_m3"] == stiffness], key, floor[key], default)
-                axes.axhspan(1e-12, ENOUGH[name], color=SHADE, linewidth=0, zorder=0)
+                axes.axhspan(1e-12, enough, color=SHADE, linewidth=0, zorder=0)
                 log_scale(axes, "xy")
             line[0].set_ylabel(label)
-            seen = [ENOUGH[name], *(max(r[key], floors[r["stiffness_n_m3"]][key]) for r in known)]
+            seen = [enough, *(max(r[key], floors[r["stiffness_n_m3"]][key]) for r in known)]
             line[0].set_ylim(max(0.3 * min(seen), 1e-7), min(3.0 * max(seen), 1e3))
         for axes, stiffness in zip(grid[0], floors, strict=True):
             axes.set_title(f"K/h {stiffness:.3g} N/m³")
@@ -447,7 +376,7 @@ def draw_workprec(
         legend(figure)
 
 
-def _draw(axes: Axes, rows: Sequence[dict[str, Any]], key: str, floor: float, default: dict[str, Any]) -> None:
+def _draw(axes: Axes, rows: Sequence[Row], key: str, floor: float, default: Row) -> None:
     """One panel; nothing below the reference's own error."""
     for method, colour in COLOURS.items():
         for held, line in ((True, "-"), (False, ":")):
@@ -462,7 +391,7 @@ def _draw(axes: Axes, rows: Sequence[dict[str, Any]], key: str, floor: float, de
                     [r["cost_us"] for r in dots], [max(r[key], floor) for r in dots], "o", color=colour, markersize=4.5,
                     markerfacecolor=colour if stands else "white",
                 )  # fmt: skip
-    chosen = [r for r in rows if all(r[name] == value for name, value in default.items())]
+    chosen = [r for r in rows if r | default == r]
     axes.plot(
         [r["cost_us"] for r in chosen], [max(r[key], floor) for r in chosen], "o", markersize=12,
         markerfacecolor="none", markeredgecolor=INK, markeredgewidth=1.4,

@@ -1,20 +1,21 @@
-"""The other half of study `workprec`: error of the whole cell against what it computes in a second.
+"""The other half of study `workprec`: error of the whole cell against its computing time.
 
 Each cell of the sweep is a scan of scene `cylinder` in lockstep: master, bus, emulated nodes and plant in one process.
-Its cost is processor time a second of the scan; its errors are those of the surface felt (curvature, normal) and of the
-true force. The plan is asked first: what a bus cannot carry is a row with the plan's reason, and is tried again with
-CAN FD for the taxels. What the drives send and get is classical all the same, so that a rate stays beyond a bus of
-1 Mbit/s: such rates are scanned on a bus of 8 Mbit/s, which no CAN has, to show what the rate alone would bring.
+Its cost is processor time per second of the scan; its errors are those of the estimated surface (curvature, normal) and
+of the true force. What the plan refuses is a row with its reason, and is tried again with CAN FD for the taxels. The
+drives use classical frames all the same: rates beyond a bus of 1 Mbit/s are scanned on a bus of 8 Mbit/s, which no CAN
+has, for the effect of the rate alone.
 
 The knee is the cheapest combination on a classical bus whose errors are all small enough (`ENOUGH`) and whose servo
-also holds the stiffest contact that the cell is made for, 40 kN/m: a scan of each setting there tells. There is one
-scan a combination: two of a setting with other noise differ by some tenths of their errors.
+holds the stiffest contact of the cell, 40 kN/m, in a scan of its own. There is one scan for each combination: two with
+different noise differ by some tenths of their errors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from time import process_time
@@ -31,7 +32,7 @@ from canprobe.results.picture import FAINT, INK, METHOD_COLOURS, legend, log_sca
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import PlantSettings, Scene
 from canprobe.scene.resolve import resolve
-from canprobe.studies.harness import Column, StudyResult, measuring_facts
+from canprobe.studies.harness import Column, Row, StudyResult, measuring_facts, on_any_bitrate
 from canprobe.studies.sweep import Sweep
 from canprobe.tasks.probing import Phase
 from canprobe.touch.estimate.fit import METHODS
@@ -40,9 +41,9 @@ RATES_HZ = (100.0, 200.0, 400.0, 500.0, 1000.0, 2000.0)
 MODES = ("features", "window", "image")
 FIDELITIES = ("ideal", "dynamic")
 SENSOR_HZ = {500.0: 250.0}
-"""Of the tactile frames where 200 Hz, or the servo's rate if that is less, does not divide the servo's."""
+"""Rate of the tactile frames where 200 Hz does not divide the servo's."""
 ENOUGH = {"curvature_percent": 2.0, "normal_deg": 0.2, "force_percent": 6.0}
-"""Errors that count as small enough: the force as the servo is to keep it at 25 mm/s; shape and normal assumed."""
+"""Small enough errors: the goal of the servo's force at 25 mm/s; shape and normal assumed."""
 MEASURES = tuple(ENOUGH)
 CLASSICAL, FD, FASTER = "classical", "FD", "8 Mbit/s"
 REAL = (CLASSICAL, FD)
@@ -63,12 +64,11 @@ COLUMNS = (
     Column("ended", "ended"),
     Column("reason", "why"),
 )
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """What bus and plan have to carry."""
+    """Rate, mode of the sensor and bus."""
 
     rate_hz: float
     mode: str
@@ -88,7 +88,7 @@ class Case:
 
 
 def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
-    """Ask the plan for every setting, and scan with what fits, one scan at a time."""
+    """Plan every setting, and scan with those that fit, one scan at a time."""
     rates, modes = ((200.0, 500.0), MODES[1:2]) if quick else (RATES_HZ, MODES)
     methods = ("recursive",) if quick else METHODS
     why: dict[Setting, str | None] = {}
@@ -118,10 +118,9 @@ def run_cell(*, quick: bool, sweep: Sweep) -> StudyResult:
         if reason is not None
     ]
 
-    def draw(path: Path) -> None:
-        draw_cell(rows, path)
-
-    return StudyResult("workprec_cell", COLUMNS, rows, findings(rows), measuring_facts(quick, 1), draw)
+    return StudyResult(
+        "workprec_cell", COLUMNS, rows, findings(rows), measuring_facts(quick, 1), partial(draw_cell, rows)
+    )
 
 
 def scene_of(setting: Setting) -> Scene:
@@ -130,20 +129,20 @@ def scene_of(setting: Setting) -> Scene:
     assert scene.sensor is not None and scene.shape is not None
     rate = setting.rate_hz
     eds = "tactile_array_fd.eds" if setting.bus == FD else scene.sensor.eds
-    bitrate = FASTER_BITRATE if setting.bus == FASTER else scene.bus.bitrate
     sensor = replace(scene.sensor, mode=setting.mode, rate_hz=SENSOR_HZ.get(rate, min(rate, 200.0)), eds=eds)  # type: ignore[arg-type]
-    return replace(
+    scene = replace(
         scene,
         cycle=replace(scene.cycle, rate_hz=rate),
         sensor=sensor,
-        bus=replace(scene.bus, fd=setting.bus == FD, bitrate=bitrate),
+        bus=replace(scene.bus, fd=setting.bus == FD),
         shape=replace(scene.shape, also=()),
         task=replace(scene.task, clearance_mm=0.5),
     )
+    return on_any_bitrate(scene, FASTER_BITRATE) if setting.bus == FASTER else scene
 
 
 def refusal(setting: Setting) -> str | None:
-    """Why the plan refuses a setting; None where it fits."""
+    """The plan's reason to refuse a setting; None where it fits."""
     try:
         make_plan(resolve(scene_of(setting)))
     except PlanError as error:
@@ -152,7 +151,7 @@ def refusal(setting: Setting) -> str | None:
 
 
 def measure(case: Case) -> dict[str, Any]:
-    """Errors of a scan, and its cost in ms of processor time a second."""
+    """Errors of a scan, and its cost in ms of processor time per second."""
     scene = scene_of(case.setting)
     assert scene.shape is not None
     scene = replace(
@@ -209,7 +208,7 @@ def good(rows: Iterable[Row], fidelity: str) -> list[Row]:
 
 
 def default_of(rows: Iterable[Row], fidelity: str) -> Row | None:
-    """The row of what scene `cylinder` does by default, on a plant of a fidelity."""
+    """The row of the defaults of scene `cylinder`, on a plant of a fidelity."""
     scene = load_scene("cylinder")
     assert scene.sensor is not None and scene.shape is not None
     mine = scene.cycle.rate_hz, scene.sensor.mode, scene.shape.method, fidelity
@@ -217,7 +216,7 @@ def default_of(rows: Iterable[Row], fidelity: str) -> Row | None:
 
 
 def findings(rows: Sequence[Row]) -> list[str]:
-    """The knee of each fidelity and the default beside it, what fidelity changes, and what did not come about."""
+    """The knee of each fidelity and the default beside it, the effect of rate and fidelity, stopped and refused."""
     said: list[str] = []
     for fidelity in FIDELITIES:
         best, mine = next(iter(good(rows, fidelity)), None), default_of(rows, fidelity)
@@ -225,7 +224,8 @@ def findings(rows: Sequence[Row]) -> list[str]:
         if mine is not None and mine is best:
             said.append("  It is the default.")
         elif mine is not None:
-            said.append(f"  It is not the default, {_told(mine)}{_times(mine, best)}.")
+            times = f": {mine['cost_ms_per_s'] / best['cost_ms_per_s']:.1f} × that cost" if best else ""
+            said.append(f"  It is not the default, {_text_of(mine)}{times if mine['ended'] == 'done' else ''}.")
     return [*said, *_of_the_rate(rows), *_of_the_plant(rows), *_not_done(rows)]
 
 
@@ -235,18 +235,12 @@ def _knee(best: Row | None) -> str:
         return f"no combination is within {limits} of curvature, normal and force and holds 40 kN/m"
     return (
         f"the knee, the cheapest on classical CAN within {limits} of curvature, normal and force whose servo also "
-        f"holds a contact of 40 kN/m, is {_told(best)}"
+        f"holds a contact of 40 kN/m, is {_text_of(best)}"
     )
 
 
-def _times(mine: Row, best: Row | None) -> str:
-    if best is None or mine["ended"] != "done":
-        return ""
-    return f": {mine['cost_ms_per_s'] / best['cost_ms_per_s']:.1f} × that cost"
-
-
 def _of_the_rate(rows: Sequence[Row]) -> list[str]:
-    """What the servo's rate brings, for window and recursive on the ideal plant, real buses or not."""
+    """Cost and errors over the servo's rate, for window and recursive on the ideal plant, on any bus."""
     told = []
     for rate in RATES_HZ:
         mine = [r for r in rows if (r["rate_hz"], r["mode"], r["method"], r["fidelity"])
@@ -262,7 +256,7 @@ def _of_the_rate(rows: Sequence[Row]) -> list[str]:
 
 
 def _of_the_plant(rows: Sequence[Row]) -> list[str]:
-    """How much dearer the dynamic plant is, and what its errors are over those of the ideal one."""
+    """Cost and errors with the dynamic plant over those with the ideal one."""
     key: Callable[[Row], tuple[Any, ...]] = lambda r: (r["rate_hz"], r["mode"], r["method"])  # noqa: E731
     done = {(*key(r), r["fidelity"]): r for r in rows if r["ended"] == "done"}
     pairs = [(r, done[*k[:3], "ideal"]) for k, r in done.items() if k[3] == "dynamic" and (*k[:3], "ideal") in done]
@@ -276,7 +270,7 @@ def _of_the_plant(rows: Sequence[Row]) -> list[str]:
 
 
 def _not_done(rows: Sequence[Row]) -> list[str]:
-    """What was stopped and what was refused, shortly; the reasons are in the table."""
+    """The scans that were stopped and the settings that were refused; the reasons are in the table."""
     said = []
     stopped = [r for r in rows if r["ended"] == "stopped"]
     for fidelity in FIDELITIES:
@@ -291,7 +285,7 @@ def _not_done(rows: Sequence[Row]) -> list[str]:
     return said
 
 
-def _told(row: Row) -> str:
+def _text_of(row: Row) -> str:
     what = f"{row['rate_hz']:.0f} Hz, {row['mode']}, {row['bus']}, {row['method']}"
     if row["ended"] != "done":
         return f"{what}, {row['ended']}: {row['reason']}"
@@ -303,8 +297,6 @@ def _told(row: Row) -> str:
     )
 
 
-# The picture of the whole cell's half of study `workprec`.
-
 MARKS = {"features": "^", "window": "o", "image": "s"}
 SIZES = {100.0: 14.0, 200.0: 34.0, 400.0: 72.0, 500.0: 90.0, 1000.0: 140.0, 2000.0: 210.0}
 PANELS = (
@@ -315,10 +307,12 @@ PANELS = (
 
 
 def draw_cell(rows: Sequence[Row], path: Path) -> None:
-    """Error against cost: a row of panels a measure, a column a fidelity."""
+    """Error against cost: a row of panels for each measure, a column for each fidelity."""
+    refused, stopped = (sum(r["ended"] == how for r in rows) for how in ("refused", "stopped"))
     title = (
         "Whole cell: error against processor time a second of the scan, master, bus, nodes and plant in one process\n"
-        f"ring: the default; star: the knee; not drawn: {_left_out(rows)}"
+        f"ring: the default; star: the knee; not drawn: {refused} settings that the plan refuses, {stopped} scans that "
+        "were stopped for safety"
     )
     with picture(path, title, 9.6) as figure:
         grid = figure.subplots(len(PANELS), len(FIDELITIES), squeeze=False, sharex=True, sharey="row")
@@ -330,12 +324,6 @@ def draw_cell(rows: Sequence[Row], path: Path) -> None:
             top.set_title(f"{fidelity} plant")
             bottom.set_xlabel("processor time a second (ms)")
         legend(figure, _keys(rows))
-
-
-def _left_out(rows: Sequence[Row]) -> str:
-    refused = sum(r["ended"] == "refused" for r in rows)
-    stopped = sum(r["ended"] == "stopped" for r in rows)
-    return f"{refused} settings that the plan refuses, {stopped} scans that were stopped for safety"
 
 
 def _draw(axes: Axes, rows: Sequence[Row], key: str, fidelity: str) -> None:

@@ -7,15 +7,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.planning.model import Plan
 from canprobe.protocol.tactile import WINDOW
-from canprobe.scene.setup import Calibrate, Free, Listen, Probe, Setup, Touch
-from canprobe.tasks.probing import MotionBounds, ProbeMotion
+from canprobe.scene.setup import Calibrate, Free, Probe, Setup, Touch
+from canprobe.tasks.probing import ProbingTask
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, replay_samples
 from canprobe.tasks.touch import TouchTask
@@ -23,7 +19,6 @@ from canprobe.touch.patch.array_model import PAD_LAG, array_calibration
 from canprobe.touch.patch.moments import MomentImage
 
 if TYPE_CHECKING:
-    from canprobe.tasks.calibrate import CalibrateTask
     from canprobe.touch.estimate.online import Estimator
 
 
@@ -43,32 +38,8 @@ seeds 100 and 101 of saddle and sphere; `canprobe study pipeline` verifies with 
 SCANNING = 2.0
 """Variance of second moments on a pad that slides over changing curvature, over that of the presses that the patch was
 calibrated with: of scans of torus, bowl and wave (seed 0) with the patch alone 1.7, 1.5 and 1.0, rounded up."""
-Vector = NDArray[np.float64]
 WITH_PATCH = ("recursive", "ml")
 """Estimators whose answers the patch completes and whose regions follow changes; the others stay as they were."""
-
-
-def make_touch_task(plan: Plan, task: Touch) -> TouchTask:
-    """The task of a ``scan`` or ``press`` scene."""
-    sensing = make_sensing(task)
-    return TouchTask(task, limits_of(plan), sensing, _motion(plan, sensing), make_shape_tracker(plan.setup))
-
-
-def _motion(plan: Plan, sensing: ContactSensing) -> Callable[[Vector], ProbeMotion]:
-    """What makes the probe's motion from the first joint angles."""
-    limits, model, flange_probe = plan.setup.limits, sensing.model, sensing.flange_probe
-    bounds = MotionBounds(
-        margin=limits.joint_margin, speed_share=limits.speed_share, workspace=limits.workspace, radius=sensing.radius
-    )
-    return lambda q: ProbeMotion(model, flange_probe, q, plan.sync.period_ns * 1e-9, bounds)
-
-
-def make_calibrate_task(plan: Plan, task: Calibrate) -> CalibrateTask:
-    """The task of a ``calibrate`` scene."""
-    from canprobe.tasks.calibrate import CalibrateTask
-
-    sensing = make_sensing(task)
-    return CalibrateTask(task, limits_of(plan), sensing, _motion(plan, sensing))
 
 
 def make_sensing(task: Touch | Calibrate) -> ContactSensing:
@@ -102,7 +73,6 @@ def make_shape_estimator(task: Touch, method: str) -> Estimator:
         method,
         sigma_point=SIGMA_POINT_M,
         sigma_normal=SIGMA_NORMAL_RAD,
-        probe_radius=task.probe.radius,
         memory_m=memory,
         window=window,
         correlation=Correlation(*CORRELATION),
@@ -158,18 +128,22 @@ def estimates_of(setup: Setup, tracker: ShapeTracker, methods: Iterable[str]) ->
 def make_task(plan: Plan) -> Controller:
     """The controller of the plan's task; what the task does not need is not even imported."""
     period_s, task = plan.sync.period_ns * 1e-9, plan.setup.task
+    if isinstance(task, Touch):
+        return TouchTask(plan, task, make_sensing(task), make_shape_tracker(plan.setup))
+    if isinstance(task, Calibrate):
+        from canprobe.tasks.calibrate import CalibrateTask
+
+        return CalibrateTask(plan, task, make_sensing(task))
     if isinstance(task, Free):
         from canprobe.tasks.untouched import FreeTask
 
         return FreeTask(task.swing, task.period_s, task.duration_s, period_s)
-    if isinstance(task, Listen):
-        from canprobe.tasks.untouched import ListenTask
+    from canprobe.tasks.untouched import ListenTask
 
-        return ListenTask(array_calibration(task.array.full_scale), task.duration_s, period_s, limits_of(plan))
-    return make_calibrate_task(plan, task) if isinstance(task, Calibrate) else make_touch_task(plan, task)
+    return ListenTask(array_calibration(task.array.full_scale), task.duration_s, period_s)
 
 
-# A task that somebody outside starts, stops and sets while it runs; what may be asked for was checked before.
+# A task that a bridge starts, stops and sets while it runs; its requests were checked before.
 #
 # A new target force or speed is approached at a bounded rate: no request makes a step.
 
@@ -212,7 +186,7 @@ class RequestedTask(Controller):
         command = self._task.step(measurement)
         if columns:
             command = replace(command, columns={**command.columns, **columns})
-        if self._stopping and not isinstance(self._task, TouchTask):
+        if self._stopping and not isinstance(self._task, ProbingTask):
             command = replace(command, done=True)
         if command.done and self._make is not None:
             self._task, self._stopping = None, False
@@ -242,7 +216,7 @@ class RequestedTask(Controller):
     def _take(self, kind: str, value: float | None) -> None:
         if kind == "stop":
             self._stopping = self._task is not None
-            if isinstance(self._task, TouchTask):
+            if isinstance(self._task, ProbingTask):
                 self._task.stop()
         elif kind == "start":
             if self._task is None and self._make is not None:

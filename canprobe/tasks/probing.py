@@ -1,12 +1,9 @@
-"""What every task that touches with the probe has: its settings and phases, the probe's motion, what it says in each
-cycle.
-"""
+"""What every task that touches with the probe has: the probe's motion, the phases, and the order of a cycle."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
@@ -14,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dgesv
 
-from canprobe.cell.controller import Command, TactileSample
-from canprobe.cell.supervision import Limits
-from canprobe.cell.supervisor import HiddenForce, outside_workspace
+from canprobe.cell.controller import Command, Measurement, TactileSample
+from canprobe.cell.supervision import Contact, limits_of
+from canprobe.cell.supervisor import outside_workspace
+from canprobe.planning.model import Plan
 from canprobe.robot.inverse import damped_step
-from canprobe.robot.kinematics import PumaModel, forward_jacobian
+from canprobe.robot.kinematics import forward_jacobian
+from canprobe.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.contact import ContactSample
@@ -36,23 +35,6 @@ SMALL_STEP = 0.01
 """Joint step of one cycle (rad) below which the exact inverse is taken: 230 deg/s at 400 Hz."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionBounds:
-    """What a probe's motion keeps to.
-
-    Attributes:
-        margin: distance from every joint stop, rad.
-        speed_share: of the joints' speed limits.
-        workspace: lowest and highest position (2, 3) of the probe's tip, m, base frame; None without one.
-        radius: from the probe's centre to its tip, m.
-    """
-
-    margin: float = 0.0
-    speed_share: float = 1.0
-    workspace: Vector | None = None
-    radius: float = 0.0
-
-
 class ProbeMotion:
     """Keeps the commanded joint angles of a probe whose pose is asked for cycle by cycle.
 
@@ -60,22 +42,23 @@ class ProbeMotion:
     command, and the step is small enough that its second-order error is gone in the next cycle.
 
     Args:
-        model: the arm.
-        flange_probe: transform (4, 4) from the probe's centre frame to the flange.
-        q: joint angles to start from (6,), rad.
+        arm, probe: what moves.
+        safety: what joints and probe must keep to.
         period_s: of the cycle.
-        bounds: what joints and probe must keep to.
+        q: joint angles to start from (6,), rad.
+
+    Attributes:
+        limit: what a joint or the workspace forbids; None where nothing does.
+        slowed: cycles in which a joint could not keep up.
     """
 
-    def __init__(
-        self, model: PumaModel, flange_probe: Vector, q: Vector, period_s: float, bounds: MotionBounds
-    ) -> None:
+    def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
         self.q = np.array(q, dtype=float)
-        self._model = model
-        self._flange_probe = flange_probe
-        self._bounds = bounds
-        self._step_max: list[float] = (model.qd_max * bounds.speed_share * period_s).tolist()
-        self._low, self._high = model.q_min + bounds.margin, model.q_max - bounds.margin
+        self._model = model = arm.model
+        self._flange_probe = flange_probe = probe.T_flange_probe
+        self._workspace, self._radius = safety.workspace, probe.radius
+        self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
+        self._low, self._high = model.q_min + safety.joint_margin, model.q_max - safety.joint_margin
         self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
         self.pose_matrix, _ = forward_jacobian(model, self.q, flange_probe)
         self._x_reference: tuple[float, float, float] = tuple(self.pose_matrix[:3, 0].tolist())
@@ -88,15 +71,11 @@ class ProbeMotion:
         return ProbePose(self.pose_matrix[:3, 3], self.pose_matrix[:3, 2])
 
     def step(self, pose: ProbePose) -> Vector:
-        """Joint targets (6,), rad, one step nearer to ``pose``.
-
-        Sets :attr:`limit` at a joint's stop and outside the workspace; counts in :attr:`slowed` the cycles in which a
-        joint could not keep up.
-        """
+        """Joint targets (6,), rad, one step nearer to ``pose``."""
         T, J = forward_jacobian(self._model, self.q, self._flange_probe)
         self.pose_matrix = T
-        if self._bounds.workspace is not None:
-            self.limit = outside_workspace(T[:3, 3] + self._bounds.radius * T[:3, 2], self._bounds.workspace)
+        if self._workspace is not None:
+            self.limit = outside_workspace(T[:3, 3] + self._radius * T[:3, 2], self._workspace)
         twist = _pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
         dq = self._increment(J, twist)
         share = max([abs(step) / most for step, most in zip(dq.tolist(), self._step_max, strict=True)])
@@ -160,17 +139,14 @@ class LineMotion:
         start: pose to leave.
         end: pose to reach.
         speed: mean speed, m/s.
-        angular_speed: mean angular speed of the pole, rad/s.
         at_once: leave with twice the mean speed, which then falls to zero: to let go of what is pressed.
     """
 
-    def __init__(
-        self, start: ProbePose, end: ProbePose, speed: float, angular_speed: float = 0.5, *, at_once: bool = False
-    ) -> None:
+    def __init__(self, start: ProbePose, end: ProbePose, speed: float, *, at_once: bool = False) -> None:
         self._start, self._end, self._at_once = start, end, at_once
         distance = float(np.linalg.norm(end.centre - start.centre))
         angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
-        self.duration = max(distance / speed, angle / angular_speed, 0.05)
+        self.duration = max(distance / speed, angle / 0.5, 0.05)  # the pole turns at 0.5 rad/s on average
 
     def at(self, t: float) -> ProbePose:
         """Pose ``t`` seconds after the start; the end pose afterwards."""
@@ -181,10 +157,45 @@ class LineMotion:
         )
 
 
-# What every task that touches with the probe has: a phase, the probe's motion, and what it says in each cycle.
+class ArcMotion:
+    """Round a centre: direction along a great circle, distance and pole by a quintic time law.
+
+    Args:
+        centre: of the ball (3,), m.
+        start: pose to leave, not at the centre.
+        end: pose to reach; not opposite to the first.
+        speed: mean speed, m/s.
+    """
+
+    def __init__(self, centre: Vector, start: ProbePose, end: ProbePose, speed: float) -> None:
+        self._centre, self._poles = centre, (start.pole, end.pole)
+        a, b = start.centre - centre, end.centre - centre
+        self._radii = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+        self._a, self._b = a / self._radii[0], b / self._radii[1]
+        self._angle = math.acos(max(-1.0, min(1.0, float(self._a @ self._b))))
+        pole_angle = math.acos(max(-1.0, min(1.0, float(start.pole @ end.pole))))
+        way = math.hypot(self._angle * max(self._radii), self._radii[1] - self._radii[0])
+        self.duration = max(way / speed, pole_angle / 0.7, 0.05)
+
+    def at(self, t: float) -> ProbePose:
+        """Pose ``t`` seconds after the start; the end pose afterwards."""
+        s = smooth_step(t / self.duration)
+        if self._angle > 1e-6:
+            direction = math.sin((1 - s) * self._angle) * self._a + math.sin(s * self._angle) * self._b
+            direction = direction / math.sin(self._angle)
+        else:
+            direction = self._b
+        radius = self._radii[0] + s * (self._radii[1] - self._radii[0])
+        pole = self._poles[0] + s * (self._poles[1] - self._poles[0])
+        return ProbePose(self._centre + radius * direction, pole / math.sqrt(float(pole @ pole)))
+
+
+# What every task that touches with the probe has: phases, and the order of a cycle.
 
 CYCLES_TO_EFFECT = 2
 """From a SYNC to the moment its command begins to take effect, behind which the drives lag."""
+RETREAT_SPEED = 20e-3
+"""m/s."""
 LONGEST_STEP = 4
 """Periods that one command makes up for at most after an overrun; the rest of a longer stall is lost time."""
 
@@ -202,52 +213,78 @@ class Phase(IntEnum):
 
 
 class ProbingTask(Task):
-    """Base of the tasks that touch.
+    """Base of the tasks that touch: the order of a cycle, and the phases that all of them have.
 
     Args:
+        plan: of a cell with an arm; beyond its limits the probe retreats and the cell stops.
         lag_s: of the drives behind a ramp.
-        limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
-        motion_from: makes the probe's motion from the first joint angles.
 
     Attributes:
-        phase: what it is about.
-        reason: why it stopped; None while all is well.
+        phase: what it does now.
+        sensing: as given.
+        reason: why it stopped; None as long as it goes on.
         taxels: last image of the touch itself.
     """
 
     lets_go = True
 
-    def __init__(
-        self,
-        lag_s: float,
-        limits: Limits,
-        sensing: ContactSensing,
-        motion_from: Callable[[Vector], ProbeMotion],
-    ) -> None:
+    def __init__(self, plan: Plan, lag_s: float, sensing: ContactSensing) -> None:
         self.phase = Phase.MOVE
         self.sensing = sensing
         self.reason: str | None = None
         self.taxels: NDArray[np.uint8] | None = None
-        self._limits = limits
-        period_s = limits.period_ns * 1e-9
-        self._lead_s = CYCLES_TO_EFFECT * period_s + lag_s
-        self._motion_from = motion_from
+        self._setup = plan.setup
+        self._touch = Contact(limits_of(plan))
+        self._period_s = self._dt = plan.sync.period_ns * 1e-9
+        self._lead_s = CYCLES_TO_EFFECT * self._period_s + lag_s
         self._motion: ProbeMotion | None = None
-        self._period_s = self._dt = period_s
+        self._line: LineMotion | ArcMotion | None = None
+        self._cycle = 0
         self._last_ns: int | None = None
         self._t = 0.0
-        self._force = 0.0
-        self._hidden, self._off_pad = HiddenForce(), HiddenForce()
+        self._floor = 0.0
         self._columns: dict[str, float | Vector] = {}
+        self._estimate: SurfaceEstimate | None = None
+        self._phases: dict[Phase, Callable[[], ProbePose]] = {
+            Phase.MOVE: self._move,
+            Phase.APPROACH: self._approach,
+            Phase.SETTLE: self._settle,
+            Phase.SCAN: self._scan,
+            Phase.RETREAT: self._retreat,
+            Phase.DONE: self._stay,
+            Phase.REGAIN: self._regain,
+        }
 
     def record(self) -> TaskRecord:
         """What it knows so far."""
         slowed = self._motion.slowed if self._motion is not None else 0
         return TaskRecord(taxels=self.taxels, unplaced=self.sensing.dropped, slowed=slowed)
 
+    def step(self, measurement: Measurement) -> Command:
+        """One cycle."""
+        self._cycle = measurement.cycle
+        self._pass_time(measurement.t_ns)
+        if self._motion is None:
+            setup = self._setup
+            assert measurement.q is not None and setup.arm is not None
+            self._motion = ProbeMotion(setup.arm, setup.probe, setup.limits, self._period_s, measurement.q)
+            self._begin(self._motion.pose)
+        patch = self.sensing.step(measurement)
+        if patch is not None and measurement.tactile is not None:
+            self._feel(measurement.tactile, patch)
+        self._touch.tactile_age = measurement.tactile_age
+        self._watch()
+        pose = self._phases[self.phase]()
+        self._t += self._dt
+        return self._command(pose)
+
     def retreat(self, reason: str) -> None:
         """Let go and end for a reason that the cell has."""
+        raise NotImplementedError
+
+    def stop(self) -> None:
+        """Let go and be done, from whatever phase."""
         raise NotImplementedError
 
     def _pass_time(self, t_ns: int) -> None:
@@ -256,15 +293,19 @@ class ProbingTask(Task):
         self._last_ns = t_ns
         self._dt = min(passed, LONGEST_STEP * self._period_s)
 
-    def _enter(self, phase: Phase) -> None:
-        self.phase = phase
-        self._t = 0.0
+    def _begin(self, pose: ProbePose) -> None:
+        """Start the first move, from where the probe is."""
+        raise NotImplementedError
 
-    def _done(self) -> ProbePose:
-        assert self._motion is not None
-        return self._motion.pose
+    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+        """Take a tactile sample."""
+        raise NotImplementedError
 
-    def _command(self, pose: ProbePose, estimate: SurfaceEstimate | None = None) -> Command:
+    def _watch(self) -> None:
+        """Check the touch by the table of conditions."""
+        raise NotImplementedError
+
+    def _command(self, pose: ProbePose) -> Command:
         """One step of the probe to a pose, as the cell takes it; a joint's limit on the way makes the task let go."""
         assert self._motion is not None
         target = self._motion.step(pose)
@@ -277,7 +318,7 @@ class ProbingTask(Task):
             done=done and self.reason is None,
             stop_reason=self.reason if done else None,
             columns=self._columns,
-            estimate=estimate,
+            estimate=self._estimate,
         )
 
     def _felt_columns(
@@ -294,3 +335,51 @@ class ProbingTask(Task):
             "contact_mm": contact.p_base * 1e3 if contact is not None else nothing,
             "normal": contact.n_base if contact is not None else nothing,
         }
+
+    # phases: each returns the pose for this cycle
+
+    def _enter(self, phase: Phase) -> None:
+        self.phase = phase
+        self._t = 0.0
+
+    def _move(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._lead_s + 0.1:
+            self._floor = self._touch.force  # an array that was pressed for long shows some of it for a while
+            self._enter(Phase.APPROACH)
+        return pose
+
+    def _approach(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _settle(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _scan(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _regain(self) -> ProbePose:
+        raise NotImplementedError
+
+    def _draw_back(self, way: Vector) -> None:
+        """Begin the retreat by a way (3,), m, off the object."""
+        assert self._motion is not None
+        pose = self._motion.pose
+        self._line = LineMotion(pose, ProbePose(pose.centre + way, pose.pole), RETREAT_SPEED, at_once=True)
+        self._enter(Phase.RETREAT)
+
+    def _retreat(self) -> ProbePose:
+        assert self._line is not None
+        pose = self._line.at(self._t)
+        if self._t >= self._line.duration + self._lead_s:
+            self._off()
+        return pose
+
+    def _off(self) -> None:
+        """The probe is off the object."""
+        self._enter(Phase.DONE)
+
+    def _stay(self) -> ProbePose:
+        assert self._motion is not None
+        return self._motion.pose

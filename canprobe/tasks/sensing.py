@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.assembly import patch_of
+from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
 from canprobe.robot.kinematics import PumaModel, count_sigma, forward
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 Vector = NDArray[np.float64]
 SETTLING = 0.08
-"""Uncertainty of the curvatures over that of the probe at which they tell the layer's stiffness from the touch."""
+"""Uncertainty of the curvatures over that of the probe at which the touch yields the layer's stiffness."""
 MOST_RATIO = 6.0
 """Between the slope that is felt and the one of the stated stiffness on a plane; further apart it is not believed."""
 REFUTED = 0.25
@@ -31,12 +31,16 @@ HOLLOWEST = 0.9
 """Least curvature over −1/radius of the probe at which a patch still makes sense."""
 
 
+HISTORY = 64
+"""Cycles whose joints are kept."""
+
+
 class JointHistory:
     """The last joint angles with their times, to be interpolated at a tactile sample's instant."""
 
-    def __init__(self, length: int = 64) -> None:
-        self._times: deque[int] = deque(maxlen=length)
-        self._joints: deque[Vector] = deque(maxlen=length)
+    def __init__(self) -> None:
+        self._times: deque[int] = deque(maxlen=HISTORY)
+        self._joints: deque[Vector] = deque(maxlen=HISTORY)
 
     def add(self, t_ns: int, q: Vector) -> None:
         """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""
@@ -110,7 +114,7 @@ class ContactSensing:
         self._history = JointHistory()
 
     def step(self, measurement: Measurement) -> Patch | None:
-        """Take one measurement; the patch of a new tactile sample, or None where there is none."""
+        """Take one measurement; the patch of a new tactile sample, or None without one."""
         if measurement.q is not None:
             self._history.add(measurement.t_ns, measurement.q)
         if measurement.tactile is None:
@@ -179,7 +183,7 @@ class ContactSensing:
         )
 
     def _moments(self, sample: TactileSample, patch: Patch) -> Moments | None:
-        """Second moments of the image; None where nobody asked, or they are not those of the whole patch."""
+        """Second moments of the image; None where they are not wanted, or not those of the whole patch."""
         if self._moment_image is None or patch.saturated or patch.cut_by_pad or patch.too_few:
             return None
         return self._moment_image.moments(mended(sample.frame.taxels)[0] if patch.dead else sample.frame.taxels)

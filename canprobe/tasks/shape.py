@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 GAP_S = 0.1
 """Time without contact after which an estimator starts afresh: a contact that is regained may be of another surface."""
 SHARPEST = 1e3
-"""1/m; no pad feels a ball of 1 mm, so an answer beyond it has diverged."""
+"""1/m; no pad measures a ball of 1 mm, so an answer beyond it has diverged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class ShapeRecord:
         t_s: instant of its last sample, s, since the first SYNC; in results on the run's clock.
         travelled_m: path of the contact since the start of the scan, m.
         estimate: the answer, in the base frame's terms.
-        told_s: instant of the cycle in which it was told, s, on the same clock.
+        told_s: instant of the cycle in which it was reported, s, on the same clock.
     """
 
     t_s: float
@@ -48,7 +48,6 @@ class ShapeTracker:
     Args:
         estimator: the online estimator.
         every: samples between two answers.
-        gap_s: time without a contact after which the estimator starts afresh.
 
     Attributes:
         records: every answer.
@@ -57,14 +56,13 @@ class ShapeTracker:
         restarts: how often the estimator diverged and started afresh.
     """
 
-    def __init__(self, estimator: Estimator, every: int, gap_s: float = GAP_S) -> None:
+    def __init__(self, estimator: Estimator, every: int) -> None:
         self.records: list[ShapeRecord] = []
         self.samples: list[ContactSample] = []
         self.travelled_m = 0.0
         self.restarts = 0
         self._estimator = estimator
         self._every = max(1, every)
-        self._gap_s = gap_s
         self._waiting: list[ContactSample] = []
         self._taken = 0
         self._found: tuple[SurfaceEstimate, float] | None = None
@@ -73,7 +71,7 @@ class ShapeTracker:
         """Note one contact; `work` takes it."""
         if self.samples:
             last = self.samples[-1]
-            if sample.t_s - last.t_s > self._gap_s:
+            if sample.t_s - last.t_s > GAP_S:
                 self._estimator.reset()
                 self._waiting.clear()
                 self._taken, self._found = len(self.samples), None
@@ -121,7 +119,7 @@ class ShapeTracker:
 
 
 def has_diverged(estimate: SurfaceEstimate) -> bool:
-    """Whether an answer is none: not finite, or sharper than anything that a pad can feel."""
+    """Whether an answer is not finite, or sharper than anything that a pad can measure."""
     known = np.asarray(estimate.kappa)[np.asarray(estimate.observed)]
     finite = np.isfinite(known).all() and np.isfinite(estimate.S).all() and np.isfinite(estimate.T_frame_contact).all()
     return not (finite and bool((np.abs(known) < SHARPEST).all()))

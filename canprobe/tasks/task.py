@@ -23,7 +23,7 @@ class Loss:
     Attributes:
         cycle: in which it was noticed.
         searched: how far the probe went towards the object, m.
-        regained_s: time from there to the new touch; None while, or because, there is none.
+        regained_s: time from there to the new touch; None without one.
     """
 
     cycle: int
@@ -33,7 +33,7 @@ class Loss:
 
 @dataclass(frozen=True, slots=True)
 class TaskRecord:
-    """What a task knows at its end; a controller of somebody's own leaves an empty one.
+    """What a task knows at its end; a user's own controller leaves an empty one.
 
     Attributes:
         shape: the estimator's contacts and answers; None where no shape was asked for.

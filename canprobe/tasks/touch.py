@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.controller import Command, Measurement
-from canprobe.cell.supervision import TOUCH_FORCE, Contact, Limits, Reaction
-from canprobe.cell.supervisor import touch_finding
+from canprobe.cell.conditions import touch_finding
+from canprobe.cell.controller import Command, Measurement, TactileSample
+from canprobe.cell.supervision import TOUCH_FORCE, Reaction
+from canprobe.planning.model import Plan
 from canprobe.scene.setup import Touch
-from canprobe.tasks.probing import LineMotion, Phase, ProbeMotion, ProbingTask, smooth_step
+from canprobe.tasks.probing import LineMotion, Phase, ProbingTask, smooth_step
 from canprobe.tasks.sensing import ContactSensing, is_too_hollow
 from canprobe.tasks.shape import ShapeTracker
 from canprobe.tasks.task import Loss, TaskRecord
 from canprobe.touch.contact import AtRest, ContactSample, PushFit
+from canprobe.touch.patch.image import Patch
 from canprobe.touch.servo import LocalSurface, PathFollower, ProbePose, TactileServo
 
 if TYPE_CHECKING:
@@ -86,8 +88,8 @@ AT_REST = 0.7
 """Share of the settling time after which nothing is asked to change any more."""
 LOST = 0.1
 """Share of the wanted force below which a scan or a hold has lost its contact: the hysteresis of the array."""
-RETREAT, RETREAT_SPEED = 6e-3, 20e-3
-"""Way off the object (m) and its speed (m/s)."""
+RETREAT = 6e-3
+"""Way off the object, m."""
 SETTLE_S = 0.5
 """At rest in contact before the scan."""
 RAMP_S = 0.05
@@ -99,38 +101,27 @@ class TouchTask(ProbingTask):
     """Approach an object, touch it with a given force, follow a strategy over it or hold still, and let go.
 
     Args:
+        plan: of the cell.
         task: what to do.
-        limits: of the cell; beyond them the probe retreats and the cell stops.
         sensing: contacts from measurements.
-        motion_from: makes the probe's motion from the first joint angles.
         shape: the estimator in the loop; None where no shape is asked for.
     """
 
-    def __init__(
-        self,
-        task: Touch,
-        limits: Limits,
-        sensing: ContactSensing,
-        motion_from: Callable[[Vector], ProbeMotion],
-        shape: ShapeTracker | None,
-    ) -> None:
-        super().__init__(task.lag_s, limits, sensing, motion_from)
+    def __init__(self, plan: Plan, task: Touch, sensing: ContactSensing, shape: ShapeTracker | None) -> None:
+        super().__init__(plan, task.lag_s, sensing)
         self.shape = shape
         self._scan_start: int | None = None
         self._scan_end: int | None = None
         self._task = task
         self._target_force = task.force
         self._speed = task.scan.speed if task.scan is not None else 0.0
-        self._line: LineMotion | None = None
         self._servo: TactileServo | None = None
-        self._cycle = 0
         self._sample_t: float | None = None
-        self._lost = 0.0
         self.losses: list[Loss] = []
         self._search: Search | None = None
         self._asked: ProbePose | None = None
         self._velocity: Vector = np.zeros(3)
-        self._scan_t = self._searched_before = self._floor = 0.0
+        self._scan_t = self._searched_before = 0.0
         self._contact: ContactSample | None = None
         self._depth0 = 0.0
         self._push = PushFit()
@@ -138,7 +129,6 @@ class TouchTask(ProbingTask):
         self._at_rest = AtRest()
         self._pole0: Vector = np.zeros(3)
         self._shape_columns: dict[str, float | Vector] = {}
-        self._estimate: SurfaceEstimate | None = None
         self._updated = True
 
     @property
@@ -178,20 +168,11 @@ class TouchTask(ProbingTask):
         """One cycle of the task."""
         self.update()
         self._updated = False
-        if self._motion is None:
-            assert measurement.q is not None
-            self._motion = self._motion_from(measurement.q)
-            self._line = LineMotion(self._motion.pose, self._above(self._task.approach.clearance), 30e-3)
-        self._cycle = measurement.cycle
-        self._pass_time(measurement.t_ns)
         self._estimate = self.shape.answer(measurement.t_ns * 1e-9) if self.shape is not None else None
-        self._sense(measurement)
-        self._watch(measurement)
-        pose = _STEPS[self.phase](self)
-        self._t += self._dt
+        command = super().step(measurement)
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_t += self._dt
-        return self._command(pose, self._estimate)
+        return command
 
     def update(self) -> None:
         """The estimator's work after a step, once: when the commands are out, or else before the next step."""
@@ -201,19 +182,12 @@ class TouchTask(ProbingTask):
 
     # sensing and supervision
 
-    def _sense(self, measurement: Measurement) -> None:
-        patch = self.sensing.step(measurement)
-        if patch is None or measurement.tactile is None:
-            return
-        self._force = patch.force
-        felt = not patch.saturated or self._push.certain(CERTAIN)
-        self._hidden.add(not felt, measurement.tactile.t_sample_ns)
+    def _feel(self, sample: TactileSample, patch: Patch) -> None:
+        self._touch.feel(patch, sample.t_sample_ns, known=patch.saturated and self._push.certain(CERTAIN))
         if self.phase is Phase.SCAN:
-            self.taxels = measurement.tactile.frame.taxels
-        touching = patch.force > TOUCH_FORCE / 2
-        self._off_pad.add(touching and patch.off_pad, measurement.tactile.t_sample_ns)
+            self.taxels = sample.frame.taxels
         depth_at_1n_mm = self.sensing.depth(1.0) * 1e3
-        contact = self.sensing.contact(measurement.tactile, patch) if touching else None
+        contact = self.sensing.contact(sample, patch) if patch.force > TOUCH_FORCE / 2 else None
         if contact is not None and self._sample_t is not None and contact.t_s <= self._sample_t:
             self.sensing.dropped += 1  # it says that it is older than the one before
             contact = None
@@ -228,7 +202,7 @@ class TouchTask(ProbingTask):
                     self._at_rest.add(contact.force_n, patch.saturated)
             if self.phase is Phase.SCAN and self.shape is not None:
                 self.shape.add(contact)
-        felt_columns = self._felt_columns(measurement.tactile, patch, contact)
+        felt_columns = self._felt_columns(sample, patch, contact)
         self._columns = felt_columns | self._shape_columns | {"depth_at_1n_mm": depth_at_1n_mm}
 
     def _feel_stiffness(self, contact: ContactSample) -> None:
@@ -270,22 +244,14 @@ class TouchTask(ProbingTask):
                 hollow = -1e3 / float(estimate.kappa[1])
                 self._leave(f"a hollow of radius {hollow:.0f} mm: as tight as the probe, no contact in one place")
 
-    def _watch(self, measurement: Measurement) -> None:
+    def _watch(self) -> None:
         if self.phase in _LEAVING:
             return
-        self._lost = self._lost + self._dt if self._force < self._least_force() else 0.0
-        finding = touch_finding(
-            Contact(
-                self._limits,
-                self._force,
-                measurement.tactile_age,
-                self._lost,
-                hidden_s=self._hidden.hidden_s,
-                off_pad_s=self._off_pad.hidden_s,
-                path=self._speed > 0 and self._scan_start is not None,
-                searched=self.losses[-1].searched if self._search is not None else 0.0,
-            )
-        )
+        touch = self._touch
+        touch.lost_s = touch.lost_s + self._dt if touch.force < self._least_force() else 0.0
+        touch.path = self._speed > 0 and self._scan_start is not None
+        touch.searched = self.losses[-1].searched if self._search is not None else 0.0
+        finding = touch_finding(touch)
         if finding is None:
             return
         if finding.condition.reaction is Reaction.SEARCH:
@@ -311,10 +277,7 @@ class TouchTask(ProbingTask):
         if self.phase in (Phase.SCAN, Phase.REGAIN):
             self._scan_end = self._cycle
         self.reason = reason
-        pose = self._motion.pose
-        away = ProbePose(pose.centre - pose.pole * RETREAT, pose.pole)
-        self._line = LineMotion(pose, away, RETREAT_SPEED, at_once=True)
-        self._enter(Phase.RETREAT)
+        self._draw_back(-RETREAT * self._motion.pose.pole)
 
     # phases: each returns the pose for this cycle
 
@@ -322,18 +285,13 @@ class TouchTask(ProbingTask):
         up = self._task.approach.axes[2]
         return ProbePose(self._task.approach.start + up * (self.sensing.radius + distance), -up)
 
-    def _move(self) -> ProbePose:
-        assert self._line is not None
-        pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._lead_s + 0.1:
-            self._floor = self._force  # an array that was pressed for long shows some of it for a while
-            self._enter(Phase.APPROACH)
-        return pose
+    def _begin(self, pose: ProbePose) -> None:
+        self._line = LineMotion(pose, self._above(self._task.approach.clearance), 30e-3)
 
     def _approach(self) -> ProbePose:
         distance = self._task.approach.clearance - self._task.approach.speed * self._t
         pose = self._above(distance)
-        if self._contact is not None and self._force > TOUCH_FORCE + self._floor:
+        if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             self._touch_down(self._contact, pose)
         elif distance < -self._task.approach.search:
             self._leave(f"no object found up to {self._task.approach.search * 1e3:.0f} mm beyond the expected point")
@@ -397,10 +355,10 @@ class TouchTask(ProbingTask):
         if self.phase is Phase.SCAN:
             self.losses.append(Loss(self._cycle))
         self._search = Search(self._motion.pose, self._velocity)
-        self._floor = self._force
+        self._floor = self._touch.force
         self._asked, self._velocity = None, np.zeros(3)
         self._searched_before = self.losses[-1].searched
-        self._lost = 0.0
+        self._touch.lost_s = 0.0
         self._enter(Phase.REGAIN)
 
     def _regain(self) -> ProbePose:
@@ -413,28 +371,10 @@ class TouchTask(ProbingTask):
             return self._sink(smooth_step(self._t / (0.6 * REST_S)))
         pose, loss = self._search.pose(self._t), self.losses[-1]
         loss.searched = self._searched_before + SPEED * self._t
-        if self._contact is not None and self._force > TOUCH_FORCE + self._floor:
+        if self._contact is not None and self._touch.force > TOUCH_FORCE + self._floor:
             loss.regained_s = (self._cycle - loss.cycle) * self._period_s
             self._servo.rest_on(self._contact.p_base, self._contact.n_base)
             self._sink_from(self._contact, pose)
             self._search = None
             self._enter(Phase.REGAIN)
         return pose
-
-    def _retreat(self) -> ProbePose:
-        assert self._line is not None
-        pose = self._line.at(self._t)
-        if self._t >= self._line.duration + self._lead_s:
-            self._enter(Phase.DONE)
-        return pose
-
-
-_STEPS: dict[Phase, Callable[[TouchTask], ProbePose]] = {
-    Phase.MOVE: TouchTask._move,
-    Phase.APPROACH: TouchTask._approach,
-    Phase.SETTLE: TouchTask._settle,
-    Phase.SCAN: TouchTask._scan,
-    Phase.RETREAT: TouchTask._retreat,
-    Phase.DONE: TouchTask._done,
-    Phase.REGAIN: TouchTask._regain,
-}

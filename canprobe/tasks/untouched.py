@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.cell.assembly import patch_of
+from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Command, Controller, Measurement
-from canprobe.cell.supervision import Contact, Limits
-from canprobe.cell.supervisor import outside_workspace, touch_finding
-from canprobe.robot.kinematics import PumaModel, joints_to_counts
+from canprobe.cell.supervisor import JointGuard
+from canprobe.planning.model import Plan
+from canprobe.robot.kinematics import joints_to_counts
 from canprobe.tasks.probing import smooth_step
 from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.patch.image import PatchCalibration
@@ -63,14 +63,12 @@ class ListenTask(Task):
         calibration: of the array.
         duration_s: how long.
         period_s: of the cycle.
-        limits: of the cell.
     """
 
-    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float, limits: Limits) -> None:
+    def __init__(self, calibration: PatchCalibration, duration_s: float, period_s: float) -> None:
         self._calibration = calibration
         self._left = duration_s
         self._period = period_s
-        self._limits = limits
         self.taxels: NDArray[np.uint8] | None = None
         self._columns: dict[str, float | Vector] = {}
 
@@ -90,9 +88,7 @@ class ListenTask(Task):
                 "pad_u_mm": patch.u * 1e3,
                 "pad_v_mm": patch.v * 1e3,
             }
-        finding = touch_finding(Contact(self._limits, 0.0, measurement.tactile_age))
-        silent = str(finding.error) if finding is not None else None
-        return Command(done=self._left <= 0, stop_reason=silent, columns=self._columns)
+        return Command(done=self._left <= 0, columns=self._columns)
 
 
 class HoldTask(Task):
@@ -124,7 +120,7 @@ class Operator(Protocol):
         """Put a question."""
 
     def answer(self) -> Answer | None:
-        """The answer to it, None as long as there is none."""
+        """The answer to it; None until it is given."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,7 +130,7 @@ class JointFinding:
     Attributes:
         joint: 0 to 5.
         start_deg: where it stood.
-        asked_deg: how far it was told to turn; 0 where it was not moved.
+        asked_deg: the way of its target; 0 where it was not moved.
         moved_deg: how far it turned, by its own motor's encoder.
         fault: what is wrong; None where nothing is.
         skipped: why it was not moved; None where it was.
@@ -151,8 +147,8 @@ class JointFinding:
         where = f"joint {self.joint + 1} at {self.start_deg:.2f} deg: "
         if self.skipped is not None:
             return where + f"not moved, {self.skipped}"
-        way = f"told {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
-        return where + way + (f": {self.fault}" if self.fault is not None else ", as it must")
+        way = f"asked {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
+        return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
 def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
@@ -184,45 +180,31 @@ def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
 #
 # Encoders are compared motor by motor, so that a drive that turns the wrong way, by another gear or not at all is named
 # even where wrist joints drag each other's motors along. Whether the joint itself turned the way it must, no encoder
-# can tell, as a drive's polarity turns target and feedback round together: that is what the operator is asked.
+# can show, as a drive's polarity turns target and feedback round together: that is what the operator is asked.
 
 Script = Generator[Command, Measurement, Measurement]
-ANGLE_DEG, SPEED_DEG_S = 1.0, 2.0
+ANGLE = math.radians(1.0)
+MOVE_S = 15 / 8 * 0.5
+"""With a highest speed of 2 deg/s: that of the quintic is 15/8 of its mean."""
 SETTLE_S = 0.25
-_PEAK = 15 / 8  # of the quintic's speed over its mean
 
 
 class JointCheck(Controller):
     """The controller that moves one joint after the other, forth and back.
 
     Args:
-        model: the arm.
-        limits: of the cell; a joint that would leave them is moved the other way, or not at all.
-        period_s: of the cycle.
-        operator: asked before each motion, and after it whether the joint turned the right way; None asks nobody.
-        angle_deg: of each motion.
-        speed_deg_s: highest speed of it.
+        plan: of a cell with an arm; a joint that would leave its limits is moved the other way, or not at all.
+        operator: asked before each motion, and after it whether the joint turned the right way; None: no questions.
 
     Attributes:
         findings: one for each joint that its turn has come to.
         start: joint angles (6,), rad, before any motion; None as long as they are not known.
     """
 
-    def __init__(
-        self,
-        model: PumaModel,
-        limits: Limits,
-        period_s: float,
-        operator: Operator | None,
-        *,
-        angle_deg: float = ANGLE_DEG,
-        speed_deg_s: float = SPEED_DEG_S,
-    ) -> None:
-        assert limits.joint_low is not None and limits.joint_high is not None
-        self._low, self._high, self._limits = limits.joint_low, limits.joint_high, limits
-        self._model, self._period_s, self._operator = model, period_s, operator
-        self._angle = math.radians(angle_deg)
-        self._move_s = _PEAK * angle_deg / speed_deg_s
+    def __init__(self, plan: Plan, operator: Operator | None) -> None:
+        assert plan.setup.arm is not None
+        self._guard, self._model = JointGuard(plan), plan.setup.arm.model
+        self._period_s, self._operator = plan.sync.period_ns * 1e-9, operator
         self.findings: list[JointFinding] = []
         self.start: Vector | None = None
         self._quits = False
@@ -239,11 +221,11 @@ class JointCheck(Controller):
     def inspect(self, q: Vector) -> str | None:
         """Why an arm that stands at joint angles (6,), rad, must not be enabled."""
         self.start = q
-        outside = np.flatnonzero((q < self._low) | (q > self._high))
+        outside = np.flatnonzero((q < self._guard.low) | (q > self._guard.high))
         if not outside.size:
             return None
         joint = int(outside[0])
-        low, high = np.degrees((self._low[joint], self._high[joint]))
+        low, high = np.degrees((self._guard.low[joint], self._guard.high[joint]))
         return (
             f"joint {joint + 1} stands at {math.degrees(q[joint]):.1f} deg, outside {low:.1f} to {high:.1f} deg:"
             " move it there by hand, or its zero is wrong"
@@ -285,21 +267,15 @@ class JointCheck(Controller):
 
     def _way(self, joint: int, start: Vector) -> Vector | None:
         """The change of the joint angles (6,), rad: forwards, or else backwards; None where there is no room."""
-        for angle in (self._angle, -self._angle):
+        for angle in (ANGLE, -ANGLE):
             way = np.zeros_like(start)
             way[joint] = angle
             goal = start + way
-            if self._low[joint] <= goal[joint] <= self._high[joint] and not self._leaves_workspace(goal):
+            if self._guard.low[joint] <= goal[joint] <= self._guard.high[joint] and self._guard.outside(goal) is None:
                 return way
         return None
 
-    def _leaves_workspace(self, q: Vector) -> bool:
-        limits = self._limits
-        if limits.workspace is None or limits.T_base_tip_of is None:
-            return False
-        return outside_workspace(limits.T_base_tip_of(q)[:3, 3], limits.workspace) is not None
-
-    # ------------------------------------------------------------------ parts of the script
+    # parts of the script
 
     def _asked(self, question: str, q: Vector) -> Generator[Command, Measurement, Answer]:
         if self._operator is None:
@@ -316,7 +292,7 @@ class JointCheck(Controller):
         return measurement
 
     def _move(self, q_from: Vector, q_to: Vector) -> Script:
-        cycles = max(1, round(self._move_s / self._period_s))
+        cycles = max(1, round(MOVE_S / self._period_s))
         for k in range(1, cycles + 1):
             yield Command(q_target=q_from + smooth_step(k / cycles) * (q_to - q_from))
         return (yield from self._hold(q_to))

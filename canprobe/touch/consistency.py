@@ -1,4 +1,4 @@
-"""Do two passes over one place tell the same surface? Every crossing of a map tested, and one verdict on all."""
+"""Do two passes over one place show the same surface? Every crossing of a map is tested, with one verdict on all."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.errors import UsageError
-from canprobe.touch.estimate.quadric import curvature_jacobian, transport, turned
+from canprobe.touch.estimate.quadric import TO_Q, curvature_jacobian, transport, turned
 from canprobe.touch.linear_algebra import Array, homogeneous, inverse_transform, positive, tangent_rotation
 from canprobe.touch.surface import SurfaceMatrix
-from canprobe.touch.surface_map import LocalPatch, SurfaceMap
+from canprobe.touch.surface_map import FACING, LocalPatch, SurfaceMap
 
-# Do two passes over one place tell the same surface? A χ² test where the contact's path crosses itself.
+# A χ² test where the contact's path crosses itself.
 #
 # Two patches that are close in space but far apart along the path were felt from different samples. Both are expressed
 # in one frame between their contacts (`S' = Tᵀ S T`, the covariance of all nine entries of S carried along), so that
@@ -27,17 +27,13 @@ from canprobe.touch.surface_map import LocalPatch, SurfaceMap
 #   contact, by `surface_map.WIDE`;
 # - `joint` is all of it together, with the correlations between the parts.
 #
-# Which σ: the patches' covariances rest on the σ's that the estimator was *told*, as if every sample's error were
-# independent, and on its prior; they are not rescaled by the innovation. On independent noise of the stated size `ml`
-# gives uniform p-values where c13, c23, c33 are what the prior expects; a surface on which they vanish (plane, saddle
-# at its middle) is granted more spread than it has (χ² per degree of freedom 0.85), and so is all that the filter with
-# forgetting says (0.83). Generous σ's (innovation well below 1) make p-values crowd towards 1. Errors that are
-# correlated along a pass do the opposite: hysteresis of the pad lags behind the motion, so that passes in different
-# directions differ by more than white noise says; creep and indentation shift whole passes. A small p is therefore no
-# proof of two surfaces, but of a difference that the stated noise does not explain; `Crossing.angle` tells which passes
-# ran alike.
+# The covariances rest on the σ's that the estimator was given, as if every sample's error were independent, and on its
+# prior; they are not rescaled by the innovation. On independent noise of the stated size `ml` gives uniform p-values
+# where c13, c23, c33 are what the prior expects; where they vanish (plane, saddle at its middle) χ² per degree of
+# freedom is 0.85, and with forgetting 0.83. Generous σ's make p-values crowd towards 1. Errors that are correlated
+# along a pass do the opposite (hysteresis differs by direction; creep shifts whole passes). A small p is no proof of
+# two surfaces, but of a difference that the stated noise does not explain; `Crossing.angle` says how they ran.
 
-_TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
 _UNSEEN = 0.05
 """Largest part of a unit combination that either pass may have left unobserved."""
 _HEIGHT, _SLOPE, _K = slice(0, 1), slice(1, 3), slice(3, 6)
@@ -55,6 +51,9 @@ class ChiSquared(NamedTuple):
     chi2: float
     dof: int
     p: float
+
+
+NOTHING = ChiSquared(0.0, 0, math.nan)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,16 +94,13 @@ class _Jet(NamedTuple):
 
 
 def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1, angle: float = math.nan) -> Crossing:
-    """Test whether two patches describe one surface.
+    """Test whether two patches from different samples, their normals within 90°, describe one surface.
 
-    The local models must hold between the two contacts: keep them within a few mm.
-
-    Args:
-        a, b: patches from different samples, their normals within 90°.
-        first, second: their indices, for the record.
-        angle: between the directions of travel, rad, for the record.
+    The local models must hold between the two contacts: keep them within a few mm. Indices and the angle between the
+    directions of travel (rad) are only noted.
     """
-    T = _common_frame(a, b)
+    z = -(a.normal + b.normal)
+    T = homogeneous(tangent_rotation(z / math.sqrt(float(z @ z))), 0.5 * (a.point + b.point))
     ja, jb = _jet(a, T), _jet(b, T)
     d, C = jb.values - ja.values, ja.covariance + jb.covariance
     k_rows = _seen_by_both(ja.hidden, jb.hidden)
@@ -125,11 +121,6 @@ def compare(a: LocalPatch, b: LocalPatch, first: int = 0, second: int = 1, angle
         height=_chi_squared(height, d, C),
         joint=_chi_squared(np.concatenate([height, slope, k_rows]), d, C),
     )
-
-
-def _common_frame(a: LocalPatch, b: LocalPatch) -> Array:
-    z = -(a.normal + b.normal)
-    return homogeneous(tangent_rotation(z / math.sqrt(float(z @ z))), 0.5 * (a.point + b.point))
 
 
 def _jet(patch: LocalPatch, T_base_common: Array) -> _Jet:
@@ -159,23 +150,26 @@ def _seen_by_both(hidden_a: Array, hidden_b: Array) -> Array:
     _, size, Vt = np.linalg.svd(np.concatenate([hidden_a, hidden_b]))
     seen = Vt[size < _UNSEEN]
     rows = np.zeros((len(seen), 6))
-    rows[:, _K] = seen * _TO_Q
+    rows[:, _K] = seen * TO_Q
     return rows
 
 
 def _chi_squared(rows: Array, d: Array, C: Array) -> ChiSquared:
     if not len(rows):
-        return ChiSquared(0.0, 0, math.nan)
-    from scipy.special import chdtrc
-
+        return NOTHING
     e, V = rows @ d, rows @ C @ rows.T
     scale = 1.0 / np.sqrt(np.diag(V))  # metres beside 1/m
     e, V = e * scale, V * np.outer(scale, scale)
-    chi2 = float(e @ np.linalg.solve(V, e))
-    return ChiSquared(chi2, len(rows), float(chdtrc(len(rows), chi2)))
+    return _tested(float(e @ np.linalg.solve(V, e)), len(rows))
 
 
-# All crossings of a map, and one verdict on whether its passes agree.
+def _tested(chi2: float, dof: int) -> ChiSquared:
+    from scipy.special import chdtrc
+
+    return ChiSquared(chi2, dof, float(chdtrc(dof, chi2)))
+
+
+# All crossings of a map.
 
 RADIUS_M = 2e-3
 """Default largest distance between the contacts of a crossing, m."""
@@ -185,7 +179,6 @@ MEMORIES = 3.0
 With forgetting by exp(−s/memory) two answers s apart share exp(−s/memory) of their data: 5 % at three."""
 LEVEL = 0.05
 PARTS = ("curvature", "normal", "height", "joint")
-_FACING = 0.5
 
 
 class Verdict(NamedTuple):
@@ -251,18 +244,10 @@ class Consistency:
 
 
 def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: float | None = None) -> list[Crossing]:
-    """Places where two passes come close, one pair of patches for each.
+    """Places where two passes come close, one pair of patches for each; radius, gap: as of `check_consistency`.
 
     Of the pairs within the radius the closest is taken; others whose contacts both lie within two radii of its
     contacts along the path are the same crossing. A path that follows itself gives one every two radii.
-
-    Args:
-        surface_map: the map.
-        radius: largest distance between the contacts, m.
-        gap: least path between them, m; None for `MEMORIES` times the longest memory of a patch.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
     """
     limit = positive("radius", radius)
     least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
@@ -270,7 +255,7 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
         return []
     along = surface_map.travelled
     apart = np.linalg.norm(surface_map.points[:, None] - surface_map.points[None], axis=2)
-    facing = surface_map.normals @ surface_map.normals.T > _FACING
+    facing = surface_map.normals @ surface_map.normals.T > FACING
     fits = (apart <= limit) & (along[None] - along[:, None] >= least) & facing
     pairs = np.argwhere(fits)[np.argsort(apart[fits], kind="stable")]
     chosen: list[tuple[int, int]] = []
@@ -286,14 +271,10 @@ def find_crossings(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap: fl
 
 def _headings(surface_map: SurfaceMap) -> Array:
     """(n, 3) unit direction of travel at each patch, from the patch before; the first as the second; NaN at rest."""
-    if len(surface_map) < 2:
-        return np.full((len(surface_map), 3), math.nan)
     steps = np.diff(surface_map.points, axis=0)
     sizes = np.linalg.norm(steps, axis=1, keepdims=True)
-    headings = np.full((len(surface_map), 3), math.nan)
-    headings[1:] = steps / np.where(sizes > 0.0, sizes, math.nan)
-    headings[0] = headings[1]
-    return headings
+    headings: Array = steps / np.where(sizes > 0.0, sizes, math.nan)
+    return np.concatenate([headings[:1], headings])
 
 
 def _angle(a: Array, b: Array) -> float:
@@ -304,8 +285,10 @@ def check_consistency(surface_map: SurfaceMap, *, radius: float = RADIUS_M, gap:
     """Test every crossing of a map and pool the independent ones; see `compare` for what the test rests on.
 
     Args:
-        surface_map, radius, gap: as in `find_crossings`; two crossings are independent where all four patches are at
-            least the gap apart along the path.
+        surface_map: the map.
+        radius: largest distance between the contacts of a crossing, m.
+        gap: least path between them, and between the patches of independent crossings, m; None for `MEMORIES` times
+            the longest memory of a patch.
     """
     least = positive("gap", gap) if gap is not None else MEMORIES * surface_map.memory
     found = find_crossings(surface_map, radius=radius, gap=gap)
@@ -331,8 +314,5 @@ def fisher(p_values: list[float]) -> ChiSquared:
     Source: R. A. Fisher, Statistical Methods for Research Workers, 4th ed., 1932, §21.1.
     """
     if not p_values:
-        return ChiSquared(0.0, 0, math.nan)
-    from scipy.special import chdtrc
-
-    chi2 = -2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300))))
-    return ChiSquared(chi2, 2 * len(p_values), float(chdtrc(2 * len(p_values), chi2)))
+        return NOTHING
+    return _tested(-2.0 * float(np.sum(np.log(np.maximum(p_values, 1e-300)))), 2 * len(p_values))

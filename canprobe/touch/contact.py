@@ -1,15 +1,7 @@
-"""Contact of a spherical probe with an object: places, normals and rates, and what a touch at rest tells of the
-layer.
+"""Contact of a spherical probe with an object: its place and normal, and the stiffness of the layer from a touch.
 
-Signs. Body f is the probe ("finger"), body o the object. `n_f`, `n_o` are OUTWARD unit normals, `n_f = -n_o` (14).
-K is a shape operator, here as a 3x3 tensor on the tangent plane, positive for convex, so that a point moving over a
-fixed body with velocity v turns its outward normal by `K v`. `V` is the velocity of the material point of a body at
-the contact, `v` that of the contact point over the body, `ω` angular velocity. All in one frame, usually base.
-
-    common position   v_o = v_f + V_f - V_o                          (17)–(19)
-    common normal     K_o v_o + K_f v_f = (ω_f - ω_o) × n_o          (16), for unit normals
-
-Source: Chen, Rink and Zhang (13)–(23). The paper writes 2S for K, right only where |∇f| = 1.
+`n_f`, `n_o` are OUTWARD unit normals of probe ("finger") and object, `n_f = −n_o` (14). Source: Chen, Rink and Zhang,
+(13), (14), (20).
 """
 
 from __future__ import annotations
@@ -24,8 +16,6 @@ from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, positive
-
-# Contact of a spherical probe with an object: places, normals and rates.
 
 
 class Doubt(Enum):
@@ -47,7 +37,7 @@ class ContactSample:
         n_base: (3,) outward unit normal of the object there, in base.
         T_base_probe: (4, 4) probe frame (origin at the sphere's centre, z through the pole of the pad) to base.
         r_probe: (3,) contact point in the probe frame, m.
-        force_n: contact force, N.
+        force_n: N.
         sigma_point: effective standard deviation of the point per axis, m; None for the estimator's own.
         sigma_normal: that of the normal per tangent axis, rad; None for the estimator's own.
         moments: second moments uu, uv, vv of the patch along the pad's axes, m² (`patch.moments`); None for none.
@@ -67,16 +57,9 @@ class ContactSample:
 
 
 def pad_to_direction(u: float, v: float, radius: float) -> Array:
-    """Direction of a pad point as seen from the sphere's centre, in the probe frame.
+    """Direction (3,) of a pad point (u, v), m, as seen from the sphere's centre, in the probe frame.
 
-    The flat array is wrapped azimuthal-equidistantly: the exponential map of (u, v)/R_p at the pole.
-
-    Args:
-        u, v: pad coordinates along the probe's x and y, m.
-        radius: R_p, m.
-
-    Returns:
-        (3,) unit vector.
+    The flat array is wrapped azimuthal-equidistantly: the exponential map of (u, v)/R_p at the pole, R_p the radius.
     """
     angle = math.hypot(u, v) / radius
     scale = 1.0 / radius if angle < 1e-9 else math.sin(angle) / (angle * radius)
@@ -94,14 +77,7 @@ def direction_to_pad(direction: Sequence[float] | Array, radius: float) -> tuple
 def contact_on_object(T_base_probe: Array, direction: Array, radius: float, depth: float) -> tuple[Array, Array]:
     """The object's contact point and outward normal in base, through the squeezed layer (13), (14), (20).
 
-    Args:
-        T_base_probe: (4, 4) probe frame to base.
-        direction: (3,) unit, from the sphere's centre to the contact, in the probe frame.
-        radius: R_p of the unloaded probe, m.
-        depth: indentation δ of the layer, m.
-
-    Returns:
-        `p = centre + (R_p - δ) n_f` and `n_o = -n_f`, (3,) each.
+    `p = centre + (R_p − δ) n_f` and `n_o = −n_f`, (3,) each, n_f along a direction (3,) of the probe frame (4, 4).
     """
     u, v, w = direction.tolist()
     (a, b, c, x), (d, e, f, y), (g, h, i, z), _ = T_base_probe.tolist()
@@ -121,17 +97,9 @@ def contact_sample(
     moments: tuple[float, float, float] | None = None,
     doubts: tuple[Doubt, ...] = (),
 ) -> ContactSample:
-    """A sample from the centroid on the pad: the whole way from taxels to base.
+    """A sample from the centroid uv (2,) on the pad (m), the indentation (m) and the probe's radius (m).
 
-    Args:
-        t_s: time at which taxels and pose hold, s.
-        T_base_probe: (4, 4) probe frame to base at that time.
-        uv: (2,) centroid on the pad, m.
-        depth: indentation, m (`indentation_from_force`).
-        radius: R_p, m.
-        force_n: N.
-        moments: of the patch, m².
-        doubts: about the image.
+    The other arguments are those of `ContactSample`; taxels and pose are of one time.
     """
     u, v = uv
     direction = pad_to_direction(u, v, radius)
@@ -141,18 +109,15 @@ def contact_sample(
 
 
 def indentation_from_force(force: float, stiffness_n_m3: float, radius: float, kappa: ArrayLike) -> float:
-    """Indentation of the elastic layer under a force.
+    """Indentation δ (m) of the elastic layer under a force.
 
     Winkler layer, `p = k (δ − A x² − B y²)₊`, hence `F = π k δ² / (2 √(AB))` with `A, B = ½ (1/R_p + κ1,2)`.
 
     Args:
-        force: N; 0 or less gives 0.
+        force: F, N; 0 or less gives 0.
         stiffness_n_m3: k = K/h, N/m³.
         radius: R_p, m.
         kappa: (2,) principal curvatures of the object, 1/m; a NaN (not observed) counts as flat.
-
-    Returns:
-        δ in m.
 
     Raises:
         UsageError: where the object is concave and as tight as the probe or tighter: there is no patch.
@@ -184,7 +149,7 @@ class PushFit:
     """Straight line of √F over the push, from running means (Welford): constant time and memory.
 
     Both have errors, and on a stiff contact a micrometre of the push is a large force. The line is that of the root on
-    the push as it was measured, which errors make flatter: it is to tell the force where the encoders say the probe is.
+    the push as it was measured, which errors make flatter: it predicts the force where the encoders see the probe.
 
     Example: `fit.add(push, force)` for every tactile frame of a touch; `fit.slope` once `fit.certain(0.1)`.
 
@@ -199,12 +164,7 @@ class PushFit:
         self._spread = self._joint = self._root_spread = 0.0  # sums of products about them
 
     def add(self, push: float, force: float) -> None:
-        """Take one sample.
-
-        Args:
-            push: way of the probe towards the object along its normal, from any zero, m.
-            force: N; too small a one is left out.
-        """
+        """Take a push of the probe towards the object (m, from any zero) and the force (N); a small one is left out."""
         if not (force >= LEAST_FORCE_N and math.isfinite(push)):
             return
         root = math.sqrt(force)
@@ -257,14 +217,9 @@ class PushFit:
 
 
 def stiffness_from_slope(slope: float, radius: float, kappa: ArrayLike) -> float:
-    """K/h of the layer (N/m³) from the slope of √F over the indentation on an object of known curvature.
+    """K/h of the layer (N/m³) from the slope b (√N per m) on an object of known curvature (2,) above −1/R_p, 1/m.
 
-    Args:
-        slope: b, √N per m.
-        radius: R_p of the probe, m.
-        kappa: (2,) principal curvatures of the object, 1/m; above −1/R_p.
-
-    Source: the inverse of `canprobe.touch.contact.indentation_from_force`.
+    The inverse of `indentation_from_force`.
     """
     k1, k2 = (float(k) for k in np.asarray(kappa, dtype=np.float64))
     return 2.0 * math.sqrt(0.25 * (1.0 / radius + k1) * (1.0 / radius + k2)) * slope * slope / math.pi
@@ -290,12 +245,7 @@ class AtRest:
         self._mean = self._spread = 0.0
 
     def add(self, force: float, saturated: bool) -> None:
-        """Take one sample.
-
-        Args:
-            force: N.
-            saturated: a taxel is at its largest count.
-        """
+        """Take a force (N), and whether a taxel was at its largest count."""
         self._n += 1
         self._saturated += saturated
         from_mean = force - self._mean
@@ -303,11 +253,9 @@ class AtRest:
         self._spread += from_mean * (force - self._mean)
 
     def doubt(self, target: float, felt: bool) -> str | None:
-        """Why the force is not the wanted one; None where all is well, or nobody can tell.
+        """Why the force is not the wanted one (N); None where all is well or not known.
 
-        Args:
-            target: N.
-            felt: the touch told its stiffness, see `canprobe.touch.contact`.
+        `felt`: the touch showed the layer's stiffness (`PushFit`).
         """
         if self._n < SAMPLES_AT_REST:
             return None

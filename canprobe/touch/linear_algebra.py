@@ -12,8 +12,6 @@ from scipy.linalg.lapack import dgeqrf, dgesv, dpotrf, dsyev, dtrtri
 
 from canprobe.errors import UsageError
 
-# Array types and input checks that the touch modules share.
-
 Array = NDArray[np.float64]
 _UPPER = np.triu(np.ones((16, 16)))
 
@@ -29,63 +27,50 @@ def upper_root(A: Array) -> Array:
 
 
 def solved(A: Array, B: Array) -> Array:
-    """A⁻¹ B.
-
-    Raises:
-        numpy.linalg.LinAlgError: where A is singular.
-    """
+    """A⁻¹ B; numpy's LinAlgError where A is singular."""
+    X: Array
     _, _, X, info = dgesv(A, B)
     if info > 0:
         raise np.linalg.LinAlgError("singular matrix")
-    result: Array = X
-    return result
+    return X
 
 
 def inverted(A: Array) -> Array:
-    """A⁻¹.
-
-    Raises:
-        numpy.linalg.LinAlgError: where A is singular.
-    """
+    """A⁻¹; numpy's LinAlgError where A is singular."""
     return solved(A, np.eye(len(A)))
 
 
 def inverted_upper(R: Array) -> Array:
-    """R⁻¹ of an upper triangular R.
-
-    Raises:
-        numpy.linalg.LinAlgError: where R is singular.
-    """
+    """R⁻¹ of an upper triangular R; numpy's LinAlgError where it is singular."""
+    result: Array
     result, info = dtrtri(R)
     if info > 0:
         raise np.linalg.LinAlgError("singular matrix")
-    found: Array = result
-    return found
+    return result
 
 
 def eigen(A: Array) -> tuple[Array, Array]:
-    """Eigenvalues of a symmetric matrix, the least first, and its eigenvectors as columns.
-
-    Raises:
-        numpy.linalg.LinAlgError: where it is not finite.
-    """
+    """Eigenvalues of a symmetric matrix, the least first, and eigenvectors as columns; LinAlgError if not finite."""
     values, vectors, info = dsyev(A, lower=1)
     if info != 0:
         raise np.linalg.LinAlgError("eigenvalues did not converge")
     return values, vectors
 
 
-def lower_root(A: Array) -> Array:
-    """The lower triangular L of a Cholesky decomposition, L Lᵀ = A.
+def principal(A: Array) -> tuple[float, float, float]:
+    """Mean and half difference of the eigenvalues of a symmetric (2, 2), and the angle (rad) of the larger one."""
+    (a, b), (_, d) = A.tolist()
+    half = 0.5 * (a - d)
+    return 0.5 * (a + d), math.hypot(half, b), 0.5 * math.atan2(b, half)
 
-    Raises:
-        numpy.linalg.LinAlgError: where A is not positive definite.
-    """
+
+def lower_root(A: Array) -> Array:
+    """The lower triangular L of a Cholesky decomposition, L Lᵀ = A; LinAlgError where A is not positive definite."""
+    L: Array
     L, info = dpotrf(A, lower=1)
     if info != 0:
         raise np.linalg.LinAlgError("matrix is not positive definite")
-    result: Array = L
-    return result
+    return L
 
 
 def read_only(values: ArrayLike) -> Array:
@@ -96,16 +81,7 @@ def read_only(values: ArrayLike) -> Array:
 
 
 def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
-    """Values as floats of the wanted shape, all finite.
-
-    Args:
-        name: the field, for the message.
-        values: what the caller gave.
-        shape: expected shape; None stands for any length.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
-    """
+    """Values as floats of a shape (None: any length), all finite; else a UsageError that names the field."""
     try:
         array = np.asarray(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -121,11 +97,7 @@ def checked(name: str, values: ArrayLike, shape: Sequence[int | None]) -> Array:
 
 
 def positive(name: str, value: Any) -> float:
-    """A finite number above zero.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
-    """
+    """A finite number above zero; else a UsageError that names the field."""
     number = float(checked(name, value, ()))
     if not number > 0.0:
         raise UsageError(f"{name}: expected a number above 0, got {number}")
@@ -133,9 +105,8 @@ def positive(name: str, value: Any) -> float:
 
 
 def _spell(shape: Sequence[int | None]) -> str:
-    return (
-        "(" + ", ".join("n" if side is None else str(side) for side in shape) + ("," if len(shape) == 1 else "") + ")"
-    )
+    sides = ", ".join("n" if side is None else str(side) for side in shape)
+    return f"({sides},)" if len(shape) == 1 else f"({sides})"
 
 
 # Frames on a tangent plane, and small rotations.
@@ -145,16 +116,10 @@ _AXIS_LIMIT = 0.95
 
 
 def tangent_rotation(z_axis: Array) -> Array:
-    """Right-handed axes with the given z; x is the parent frame's x axis laid on the tangent plane.
+    """Right-handed axes (3, 3), columns x, y, z, with a given unit z; x is the parent frame's x on the tangent plane.
 
     Where z is within 18° of the parent's x axis, the parent's y axis is laid on the plane instead. The choice depends
     on z alone, so that two nearly equal normals give nearly equal axes.
-
-    Args:
-        z_axis: (3,) unit vector.
-
-    Returns:
-        (3, 3), columns x, y, z.
     """
     zx, zy, zz = float(z_axis[0]), float(z_axis[1]), float(z_axis[2])
     if abs(zx) <= _AXIS_LIMIT:
@@ -163,25 +128,11 @@ def tangent_rotation(z_axis: Array) -> Array:
     else:
         scale = 1.0 / math.sqrt(zx * zx + zz * zz)
         xx, xy, xz = -zy * zx * scale, (zx * zx + zz * zz) * scale, -zy * zz * scale
-    return np.array(
-        [
-            [xx, zy * xz - zz * xy, zx],
-            [xy, zz * xx - zx * xz, zy],
-            [xz, zx * xy - zy * xx, zz],
-        ]
-    )
+    return np.array([[xx, zy * xz - zz * xy, zx], [xy, zz * xx - zx * xz, zy], [xz, zx * xy - zy * xx, zz]])
 
 
 def transported_rotation(R: Array, z_axis: Array) -> Array:
-    """Axes turned the shortest way so that z becomes `z_axis` (parallel transport over a small step).
-
-    Args:
-        R: (3, 3) axes, columns x, y, z.
-        z_axis: (3,) the new unit z.
-
-    Returns:
-        (3, 3).
-    """
+    """Axes (3, 3), turned the shortest way so that their z becomes a unit vector: parallel transport over a step."""
     x, y, z = R[:, 0].tolist()
     u, v, w = z_axis.tolist()
     along = x * u + y * v + z * w

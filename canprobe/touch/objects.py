@@ -1,7 +1,4 @@
-"""True object geometry: the touchable surfaces by name (``make_object``), and those of first and second degree.
-
-What they share, frames and signs included, is told in ``shapes``.
-"""
+"""True object geometry: the touchable surfaces by name (``make_object``), and the quadrics; frames as in ``shapes``."""
 
 from __future__ import annotations
 
@@ -13,41 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.touch.shapes import (
-    Array,
     Bowl,
-    ClosestPoint,
     Fillet,
     Foot,
-    Nearest,
-    ObjectShape,
     PlacedShape,
+    RoundShape,
     Torus,
-    Touches,
+    Vec,
     Wave,
-    osculating_matrix,
     require_positive,
     tangent_of,
 )
-
-__all__ = [
-    "OBJECT_PARAMETERS",
-    "Bowl",
-    "ClosestPoint",
-    "Cylinder",
-    "Ellipsoid",
-    "Fillet",
-    "Nearest",
-    "ObjectShape",
-    "PlacedShape",
-    "Plane",
-    "Quadric",
-    "Saddle",
-    "Sphere",
-    "Torus",
-    "Touches",
-    "Wave",
-    "make_object",
-]
 
 
 class Plane(PlacedShape):
@@ -56,22 +29,9 @@ class Plane(PlacedShape):
     def _foot(self, x: float, y: float, z: float) -> Foot:
         return x, y, 0.0, 0.0, 0.0, 1.0, z, 0.0, 0.0, 1.0, 0.0, 0.0
 
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.0, 0.0, 0.0))
 
-
-class Sphere(PlacedShape):
-    """Ball of a given radius, centre at z = -radius.
-
-    Args:
-        T_base_object: (4, 4) pose, m.
-        radius: m.
-    """
-
-    def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
-        super().__init__(T_base_object)
-        require_positive(radius=radius)
-        self.radius = radius
+class Sphere(RoundShape):
+    """Ball of a given radius, centre at z = -radius."""
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
@@ -81,22 +41,9 @@ class Sphere(PlacedShape):
         k = 1.0 / radius
         return (radius * nx, radius * ny, radius * (nz - 1.0), nx, ny, nz, rho - radius, k, k, *tangent_of(nx, ny, nz))
 
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.5 / self.radius,) * 3)
 
-
-class Cylinder(PlacedShape):
-    """Endless round cylinder along the object's x axis, centre line at z = -radius.
-
-    Args:
-        T_base_object: (4, 4) pose, m.
-        radius: m.
-    """
-
-    def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
-        super().__init__(T_base_object)
-        require_positive(radius=radius)
-        self.radius = radius
+class Cylinder(RoundShape):
+    """Endless round cylinder along the object's x axis, centre line at z = -radius."""
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         radius = self.radius
@@ -105,9 +52,6 @@ class Cylinder(PlacedShape):
         ny, nz = (y / rho, zc / rho) if rho > 0.0 else (0.0, 1.0)
         # Round the circumference first: d1 = (0, nz, -ny), d2 = n x d1 = -x.
         return x, radius * ny, radius * (nz - 1.0), 0.0, ny, nz, rho - radius, 1.0 / radius, 0.0, 0.0, nz, -ny
-
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.0, 0.5 / self.radius, 0.5 / self.radius))
 
 
 class Quadric(PlacedShape):
@@ -134,9 +78,7 @@ class Quadric(PlacedShape):
             raise ValueError(f"matrix must be a finite symmetric 4x4 array, got {S!r}")
         if S[2, 3] <= 0.0 or np.abs(S[[0, 1], 3]).max() > 1e-12 * S[2, 3] or abs(S[3, 3]) > 1e-12 * S[2, 3]:
             raise ValueError(f"matrix must pass through the origin with its gradient along +z there, got {S!r}")
-        S *= 0.5 / S[2, 3]
-        w, V = np.linalg.eigh(S[:3, :3])
-        self._S = S
+        w, V = np.linalg.eigh(S[:3, :3] * (0.5 / S[2, 3]))
         self._w: list[float] = w.tolist()
         self._b: list[float] = (0.5 * V[2]).tolist()
         self._v = tuple(V.ravel().tolist())
@@ -154,23 +96,13 @@ class Quadric(PlacedShape):
         distance = n0 * (p[0] - e0) + n1 * (p[1] - e1) + n2 * (p[2] - e2)
         k1, k2, (d0, d1, d2) = self._curvatures((n0, n1, n2), size)
         return (
-            v0 * e0 + v1 * e1 + v2 * e2,
-            v3 * e0 + v4 * e1 + v5 * e2,
-            v6 * e0 + v7 * e1 + v8 * e2,
-            v0 * n0 + v1 * n1 + v2 * n2,
-            v3 * n0 + v4 * n1 + v5 * n2,
-            v6 * n0 + v7 * n1 + v8 * n2,
-            distance,
-            k1,
-            k2,
-            v0 * d0 + v1 * d1 + v2 * d2,
-            v3 * d0 + v4 * d1 + v5 * d2,
-            v6 * d0 + v7 * d1 + v8 * d2,
+            *(v0 * e0 + v1 * e1 + v2 * e2, v3 * e0 + v4 * e1 + v5 * e2, v6 * e0 + v7 * e1 + v8 * e2),
+            *(v0 * n0 + v1 * n1 + v2 * n2, v3 * n0 + v4 * n1 + v5 * n2, v6 * n0 + v7 * n1 + v8 * n2),
+            *(distance, k1, k2),
+            *(v0 * d0 + v1 * d1 + v2 * d2, v3 * d0 + v4 * d1 + v5 * d2, v6 * d0 + v7 * d1 + v8 * d2),
         )
 
-    def _curvatures(
-        self, n: tuple[float, float, float], half_gradient: float
-    ) -> tuple[float, float, tuple[float, float, float]]:
+    def _curvatures(self, n: Vec, half_gradient: float) -> tuple[float, float, Vec]:
         """Principal curvatures of K = P' S3 P / |half gradient| and the first direction, eigenbasis."""
         w0, w1, w2 = self._w
         t0, t1, t2 = tangent_of(*n)
@@ -183,7 +115,7 @@ class Quadric(PlacedShape):
         c, s = cos(angle), sin(angle)
         return mean + spread, mean - spread, (c * t0 + s * s0, c * t1 + s * s1, c * t2 + s * s2)
 
-    def _eigen_foot(self, p: tuple[float, float, float]) -> tuple[float, float, float]:
+    def _eigen_foot(self, p: Vec) -> Vec:
         """Closest surface point in the eigenbasis."""
         (w0, w1, w2), (b0, b1, b2) = self._w, self._b
         p0, p1, p2 = p
@@ -212,7 +144,7 @@ class Quadric(PlacedShape):
             t = new
         return self._medial_foot((x0, x1, x2), 2 if f < 0.0 else 0)
 
-    def _medial_foot(self, x: tuple[float, float, float], free: int) -> tuple[float, float, float]:
+    def _medial_foot(self, x: Vec, free: int) -> Vec:
         """From a point of symmetry two feet are equally near: keep the one on the side of x.
 
         The multiplier stands at the end of its interval, where the coordinate ``free`` follows from f = 0 alone.
@@ -224,14 +156,18 @@ class Quadric(PlacedShape):
         foot[free] = (-b + side * sqrt(max(0.0, b * b - w * rest))) / w
         return foot[0], foot[1], foot[2]
 
-    def _matrix(self) -> Array:
-        return self._S
-
     def _tightest_anywhere(self) -> float:
         radii = np.linspace(0.0, 0.05, 11)
         angles = np.arange(24) * (2 * pi / 24)
         local = np.array([(r * cos(a), r * sin(a), 0.0) for r in radii for a in angles])
         return self.tightest_concave_radius(local @ self._pose[:3, :3].T + self._pose[:3, 3])
+
+
+def _level_matrix(xx: float, yy: float, zz: float) -> npt.NDArray[np.float64]:
+    """S of ``xx x^2 + yy y^2 + zz z^2 + z``."""
+    S = np.diag((xx, yy, zz, 0.0))
+    S[2, 3] = S[3, 2] = 0.5
+    return S
 
 
 class Saddle(Quadric):
@@ -252,7 +188,7 @@ class Saddle(Quadric):
                 f"a saddle needs radius_x and radius_y of opposite sign (positive: convex), in m; "
                 f"got {radius_x!r} and {radius_y!r}"
             )
-        super().__init__(T_base_object, osculating_matrix((0.5 / radius_x, 0.5 / radius_y, 0.0)))
+        super().__init__(T_base_object, _level_matrix(0.5 / radius_x, 0.5 / radius_y, 0.0))
         self.radius_x, self.radius_y = radius_x, radius_y
 
     def _tightest_anywhere(self) -> float:
@@ -272,7 +208,7 @@ class Ellipsoid(Quadric):
     def __init__(self, T_base_object: npt.ArrayLike, radius_x: float, radius_y: float, radius_z: float) -> None:
         require_positive(radius_x=radius_x, radius_y=radius_y, radius_z=radius_z)
         half = 0.5 * radius_z
-        super().__init__(T_base_object, osculating_matrix((half / radius_x**2, half / radius_y**2, half / radius_z**2)))
+        super().__init__(T_base_object, _level_matrix(half / radius_x**2, half / radius_y**2, half / radius_z**2))
 
     def _tightest_anywhere(self) -> float:
         return inf

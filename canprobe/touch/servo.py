@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from canprobe.errors import UsageError
 
-# Exploration strategies: where the contact goes next, as a heading in the scan plane.
+# Strategies: where the contact goes next, as a heading in the scan plane.
 #
 # The scan plane is perpendicular to the approach direction. A strategy is a closed curve in it, followed by arc length,
 # so that the contact speed is the same everywhere; the servo lifts the heading into the surface's tangent plane.
@@ -112,12 +112,7 @@ def make_strategy(name: str, length_m: float, width_m: float, wavelength_m: floa
 
 
 class PathFollower:
-    """Follows a :class:`Strategy` by arc length.
-
-    Args:
-        strategy: the curve.
-        cross_track_per_m: how strongly the heading turns back to the curve (1/m).
-    """
+    """Follows a curve by arc length; `cross_track_per_m`: how strongly the heading turns back to it."""
 
     def __init__(self, strategy: Strategy, cross_track_per_m: float = 60.0) -> None:
         self._strategy = strategy
@@ -126,21 +121,15 @@ class PathFollower:
 
     @property
     def heading(self) -> tuple[float, float]:
-        """Unit tangent of the curve (along, across) where the follower is."""
+        """Unit tangent (along, across) of the curve where the follower is."""
         tx, ty = self._strategy.tangent(self._phase)
         norm = max(math.hypot(tx, ty), 1e-9)
         return tx / norm, ty / norm
 
     def step(self, x: float, y: float, distance_m: float) -> tuple[float, float]:
-        """Unit heading in the scan plane for the next step.
+        """Unit heading (along, across) in the scan plane for the next step, from where the contact is (m, m).
 
-        Args:
-            x: where the contact is along the heading (m).
-            y: where it is across (m).
-            distance_m: how far the contact moves in the scan plane until the next call.
-
-        Returns:
-            Unit vector (along, across).
+        `distance_m`: how far it moves in that plane until the next call.
         """
         tx, ty = self._strategy.tangent(self._phase)
         norm = math.hypot(tx, ty)
@@ -152,7 +141,7 @@ class PathFollower:
         return (hx / scale, hy / scale) if scale > 1e-9 else (1.0, 0.0)
 
 
-# The tactile servo: from contact samples to the pose of the probe, 400 times a second.
+# The local surface and the servo on it.
 
 Vector = NDArray[np.float64]
 Floats = Sequence[float]
@@ -204,13 +193,11 @@ class LocalSurface:
         """Outward unit normal (3,) there."""
         return np.array(self._normal)
 
-    def foot(self, x: Vector) -> tuple[Vector, Vector]:
-        """Surface point and outward unit normal over the tangential position of ``x`` (3,), m."""
-        foot, normal = self.foot_of(x.tolist())
-        return np.array(foot), np.array(normal)
+    def foot(self, x: Floats) -> tuple[Floats, Floats]:
+        """Surface point and outward unit normal over the tangential position of a point, m.
 
-    def foot_of(self, x: Floats) -> tuple[Floats, Floats]:
-        """The same on plain floats: on 3-vectors numpy costs ten times as much."""
+        On plain floats: on 3-vectors numpy costs ten times as much.
+        """
         a0, a1, a2 = self._point
         m0, m1, m2 = self._normal
         d0, d1, d2 = x[0] - a0, x[1] - a1, x[2] - a2
@@ -229,20 +216,14 @@ class LocalSurface:
         )
 
     def correct(self, point: Vector, normal: Vector, dt: float) -> float:
-        """Move the model to a measured contact and towards it.
+        """Move the model to a measured point (3,), m, and towards it and its outward normal (3,), `dt` (s) later.
 
-        Args:
-            point: measured surface point (3,), m.
-            normal: measured outward unit normal (3,).
-            dt: time since the previous sample, s; not negative.
-
-        Returns:
-            The height error before correction (m), positive where the surface was found higher than modelled.
+        Returns the height error before, m, positive where the surface was found higher than modelled.
         """
         if dt < 0:
             raise UsageError(f"dt: expected a time that has passed, got {dt:g} s")
         p, n = point.tolist(), normal.tolist()
-        foot, m = self.foot_of(p)
+        foot, m = self.foot(p)
         error: float = sum(mi * (pi - fi) for mi, pi, fi in zip(m, p, foot, strict=True))
         height = 1 - math.exp(-2 * math.pi * self._gains.height_hz * dt)
         tilt = 1 - math.exp(-2 * math.pi * self._gains.tilt_hz * dt)
@@ -314,17 +295,14 @@ class TactileServo:
         self._reference = tuple(point.tolist())
 
     def step(self, speed: float, depth: float, dt: float) -> ProbePose:
-        """One servo cycle.
+        """The pose that the probe must have when this cycle's command takes effect.
 
         Args:
-            speed: contact speed over the surface, m/s.
+            speed: of the contact over the surface, m/s.
             depth: wanted indentation, m.
             dt: servo period, s.
-
-        Returns:
-            The pose the probe must have when this cycle's command takes effect.
         """
-        foot, normal = self.surface.foot_of(self._reference)
+        foot, normal = self.surface.foot(self._reference)
         if speed > 0 and self._follower is not None:
             foot, normal = self._march(self._follower, foot, normal, speed * dt)
         self._reference = foot
@@ -348,7 +326,7 @@ class TactileServo:
         x, y, z = x - fall * u0, y - fall * u1, z - fall * u2
         out = n0 * x + n1 * y + n2 * z
         x, y, z = _unit((x - out * n0, y - out * n1, z - out * n2))
-        return self.surface.foot_of((f0 + distance * x, f1 + distance * y, f2 + distance * z))
+        return self.surface.foot((f0 + distance * x, f1 + distance * y, f2 + distance * z))
 
 
 def _dot(a: Floats, b: Floats) -> float:

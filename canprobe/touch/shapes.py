@@ -1,5 +1,4 @@
-"""A shape at a pose, which all touchable surfaces share, and the surfaces of higher degree: bowl, wave, fillet,
-torus.
+"""A shape at a pose, which all touchable surfaces share, and those that are no quadric: bowl, wave, fillet, torus.
 
 Every shape has a frame of its own: the origin lies ON the surface at its reference (top-most) point, z is the outward
 normal there. A scene thus places a surface by one of its points. Bodies are solid below the origin; curvature is
@@ -10,12 +9,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import atan2, cos, hypot, inf, pi, sin, sqrt
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-
-# A shape at a pose: what all touchable surfaces share.
 
 Array = npt.NDArray[np.float64]
 
@@ -25,7 +22,7 @@ Vec = tuple[float, float, float]
 
 
 class Nearest(NamedTuple):
-    """What ``ClosestPoint`` holds, in plain floats for those who ask in every cycle."""
+    """What ``ClosestPoint`` holds, in plain floats for what asks in every cycle."""
 
     point: Vec
     normal: Vec
@@ -72,32 +69,6 @@ class Touches:
     edge_m: Array
 
 
-class ObjectShape(Protocol):
-    """What the plant, the plan and the studies ask of an object."""
-
-    @property
-    def T_base_object(self) -> Array:
-        """(4, 4) frame of the object in the base frame, m."""
-
-    def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
-        """Closest surface point to a (3,) point of the base frame, m."""
-
-    def nearest(self, point_base: Vec) -> Nearest:
-        """The same in plain floats."""
-
-    def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Where a ball touches if that is not its closest point alone (see ``PlacedShape``)."""
-
-    def gaps(self, points_base: Array) -> Array:
-        """Signed distances of (n, 3) points (see ``PlacedShape``)."""
-
-    def tightest_concave_radius(self, region: npt.ArrayLike | None = None) -> float:
-        """Smallest radius of a hollow, m; inf where there is none (see ``PlacedShape``)."""
-
-    def surface_matrix(self) -> Array:
-        """(4, 4) quadric of the surface in the base frame, f < 0 inside, gradient of length 1 at the origin."""
-
-
 class PlacedShape:
     """A shape at a pose: carries queries into the object's frame and answers back.
 
@@ -127,24 +98,13 @@ class PlacedShape:
         return self._pose
 
     def closest(self, point_base: npt.ArrayLike) -> ClosestPoint:
-        """Closest surface point, its normal and curvatures.
-
-        Args:
-            point_base: (3,) query point in the base frame, m.
-
-        Returns:
-            Everything in the base frame.
-        """
+        """Closest surface point to a (3,) point of the base frame (m), its normal and curvatures."""
         bx, by, bz = np.asarray(point_base, dtype=float).tolist()
         point, normal, distance, kappa, directions = self.nearest((bx, by, bz))
         return ClosestPoint(np.array(point), np.array(normal), distance, np.array(kappa), np.array(directions))
 
     def nearest(self, point_base: Vec) -> Nearest:
-        """As ``closest``, in plain floats.
-
-        Args:
-            point_base: query point in the base frame, m.
-        """
+        """As ``closest``, in plain floats."""
         bx, by, bz = point_base
         ox, oy, oz = self._origin
         x0, x1, x2, y0, y1, y2, z0, z1, z2 = self._columns
@@ -167,26 +127,11 @@ class PlacedShape:
         )
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Where a ball touches the surface if that is not its closest point alone.
-
-        Args:
-            point_base: (3,) centre of the ball, base frame, m.
-            reach: its radius, m.
-
-        Returns:
-            Every place nearer than the reach; None where ``closest`` tells all there is.
-        """
+        """Every place where a ball (centre (3,) in base, radius, m) touches; None where ``closest`` is all there is."""
         return None
 
     def gaps(self, points_base: Array) -> Array:
-        """Signed distances of many points, positive outside.
-
-        Args:
-            points_base: (n, 3) m.
-
-        Returns:
-            (n,) m.
-        """
+        """Signed distances (n,) of points (n, 3) of the base frame, m, positive outside."""
         return np.array([self.closest(p).distance for p in points_base])
 
     def _to_object(self, points_base: Array) -> Array:
@@ -214,36 +159,32 @@ class PlacedShape:
         k2 = min(float(self.closest(p).kappa[1]) for p in np.atleast_2d(np.asarray(region, dtype=float)))
         return -1.0 / k2 if k2 < -1e-12 else inf
 
-    def surface_matrix(self) -> Array:
-        """(4, 4) quadric S of the surface in the base frame: f = X'SX, X = (x, y, z, 1), f < 0 inside.
-
-        Scaled so that the gradient has length 1 at the object's origin.
-        """
-        T_object_base = np.linalg.inv(self._pose)
-        S: Array = T_object_base.T @ self._matrix() @ T_object_base
-        return (S + S.T) / 2
-
     def _foot(self, x: float, y: float, z: float) -> Foot:
-        raise NotImplementedError
-
-    def _matrix(self) -> Array:
         raise NotImplementedError
 
     def _tightest_anywhere(self) -> float:
         return inf
 
 
-def osculating_matrix(diagonal: tuple[float, float, float]) -> Array:
-    """Quadric x'Dx + z = 0, through the origin with unit outward gradient along z."""
-    S = np.diag((*diagonal, 0.0))
-    S[2, 3] = S[3, 2] = 0.5
-    return S
-
-
 def require_positive(**lengths: float) -> None:
+    """Refuse lengths that are not above 0 m and finite."""
     for name, value in lengths.items():
         if not 0.0 < value < inf:
             raise ValueError(f"{name} must be a positive length in m, got {value!r}")
+
+
+class RoundShape(PlacedShape):
+    """A shape with a radius.
+
+    Args:
+        T_base_object: (4, 4) pose, m.
+        radius: m.
+    """
+
+    def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
+        super().__init__(T_base_object)
+        require_positive(radius=radius)
+        self.radius = radius
 
 
 def tangent_of(nx: float, ny: float, nz: float) -> tuple[float, float, float]:
@@ -255,28 +196,20 @@ def tangent_of(nx: float, ny: float, nz: float) -> tuple[float, float, float]:
     return -nz * nx / size, -nz * ny / size, size
 
 
-# A round hollow, and what happens when a ball is too large for it.
-
 LIP_M = 1e-3
 """Radius of the rounding between the hollow's wall and the top."""
 _PIECES = 360
 
 
-class Bowl(PlacedShape):
+class Bowl(RoundShape):
     """Hollow half sphere in a solid block with a rounded lip and a flat top.
 
     The centre is at z = +radius, the origin at the bottom; the top lies a lip's radius above the centre. A ball too
     large to go in rests on the lip all round: there ``touches`` cuts the ring into short edges.
-
-    Args:
-        T_base_object: (4, 4) pose, m.
-        radius: m.
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float) -> None:
-        super().__init__(T_base_object)
-        require_positive(radius=radius)
-        self.radius = radius
+        super().__init__(T_base_object, radius)
         angles = np.arange(_PIECES) * (2.0 * pi / _PIECES)
         ring = radius + LIP_M
         self._ring = np.column_stack((ring * np.cos(angles), ring * np.sin(angles), np.full(_PIECES, radius)))
@@ -289,18 +222,8 @@ class Bowl(PlacedShape):
         k = -1.0 / radius
         rho = sqrt(x * x + y * y + zc * zc)
         nx, ny, nz = (-x / rho, -y / rho, -zc / rho) if rho > 0.0 else (0.0, 0.0, 1.0)
-        return (
-            -radius * nx,
-            -radius * ny,
-            radius * (1.0 - nz),
-            nx,
-            ny,
-            nz,
-            radius - rho,
-            k,
-            k,
-            *tangent_of(nx, ny, nz),
-        )
+        foot = -radius * nx, -radius * ny, radius * (1.0 - nz)
+        return (*foot, nx, ny, nz, radius - rho, k, k, *tangent_of(nx, ny, nz))
 
     def _lip_foot(self, x: float, y: float, zc: float) -> Foot:
         """Closest point of the lip or the top; zc is counted from the centre's height."""
@@ -319,7 +242,7 @@ class Bowl(PlacedShape):
         )
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Pieces of the lip under a ball whose centre is above it; see ``PlacedShape``."""
+        """Pieces of the lip under a ball whose centre is above it."""
         p = self._to_object(np.asarray(point_base, dtype=float)[None])[0]
         if p[2] <= self.radius or hypot(p[0], p[1]) >= self.radius + LIP_M:
             return None
@@ -343,14 +266,9 @@ class Bowl(PlacedShape):
         gaps: Array = np.where(zc > 0.0, above, inside)
         return gaps
 
-    def _matrix(self) -> Array:
-        return osculating_matrix((-0.5 / self.radius,) * 3)
-
     def _tightest_anywhere(self) -> float:
         return self.radius
 
-
-# Surfaces that are straight along x: a sine sheet and a rounded edge, given by their section across.
 
 _PER_WAVE = 48
 _NEWTON = 60
@@ -420,7 +338,7 @@ class Wave(PlacedShape):
         return x, v, h, 0.0, ny, nz, distance, 0.0, across, 1.0, 0.0, 0.0
 
     def touches(self, point_base: npt.ArrayLike, reach: float) -> Touches | None:
-        """Both walls where a trough is too tight for the ball; see ``PlacedShape``."""
+        """Both walls where a trough is too tight for the ball."""
         x, y, z = self._to_object(np.asarray(point_base, dtype=float)[None])[0].tolist()
         near = [v for square, v in self._minima(y, z) if square < reach * reach]
         if len(near) < 2:
@@ -435,14 +353,11 @@ class Wave(PlacedShape):
         gaps: Array = (z - self.amplitude * (np.cos(self._k * y) - 1.0)) / np.sqrt(1.0 + slope * slope)
         return gaps
 
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.0, 0.5 * self.amplitude * self._k**2, 0.0))
-
     def _tightest_anywhere(self) -> float:
         return 1.0 / (self.amplitude * self._k**2)
 
 
-class Fillet(PlacedShape):
+class Fillet(RoundShape):
     """Rounded edge along x: plane, cylinder, plane; the curvature jumps twice. The origin is the middle of the arc.
 
     Args:
@@ -452,11 +367,10 @@ class Fillet(PlacedShape):
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, radius: float, angle: float) -> None:
-        super().__init__(T_base_object)
-        require_positive(radius=radius)
+        super().__init__(T_base_object, radius)
         if not 0.0 < angle < pi:
             raise ValueError(f"angle must be between 0 and pi, in rad; got {angle!r}")
-        self.radius, self.angle = radius, angle
+        self.angle = angle
         self._half, self._sin, self._cos = 0.5 * angle, sin(0.5 * angle), cos(0.5 * angle)
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
@@ -470,14 +384,8 @@ class Fillet(PlacedShape):
         distance = y * ny + zc * nz - radius
         return x, y - distance * ny, z - distance * nz, 0.0, ny, nz, distance, 0.0, 0.0, 0.0, nz, -ny
 
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.0, 0.5 / self.radius, 0.0))
 
-
-# A ring with a round section.
-
-
-class Torus(PlacedShape):
+class Torus(RoundShape):
     """Ring lying flat: axis along z through x = -ring_radius, the origin on its crown, x outward from the axis.
 
     Round the tube the curvature is 1/radius everywhere; along the ring it is positive outside, 0 on the crown and
@@ -490,11 +398,10 @@ class Torus(PlacedShape):
     """
 
     def __init__(self, T_base_object: npt.ArrayLike, ring_radius: float, radius: float) -> None:
-        super().__init__(T_base_object)
-        require_positive(ring_radius=ring_radius, radius=radius)
-        if radius >= ring_radius:
+        super().__init__(T_base_object, radius)
+        if not radius < ring_radius < inf:
             raise ValueError(f"a torus needs ring_radius > radius, in m; got {ring_radius!r} and {radius!r}")
-        self.ring_radius, self.radius = ring_radius, radius
+        self.ring_radius = ring_radius
 
     def _foot(self, x: float, y: float, z: float) -> Foot:
         ring, radius = self.ring_radius, self.radius
@@ -508,9 +415,6 @@ class Torus(PlacedShape):
             *(ring * ux + radius * nx - ring, ring * uy + radius * ny, radius * (nz - 1.0)),
             *(nx, ny, nz, rho - radius, 1.0 / radius, nr / (ring + radius * nr), -nz * ux, -nz * uy, nr),
         )
-
-    def _matrix(self) -> Array:
-        return osculating_matrix((0.5 / self.radius, 0.0, 0.0))
 
     def _tightest_anywhere(self) -> float:
         return self.ring_radius - self.radius

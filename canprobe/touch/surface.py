@@ -71,11 +71,9 @@ class SurfaceMatrix:
 
     @classmethod
     def from_curvature(cls, K: ArrayLike, c13: float = 0.0, c23: float = 0.0, c33: float = 0.0) -> SurfaceMatrix:
-        """The normalised surface with shape operator K at the origin of its contact frame.
+        """The normalised surface with shape operator K (2, 2) at the origin of its contact frame, 1/m.
 
-        Args:
-            K: (2, 2) symmetric, 1/m.
-            c13, c23, c33: the entries that K leaves open, 1/m.
+        c13, c23, c33 (1/m) are the entries that K leaves open.
         """
         k = checked("K", K, (2, 2))
         S = np.zeros((4, 4))
@@ -154,7 +152,7 @@ class SurfaceMatrix:
     def contact_frame(self, point: ArrayLike) -> Array:
         """T (4, 4) from the contact frame at a point to this frame: z is the inward normal.
 
-        The x axis is this frame's x axis laid on the tangent plane (`frames.tangent_rotation`).
+        The x axis is this frame's x axis laid on the tangent plane (`linear_algebra.tangent_rotation`).
         """
         p = checked("point", point, (3,))
         return homogeneous(tangent_rotation(-self.gradient(p) / self._gradient_size(p)), p)

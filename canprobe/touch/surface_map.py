@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,11 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from canprobe.errors import UsageError
 from canprobe.touch.estimate.answer import SurfaceEstimate
-from canprobe.touch.estimate.quadric import UNIT, parameters_of, value_rows
+from canprobe.touch.estimate.quadric import TO_Q, UNIT, parameters_of, terms
 from canprobe.touch.linear_algebra import Array, checked, positive, read_only
 from canprobe.touch.surface import SurfaceMatrix
-
-# One local patch of a surface: its contact frame, its matrix, and how well every entry of it is known.
 
 WIDE = 10.0
 """Standard deviation of a combination of curvature that was not observed, over the path that the estimate rests on:
@@ -81,13 +79,7 @@ class LocalPatch:
 
     @classmethod
     def of(cls, estimate: SurfaceEstimate, *, t_s: float, travelled_m: float) -> LocalPatch:
-        """The patch of one estimate.
-
-        Args:
-            estimate: in the base frame, lengths in m.
-            t_s: instant of its last sample, s.
-            travelled_m: path of the contact until then, m.
-        """
+        """The patch of one estimate in the base frame; instant (s) of its last sample and path (m) until then."""
         return cls(
             T_base_contact=estimate.T_frame_contact,
             S=estimate.S,
@@ -162,14 +154,11 @@ def _covariance(estimate: SurfaceEstimate) -> Array:
 def _curvature_covariance(estimate: SurfaceEstimate, V: Array, weak: float) -> Array:
     """(3, 3) covariance of q = (K11, √2 K12, K22), what was not observed held wide, 1/m²."""
     if estimate.rank == 3:
-        to_q = np.array([1.0, math.sqrt(2.0), 1.0])
-        return estimate.covariance * np.outer(to_q, to_q)
+        return estimate.covariance * np.outer(TO_Q, TO_Q)
     seen = V @ np.linalg.inv(V.T @ estimate.information @ V) @ V.T
     result: Array = seen + weak**2 * (np.eye(3) - V @ V.T)
     return result
 
-
-# A whole scan as one surface description: local patches along the contact's path.
 
 SPACING_M = 2e-3
 """Path from one patch to the next, m: well below the radius of what can be felt, so that neighbours overlap."""
@@ -223,14 +212,6 @@ class SurfaceMap:
         """Longest path that a patch rests on, m; 0 without patches."""
         return max((patch.distance_m for patch in self.patches), default=0.0)
 
-    def thinned(self, spacing: float) -> SurfaceMap:
-        """The patches at every `spacing` (m) of path; see `spaced`.
-
-        Raises:
-            UsageError: when the spacing is not above 0.
-        """
-        return replace(self, patches=tuple(spaced(self.patches, spacing)))
-
     def equals(self, other: SurfaceMap) -> bool:
         """The same patches, path and method, bit by bit."""
         same = len(self) == len(other) and self.method == other.method and np.array_equal(self.path, other.path)
@@ -238,14 +219,7 @@ class SurfaceMap:
 
 
 def spaced(patches: Iterable[LocalPatch], spacing: float) -> list[LocalPatch]:
-    """The first patch at or after every multiple of a spacing along the path, from the first patch on.
-
-    A contact that stands still adds none.
-
-    Args:
-        patches: by increasing `travelled_m`.
-        spacing: m, above 0.
-    """
+    """The first patch at or after every multiple of a spacing (m) along the path; a contact at rest adds none."""
     step = positive("spacing", spacing)
     kept: list[LocalPatch] = []
     last = -1
@@ -262,16 +236,9 @@ def spaced(patches: Iterable[LocalPatch], spacing: float) -> list[LocalPatch]:
 def merge_patches(
     patches: Sequence[LocalPatch], path: ArrayLike, *, spacing: float = SPACING_M, method: str = ""
 ) -> SurfaceMap:
-    """One map of a scan from its estimates, a patch every `spacing`, without those that observed no curvature.
+    """One map of a scan from its estimates' patches, in the order of the path (n, 3), m, in base.
 
-    Args:
-        patches: of all estimates, in the order of the path.
-        path: (n, 3) contact points, base frame, m.
-        spacing: m.
-        method: name of the estimator.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
+    A patch every `spacing` (m) is kept, of those that observed some curvature.
     """
     usable = [patch for patch in patches if patch.rank >= LEAST_RANK]
     return SurfaceMap(patches=tuple(spaced(usable, spacing)), path=np.asarray(path, np.float64), method=method)
@@ -294,7 +261,7 @@ REACH_M = 4e-3
 _ITERATIONS = 40
 """Most rounds; each shrinks the error of the normal by the height over the radius of curvature."""
 _SETTLED = 1e-10
-_FACING = 0.5
+FACING = 0.5
 """Least cosine between a patch's normal and that of the nearest one: others are another side of a thin body."""
 
 
@@ -318,24 +285,11 @@ class MapPoint:
     patches: int
 
 
-class _Stack(NamedTuple):
-    """Patches as arrays: frames, gradient `B x + h` of f, covariance of S (zeros where the pose is not known)."""
-
-    R: Array
-    origin: Array
-    B: Array
-    h: Array
-    covariance: Array
-
-    @classmethod
-    def of(cls, patches: Sequence[LocalPatch]) -> _Stack:
-        T, S = np.array([p.T_base_contact for p in patches]), np.array([p.S for p in patches])
-        covariance = np.array([p.S_covariance * p.pose_known for p in patches])
-        return cls(T[:, :3, :3], T[:, :3, 3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3], covariance)
-
-
 class _Heights(NamedTuple):
-    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met."""
+    """What each patch says along one line: height (m), outward normal (base), its variance (m²), whether it is met.
+
+    Variances are 0 where the pose is not known.
+    """
 
     height: Array
     normal: Array
@@ -344,29 +298,24 @@ class _Heights(NamedTuple):
 
 
 def closest(surface_map: SurfaceMap, point: ArrayLike, reach: float = REACH_M) -> MapPoint:
-    """Closest point of a map's surface to a point nearby.
+    """Closest point of a map's surface to a point (3,) nearby, base frame, m.
 
-    Args:
-        surface_map: the map.
-        point: (3,) base frame, m.
-        reach: distance from a contact at which its patch no longer counts, m.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
+    `reach` (m) is the distance from a contact at which its patch no longer counts.
     """
     p, limit = checked("point", point, (3,)), positive("reach", reach)
     chosen = _candidates(surface_map, p, limit)
+    nowhere = MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
     if not len(chosen):
-        return _nowhere()
-    stack = _Stack.of([surface_map.patches[i] for i in chosen])
+        return nowhere
+    patches, contacts = [surface_map.patches[i] for i in chosen], surface_map.points[chosen]
     normal = surface_map.normals[chosen[0]]
-    foot = p - normal * float(normal @ (p - surface_map.points[chosen[0]]))
+    foot = p - normal * float(normal @ (p - contacts[0]))
     for _ in range(_ITERATIONS):
-        said = _heights(stack, p, normal)
-        weight = _weights(said, np.linalg.norm(stack.origin - foot, axis=1), limit)
+        said = _heights(patches, p, normal)
+        weight = _weights(said, np.linalg.norm(contacts - foot, axis=1), limit)
         total = float(weight.sum())
         if not total > 0.0:
-            return _nowhere()
+            return nowhere
         weight = weight / total
         height = float(weight @ said.height)
         foot = p + height * normal
@@ -388,14 +337,10 @@ def _candidates(surface_map: SurfaceMap, p: Array, reach: float) -> NDArray[np.i
     distance = np.sqrt(np.einsum("ij,ij->i", offset, offset))
     first = int(np.argmin(distance))
     lifted = abs(float(surface_map.normals[first] @ offset[first]))
-    facing = surface_map.normals @ surface_map.normals[first] > _FACING
+    facing = surface_map.normals @ surface_map.normals[first] > FACING
     # by the triangle inequality, with room for a foot that is not below the point as seen from the nearest patch
     chosen = np.flatnonzero(facing & (distance <= 1.5 * reach + lifted))
     return chosen[np.argsort(distance[chosen], kind="stable")]
-
-
-def _nowhere() -> MapPoint:
-    return MapPoint(np.full(3, math.nan), np.full(3, math.nan), math.nan, math.nan, 0)
 
 
 def _weights(said: _Heights, distance: Array, reach: float) -> Array:
@@ -409,21 +354,23 @@ def _weights(said: _Heights, distance: Array, reach: float) -> Array:
     return fade
 
 
-def _heights(stack: _Stack, p: Array, normal: Array) -> _Heights:
+def _heights(patches: Sequence[LocalPatch], p: Array, normal: Array) -> _Heights:
     """Where the line p + t·normal meets each patch."""
-    x, d = (p - stack.origin)[:, None] @ stack.R, normal @ stack.R
-    x = x[:, 0]
-    gx, gd = (x[:, None] @ stack.B)[:, 0] + stack.h, (d[:, None] @ stack.B)[:, 0]
+    T, S = np.array([patch.T_base_contact for patch in patches]), np.array([patch.S for patch in patches])
+    R, B, h = T[:, :3, :3], 2.0 * S[:, :3, :3], 2.0 * S[:, :3, 3]
+    x, d = ((p - T[:, :3, 3])[:, None] @ R)[:, 0], normal @ R
+    gx, gd = (x[:, None] @ B)[:, 0] + h, (d[:, None] @ B)[:, 0]
     # f(x + t d) = ½ a t² + b t + c
     a, b = np.einsum("ij,ij->i", d, gd), np.einsum("ij,ij->i", d, gx)
-    c = 0.5 * np.einsum("ij,ij->i", x, gx + stack.h)
+    c = 0.5 * np.einsum("ij,ij->i", x, gx + h)
     square = b * b - 2.0 * a * c
     root = b + np.sqrt(np.maximum(square, 0.0))
     met = (square >= 0.0) & (root > 0.0)
     t = np.where(met, -2.0 * c / np.where(met, root, 1.0), 0.0)
     g = gx + t[:, None] * gd
-    F = value_rows(x + t[:, None] * d)
+    F = terms(x + t[:, None] * d, 9)[:, 0]  # df/dc
     slope = np.where(met, np.einsum("ij,ij->i", g, d), 1.0)
-    variance = np.einsum("ij,ijk,ik->i", F, stack.covariance, F) / slope**2
-    outward = (stack.R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
+    covariance = np.array([patch.S_covariance * patch.pose_known for patch in patches])
+    variance = np.einsum("ij,ijk,ik->i", F, covariance, F) / slope**2
+    outward = (R @ g[:, :, None])[:, :, 0] / np.sqrt(np.einsum("ij,ij->i", g, g))[:, None]
     return _Heights(t, outward, variance, met)

@@ -14,7 +14,7 @@ from pathlib import Path
 
 _MODULES = ("can", "can-raw", "can-bcm", "can-gw", "can-dev", "vcan", "vxcan", "slcan")
 _FINIT_MODULE = {"x86_64": 313, "i686": 350, "i586": 350, "i486": 350, "i386": 350}
-_NEW_LINK, _DELETE_LINK = 16, 17
+_NEW_LINK = 16
 _NLM_REQUEST_ACK_CREATE = 0x1 | 0x4 | 0x400
 _IFLA_IFNAME, _IFLA_LINKINFO, _IFLA_INFO_KIND = 3, 18, 1
 _IFF_UP = 1
@@ -40,11 +40,6 @@ def make_link(name: str, kind: str) -> None:
 def set_link(name: str, up: bool) -> None:
     """Bring a link up or down; OSError if the kernel refuses."""
     _request(_NEW_LINK, struct.pack("=BxHiII", 0, 0, socket.if_nametoindex(name), _IFF_UP if up else 0, _IFF_UP))
-
-
-def remove_link(name: str) -> None:
-    """Delete a link; OSError if the kernel refuses."""
-    _request(_DELETE_LINK, struct.pack("=BxHiII", 0, 0, socket.if_nametoindex(name), 0, 0))
 
 
 def _attribute(kind: int, payload: bytes) -> bytes:

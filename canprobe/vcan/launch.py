@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from types import FrameType
 from typing import Protocol
 
 from canprobe.bus.socketcan import check_interface, has_socketcan
@@ -32,30 +31,15 @@ _PATIENCE = 3
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
-class Signals:
-    """Signals that arrived and were not dealt with yet, oldest first."""
-
-    def __init__(self) -> None:
-        self._pending: list[int] = []
-
-    def take(self) -> list[int]:
-        """Return what arrived since the last call."""
-        taken, self._pending = self._pending, []
-        return taken
-
-    def _remember(self, number: int, frame: FrameType | None) -> None:
-        self._pending.append(number)
-
-
 @contextlib.contextmanager
-def caught_signals() -> Iterator[Signals]:
-    """Within the block, remember SIGINT, SIGTERM, SIGHUP and SIGQUIT instead of dying; ignored ones stay ignored."""
-    signals = Signals()
+def caught_signals() -> Iterator[list[int]]:
+    """Yield a list to which SIGINT, SIGTERM, SIGHUP and SIGQUIT are appended within the block; ignored ones stay so."""
+    signals: list[int] = []
     before = {number: signal.getsignal(number) for number in _FORWARDED}
     try:
         for number, handler in before.items():
             if handler != signal.SIG_IGN:
-                signal.signal(number, signals._remember)
+                signal.signal(number, lambda n, _: signals.append(n))
         yield signals
     finally:
         for number, handler in before.items():
@@ -78,14 +62,14 @@ class Job(Protocol):
         ...
 
 
-def supervise(job: Job, signals: Signals, timeout_s: float | None) -> tuple[int, bool]:
+def supervise(job: Job, signals: list[int], timeout_s: float | None) -> tuple[int, bool]:
     """Run `job` to its end.
 
     Every signal is passed on; the third one kills. On the time-out the job gets SIGTERM and 5 s, then it is killed.
 
     Args:
         job: what runs already.
-        signals: where signals of this process arrive.
+        signals: where signals of this process arrive; those that were passed on are taken out.
         timeout_s: how long it may run, from now; `None` for ever.
 
     Returns:
@@ -95,7 +79,8 @@ def supervise(job: Job, signals: Signals, timeout_s: float | None) -> tuple[int,
     timed_out = False
     received = 0
     while (status := job.poll()) is None:
-        for number in signals.take():
+        while signals:
+            number = signals.pop(0)
             received += 1
             if received >= _PATIENCE:
                 job.kill()
@@ -179,14 +164,14 @@ def run_with_vcan(
         return _run_in_guest(command, signals, timeout_s, install, realtime)
 
 
-def _run_here(command: Sequence[str], way: str, signals: Signals, timeout_s: float | None) -> int:
+def _run_here(command: Sequence[str], way: str, signals: list[int], timeout_s: float | None) -> int:
     status, timed_out = supervise(LocalJob(command, {**os.environ, WAY: way}), signals, timeout_s)
     _report_time_out(timed_out, timeout_s)
     return status
 
 
 def _run_in_guest(
-    command: Sequence[str], signals: Signals, timeout_s: float | None, install: bool, realtime: bool
+    command: Sequence[str], signals: list[int], timeout_s: float | None, install: bool, realtime: bool
 ) -> int:
     if not is_installed():
         line = f"{'' if os.geteuid() == 0 else 'sudo '}apt-get install -y {PACKAGE}"
@@ -204,7 +189,7 @@ def _run_in_guest(
         return GUEST_LOST
 
 
-def _supervise_guest(job: GuestJob, signals: Signals, timeout_s: float | None) -> int:
+def _supervise_guest(job: GuestJob, signals: list[int], timeout_s: float | None) -> int:
     """Wait for the boot, which may be interrupted but does not count as running time, then for the command."""
     interrupted, _ = supervise(_Boot(job), signals, None)
     if interrupted:

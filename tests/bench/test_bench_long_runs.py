@@ -15,7 +15,7 @@ T, POLE = np.eye(4), np.array([0.0, 0.0, 0.04])
 
 @pytest.fixture
 def estimator():
-    return make_estimator("recursive", sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL, probe_radius=0.04)
+    return make_estimator("recursive", sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL)
 
 
 def way(n):

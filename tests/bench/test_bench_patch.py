@@ -47,7 +47,7 @@ def test_bench_add(benchmark, patch):
 
 
 def test_bench_fuse(benchmark, patch):
-    motion = make_estimator("recursive", sigma_point=1e-4, sigma_normal=4e-3, probe_radius=0.04)
+    motion = make_estimator("recursive", sigma_point=1e-4, sigma_normal=4e-3)
     for i in range(300):
         motion.add(touch(i))
     estimate = motion.estimate()

@@ -35,7 +35,7 @@ def samples(n):
 def settled(method):
     """An estimator after 480 samples, and those that come next."""
     estimator = make_estimator(
-        method, sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL, probe_radius=0.04, correlation=CORRELATION[method]
+        method, sigma_point=SIGMA_POINT, sigma_normal=SIGMA_NORMAL, correlation=CORRELATION[method]
     )
     coming = iter(samples(60_000))
     for sample in itertools.islice(coming, 480):

@@ -37,7 +37,7 @@ def test_a_measurement_comes_out_as_it_went_in(frame):
     sent = Measurement(*(getattr(sent, n) for n in sent.__slots__[:7]), sample, 2)
     frames = [(0x80, b"\x01", 5), (0x80000123, b"12345678", 6), (0x40000181, b"", 7)]
     got = unpack_observation(pack_observation(Observation(99, sent, None, frames), 3))
-    assert (got.t_ns, got.frames, got.dropped, got.phase, got.estimate) == (99, frames, 3, None, None)
+    assert (got.t_ns, got.frames, got.dropped, got.phase, got.patch) == (99, frames, 3, None, None)
     m = got.measurement
     np.testing.assert_array_equal(m.q, q)
     for name in ("cycle", "t_ns", "q_age", "torque_permille", "statuswords", "enabled", "tactile_age"):
@@ -75,7 +75,7 @@ def test_an_estimate_keeps_what_was_not_observed():
         observed = np.array([True, False])
 
     got = unpack_observation(pack_observation(Observation(5, Measurement(0, 0), Command(estimate=Estimate()), [])))
-    np.testing.assert_array_equal(got.estimate.T_frame_contact, Estimate.T_frame_contact)
-    np.testing.assert_array_equal(got.estimate.K, Estimate.K)
-    np.testing.assert_array_equal(got.estimate.covariance, Estimate.covariance)
-    assert got.estimate.observed == (True, False)
+    np.testing.assert_array_equal(got.patch.T_base_contact, Estimate.T_frame_contact)
+    np.testing.assert_array_equal(got.patch.K, Estimate.K)
+    np.testing.assert_array_equal(got.patch.covariance, Estimate.covariance)
+    assert got.patch.observed == (True, False)

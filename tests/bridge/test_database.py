@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.bridge.database import FORMATS, describe_frames, identifier, write_database
+from canprobe.bridge.database import FORMATS, identifier, plan_database, write_database
 from canprobe.bus.disk import read_candump
 from canprobe.errors import UsageError
 from canprobe.protocol.pdo import PdoEntry
@@ -73,10 +73,10 @@ def test_grouped_targets_are_one_message_with_two_signals(tmp_path):
 
 @pytest.mark.parametrize("scene", ["cylinder", "free", "listen", "press"])
 def test_names_are_unique_and_no_bit_is_used_twice(scene):
-    frames = describe_frames(canprobe.plan(load_scene(scene)))
-    assert len({frame.name for frame in frames}) == len({frame.cob_id for frame in frames}) == len(frames)
+    frames = plan_database(canprobe.plan(load_scene(scene))).messages
+    assert len({frame.name for frame in frames}) == len({frame.frame_id for frame in frames}) == len(frames)
     for frame in frames:
-        bits = [bit for signal in frame.signals for bit in range(signal.start, signal.start + signal.bits)]
+        bits = [bit for signal in frame.signals for bit in range(signal.start, signal.start + signal.length)]
         assert len(bits) == len(set(bits)) and max(bits) < 8 * frame.length
         assert len({signal.name for signal in frame.signals}) == len(frame.signals)
 

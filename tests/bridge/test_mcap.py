@@ -17,7 +17,7 @@ from undrawn import undrawn_run
 import canprobe
 import canprobe.errors
 from canprobe.bridge.messages import Encoder, Messages
-from canprobe.bridge.sample import CanFrame, Sample
+from canprobe.bridge.sample import Sample
 from canprobe.bus.disk import read_candump
 from canprobe.cli import main
 from canprobe.eds.packaged import eds_path
@@ -191,7 +191,7 @@ def test_frames_of_can_fd_have_a_topic_of_their_own(recorded):
     """64 bytes do not fit can_msgs: they go where ros2_socketcan puts them, whole."""
     encoder = Encoder()
     data = bytes(range(64))
-    sample = Sample(7, frames=(CanFrame(5, 0x181, data), CanFrame(6, 0x182, data[:8])))
+    sample = Sample(7, frames=((0x181, data, 5), (0x182, data[:8], 6)))
     messages = list(Messages(recorded.result.plan, encoder).of(sample))
     assert [topic.name for topic, _, _ in messages][:2] == ["/can_fd_frames", "/can_frames"]
     frame = encoder.decode("ros2_socketcan_msgs/msg/FdFrame", messages[0][2])

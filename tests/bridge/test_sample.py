@@ -58,5 +58,5 @@ def test_the_contact_frame_looks_inward():
     T = np.eye(4)
     T[:3, :3] = np.diag([1.0, -1.0, -1.0])  # z down, into an object that lies below
     T[:3, 3] = (0.1, 0.2, 0.3)
-    contact = ContactFrame(0, T, 2.0)
+    contact = ContactFrame(T)
     assert contact.normal.tolist() == [0.0, 0.0, 1.0] and contact.point.tolist() == [0.1, 0.2, 0.3]

@@ -21,12 +21,10 @@ from canprobe.bridge.view.instants import (
     SILENT_NS,
     Follower,
     Moment,
-    curvature_error,
-    curvature_sigma,
     curves_of,
+    judge,
     kappa_sigmas,
     row_of,
-    true_kappa,
 )
 from canprobe.bridge.view.path import GAP_M, LIFT_M, Trail, error_scale
 from canprobe.bridge.view.recorded import read_run
@@ -55,10 +53,10 @@ def samples(recorded):
 
 def test_every_answer_of_the_estimator_is_found_once(run, recorded):
     said = recorded.result.estimates["recursive"]
-    assert len(run.patches) == len(said) > 5
-    for patch, record in zip(run.patches, said, strict=True):
-        assert np.array_equal(patch.K, record.estimate.K)
-        assert np.array_equal(patch.T_base_contact, record.estimate.T_frame_contact)
+    assert len(run.answers) == len(said) > 5
+    for answer, record in zip(run.answers, said, strict=True):
+        assert np.array_equal(answer.patch.K, record.estimate.K)
+        assert np.array_equal(answer.patch.T_base_contact, record.estimate.T_frame_contact)
 
 
 def test_every_tactile_frame_of_the_bus_is_found_once(run, recorded):
@@ -94,30 +92,33 @@ def test_live_and_recorded_show_the_same(run, recorded, samples):
     compared, touched = 0, None
     for sample in samples:
         live = follower.take(sample)
-        touched = sample.contact or touched
+        touched = (sample.touch and sample.touch.contact) or touched
         if sample.patch is None:
             continue
         kept = run.at(live.t_s)
         assert live.q.tolist() == kept.q.tolist() and live.phase in {kept.phase, "retreat"}
-        assert live.force == pytest.approx(kept.force) and live.error == pytest.approx(kept.error, nan_ok=True)
+        assert live.force == pytest.approx(kept.force) and live.answer.error == pytest.approx(
+            kept.answer.error, nan_ok=True
+        )
         assert live.contact is touched
         apart, normal = live.contact.point - kept.contact.point, kept.contact.normal
         assert np.linalg.norm(apart - (apart @ normal) * normal) < 5e-6  # its height is the sample's business
         assert live.contact.T_base_contact[:3, 2] == pytest.approx(kept.contact.T_base_contact[:3, 2], abs=1e-6)
         compared += 1
-    assert compared == len(run.patches)
+    assert compared == len(run.answers)
 
 
 def test_errors_are_those_of_the_summary(run, recorded):
     """After the first 20 mm, as `summary.json` scores them."""
     records = recorded.result.estimates["recursive"]
-    late = [e for e, r in zip(run.errors, records, strict=True) if r.travelled_m >= 0.02 and math.isfinite(e)]
+    errors = [answer.error for answer in run.answers]
+    late = [e for e, r in zip(errors, records, strict=True) if r.travelled_m >= 0.02 and math.isfinite(e)]
     expected = recorded.result.summary["shape"]["kappa_rms_error_per_m"]
     assert (expected is None and not late) or np.sqrt(np.mean(np.square(late))) == pytest.approx(expected, rel=0.02)
 
 
 def test_contact_ends_when_nothing_more_is_felt():
-    contact = ContactFrame(0, np.eye(4), 1.0)
+    contact = ContactFrame(np.eye(4))
     follower = Follower()
     follower.moment = Moment(contact=contact)
     follower._felt_ns = 0
@@ -145,10 +146,11 @@ def cylinder_patch(turn, scale=1.0, observed=(True, True), covariance=None):
 
 @pytest.mark.parametrize("turn", [0.0, 0.7, 2.0])
 def test_the_error_of_an_exact_patch_is_zero_in_any_axes_and_its_own_size_otherwise(turn):
-    assert curvature_error(*cylinder_patch(turn)) < 1e-10
-    assert curvature_error(*cylinder_patch(turn, 1.1)) == pytest.approx(0.1 / 0.036)
-    assert curvature_error(*cylinder_patch(turn, -1.0)) == pytest.approx(2.0 / 0.036)
-    assert math.isnan(curvature_error(*cylinder_patch(turn, observed=(True, False))))
+    assert judge(*cylinder_patch(turn)).error < 1e-10
+    assert judge(*cylinder_patch(turn, 1.1)).error == pytest.approx(0.1 / 0.036)
+    assert judge(*cylinder_patch(turn, -1.0)).error == pytest.approx(2.0 / 0.036)
+    assert math.isnan(judge(*cylinder_patch(turn, observed=(True, False))).error)
+    assert math.isnan(judge(cylinder_patch(turn)[0], None).error)
 
 
 def test_the_stated_deviation_is_the_expected_size_of_an_error():
@@ -156,18 +158,18 @@ def test_the_stated_deviation_is_the_expected_size_of_an_error():
     patch, _ = cylinder_patch(0.3, covariance=C)
     draws = np.random.default_rng(0).multivariate_normal(np.zeros(3), C, 40_000)
     errors = draws[:, 0] ** 2 + 2 * draws[:, 1] ** 2 + draws[:, 2] ** 2
-    assert curvature_sigma(patch) == pytest.approx(math.sqrt(errors.mean()), rel=0.02)
+    assert judge(patch, None).sigma == pytest.approx(math.sqrt(errors.mean()), rel=0.02)
     K = patch.K + 1e-4 * np.stack([draws[:, :2], draws[:, 1:]], axis=1)
     kappas = np.linalg.eigvalsh(K)[:, ::-1] - np.linalg.eigvalsh(patch.K)[::-1]
     assert kappa_sigmas(patch) == pytest.approx(1e4 * kappas.std(axis=0), rel=0.03)
     open_ = np.where(np.eye(3) > 0, np.nan, C)
-    assert curvature_sigma(cylinder_patch(0.0, covariance=open_)[0]) == math.inf
+    assert judge(*cylinder_patch(0.0, covariance=open_)).sigma == math.inf
     assert kappa_sigmas(cylinder_patch(0.0, covariance=open_)[0]) == (math.inf, math.inf)
 
 
 def test_curves_hold_the_bands_of_the_answers(run):
-    curves = curves_of(run.at(t) for t in run.times(0.04))
-    last = run.patches[-1]
+    curves = curves_of(row_of(run.at(t)) for t in run.times(0.04))
+    last = run.answers[-1].patch
     assert (curves["kappa1"][-1], curves["kappa2"][-1]) == pytest.approx(last.kappa)
     s1, s2 = kappa_sigmas(last)
     assert curves["high1"][-1] - curves["low1"][-1] == pytest.approx(2 * 1.96 * s1)
@@ -212,7 +214,7 @@ def test_the_true_curvature_is_that_under_the_contact():
     shape = make_object("torus", T_base_object=np.eye(4), ring_radius=0.06, radius=0.02)
     outside = homogeneous(tangent_rotation(np.array([-1.0, 0.0, 0.0])), np.array([0.02, 0.0, -0.02]))
     patch = SurfacePatch(0, outside, np.diag([12.5, 50.0]), np.eye(3), (True, True))
-    assert true_kappa(patch, shape) == pytest.approx((50.0, 12.5))
+    assert judge(patch, shape).kappa_true == pytest.approx((50.0, 12.5))
 
 
 # the page

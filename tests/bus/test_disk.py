@@ -13,20 +13,15 @@ from hypothesis import strategies as st
 
 import canprobe
 from canprobe.bus.disk import (
-    FOREIGN,
     CandumpWriter,
     RecordingPort,
-    convert_log,
-    format_line,
     read_candump,
-    read_log,
     read_npz,
     whole_file,
     write_text,
 )
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.port import ERR_FLAG, VirtualClock, is_bus_error
-from canprobe.cli import main
+from canprobe.bus.port import ERR_FLAG, VirtualClock
 from canprobe.errors import ResultsError, UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 
@@ -109,7 +104,7 @@ def test_recording_port_writes_both_directions(tmp_path: Path) -> None:
     bus = LockstepBus(VirtualClock(), "can0")
     one, two = bus.port(), bus.port()
     with CandumpWriter(tmp_path / "x", "can0") as writer:
-        port = RecordingPort(one, writer)
+        port = RecordingPort(one, writer.write)
         port.send_batch([(0x080, b"\1"), (0x201, b"\2")])
         port.clock.sleep_until_ns(2_500_000)
         two.send_batch([(0x181, b"\3")])
@@ -137,8 +132,6 @@ def test_a_torn_last_line_is_passed_over_unless_the_log_should_be_whole(tmp_path
         list(read_candump(path))
 
 
-# Logs converted between candump and python-can's forms: read back by python-can, and by ourselves.
-
 FRAMES = [
     (0, "can0", 0x080, b"\x01"),
     (2_500_000, "can0", 0x181, bytes(range(8))),
@@ -148,79 +141,20 @@ FRAMES = [
 ]
 
 
-@pytest.fixture
-def candump(tmp_path):
+def test_python_can_reads_a_log_of_ours_with_its_fd_frames(tmp_path):
     path = tmp_path / "bus.log"
-    path.write_text("".join(format_line(name, can_id, data, t_ns) for t_ns, name, can_id, data in FRAMES))
-    return path
-
-
-def test_fd_frames_stand_in_candump_as_can_utils_writes_them(candump):
-    assert list(read_candump(candump)) == FRAMES
-    assert candump.read_text().splitlines()[-1] == f"(0000000000.007500) can0 531##1{bytes(range(64)).hex().upper()}"
-
-
-def test_blf_is_read_by_python_can(candump, tmp_path):
-    assert convert_log(candump, tmp_path / "bus.blf") == len(FRAMES)
-    with can.BLFReader(tmp_path / "bus.blf") as reader:
-        messages = list(reader)
+    with CandumpWriter(path, "can0") as writer:
+        for t_ns, channel, can_id, data in FRAMES:
+            writer.on(channel)(can_id, data, t_ns)
+    assert list(read_candump(path)) == FRAMES
+    assert path.read_text().splitlines()[-1] == f"(0000000000.007500) can0 531##1{bytes(range(64)).hex().upper()}"
+    messages = list(can.CanutilsLogReader(path))
     assert [message.arbitration_id for message in messages] == [0x080, 0x181, 0x201, 0x18FF0102, 0x531]
     assert [bytes(message.data) for message in messages] == [data for *_, data in FRAMES]
-    assert [message.is_fd for message in messages] == [False] * 4 + [True]
+    assert [message.is_fd and message.bitrate_switch for message in messages] == [False] * 4 + [True]
     assert [message.is_remote_frame for message in messages] == [False, False, True, False, False]
-    assert [message.channel for message in messages] == [0, 0, 0, 1, 0]
+    assert [message.channel for message in messages] == [channel for _, channel, _, _ in FRAMES]
     assert [message.timestamp for message in messages] == pytest.approx([0, 2.5e-3, 2.501e-3, 5e-3, 7.5e-3], abs=1e-9)
-
-
-@pytest.mark.parametrize("suffix", [".blf", ".asc"])
-def test_there_and_back(candump, tmp_path, suffix):
-    convert_log(candump, tmp_path / f"there{suffix}")
-    convert_log(tmp_path / f"there{suffix}", tmp_path / "back.log")
-    frames = list(read_log(tmp_path / "back.log"))
-    assert [frame[2:] for frame in frames] == [frame[2:] for frame in FRAMES]
-    assert [frame[0] - frames[0][0] for frame in frames] == [frame[0] for frame in FRAMES]
-    if suffix == ".blf":
-        assert (tmp_path / "back.log").read_bytes() == candump.read_bytes()
-
-
-@pytest.mark.parametrize("suffix", [".blf", ".asc"])
-def test_an_error_frame_stays_one_though_its_class_is_lost(tmp_path, suffix):
-    log = tmp_path / "bus.log"
-    error = (1_000_000, "can0", ERR_FLAG | 0x088, bytes(8))
-    log.write_text("".join(format_line(name, i, data, t_ns) for t_ns, name, i, data in (FRAMES[0], error)))
-    convert_log(log, tmp_path / f"there{suffix}")
-    (_, _, can_id, _) = list(read_log(tmp_path / f"there{suffix}"))[-1]
-    assert is_bus_error(can_id)
-
-
-def test_what_is_no_log_is_refused_and_leaves_nothing(candump, tmp_path):
-    with pytest.raises(UsageError, match="itself"):
-        convert_log(candump, candump)
-    for suffix in FOREIGN:
-        wrong = tmp_path / f"wrong{suffix}"
-        wrong.write_bytes(b"\x00\x01no log at all")
-        if suffix != ".asc":  # whose reader passes over what it does not know
-            with pytest.raises(UsageError, match="wrong"):
-                convert_log(wrong, tmp_path / "out.log")
-            assert not (tmp_path / "out.log").exists()
-    with pytest.raises(UsageError, match="No such file"):
-        list(read_log(tmp_path / "none.blf"))
-    with pytest.raises(UsageError, match="missing"):
-        convert_log(candump, tmp_path / "missing" / "bus.blf")
-
-
-def test_a_run_writes_blf(tmp_path):
-    out = tmp_path / "run"
-    assert main(["run", "listen", "--duration", "0.05", "--out", str(out), "--blf"]) == 0
-    lines = [frame[2:] for frame in read_candump(out / "bus.log")]
-    assert [frame[2:] for frame in read_log(out / "bus.blf")] == lines
-
-
-@pytest.mark.parametrize("name", ["run.csv", "run.mf4", "run.log.gz"])
-def test_a_suffix_that_names_no_form_is_refused(candump, tmp_path, name):
-    with pytest.raises(UsageError, match=r"expected \.log \(candump\), \.asc, \.blf, \.trc, got \."):
-        convert_log(candump, tmp_path / name)
-    assert not (tmp_path / name).exists()
 
 
 # Files of a run that are cut off, empty or something else: one line that names the file, from every reader.

@@ -10,7 +10,7 @@ import can
 import pytest
 
 from canprobe.bus.interfaces import open_port
-from canprobe.bus.mmsg import BatchedSocket, PlainSocket
+from canprobe.bus.mmsg import FrameSocket
 from canprobe.bus.port import MonotonicClock
 from canprobe.errors import InterfaceError
 
@@ -35,10 +35,9 @@ def pair():
         end.close()
 
 
-@pytest.mark.parametrize("kind", [BatchedSocket, PlainSocket])
-def test_frames_are_the_kernels_structures(pair, kind):
+def test_frames_are_the_kernels_structures(pair):
     one, two = pair
-    frames = kind(one, fd=True)
+    frames = FrameSocket(one, fd=True)
     left = FRAMES
     while left:
         left = left[frames.send(left) :]
@@ -51,7 +50,7 @@ def test_frames_are_the_kernels_structures(pair, kind):
 
 def test_more_than_a_batch_keeps_each_length(pair):
     one, two = pair
-    sender, receiver = BatchedSocket(one, fd=True), BatchedSocket(two, fd=True)
+    sender, receiver = FrameSocket(one, fd=True), FrameSocket(two, fd=True)
     wanted = [(0x181 + k, LONG if k % 3 == 0 else LONG[: k % 9]) for k in range(100)]
     sent = sender.send(wanted)
     sent += sender.send(wanted[sent:])

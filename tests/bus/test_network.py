@@ -1,8 +1,9 @@
-"""canopen's Network pumped by whoever waits, against canopen's own LocalNode as the server, in virtual time."""
+"""SDO dialogues and waiting over a port, against canopen's own LocalNode as the server, in virtual time."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Generator, Sequence
+from typing import Any
 
 import canopen
 import pytest
@@ -10,10 +11,18 @@ from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.lockstep import LockstepBus
-from canprobe.bus.network import PumpedNetwork
+from canprobe.bus.network import (
+    Lss,
+    LssAnswerError,
+    PumpedNetwork,
+    SdoTimeoutError,
+    download,
+    hold_dialogues,
+    read_value,
+    upload,
+)
 from canprobe.bus.port import VirtualClock
-from canprobe.errors import UsageError
-from canprobe.protocol.frames import RTR_FLAG, Frame
+from canprobe.protocol.frames import RTR_FLAG, Frame, LssAddress
 
 MS = 1_000_000
 LONG = bytes(range(256)) * 3 + b"end"
@@ -21,7 +30,7 @@ LONG = bytes(range(256)) * 3 + b"end"
 
 def make_od() -> canopen.ObjectDictionary:
     od = canopen.ObjectDictionary()
-    for index, data_type in ((0x2000, 0x07), (0x2001, 0x0F), (0x1017, 0x06)):  # UNSIGNED32, DOMAIN, UNSIGNED16
+    for index, data_type in ((0x2000, 0x07), (0x2001, 0x0F), (0x2002, 0x06)):  # UNSIGNED32, DOMAIN, UNSIGNED16
         variable = ODVariable(f"var {index:X}", index)
         variable.data_type = data_type
         variable.access_type = "rw"
@@ -61,146 +70,139 @@ class LocalServer:
         return due
 
 
-class BlockServer(LocalServer):
-    """Answers one block upload or download of LONG by the book (CiA 301, 7.2.4.3.9 to 7.2.4.3.14), without CRC."""
-
-    def __init__(self, node_id: int) -> None:
-        super().__init__(node_id)
-        self.received = bytearray()
-        self._chunks = [LONG[k : k + 7].ljust(7, b"\0") for k in range(0, len(LONG), 7)]
-        self._first = 0
-        self._downloading = 0
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        if can_id != 0x605:
-            return ()
-        return [(0x585, bytes(answer)) for answer in self._answer(data)]
-
-    def _answer(self, data: bytes) -> Sequence[bytes]:
-        if self._downloading:
-            return self._take(data)
-        command = data[0]
-        if command & 0xE3 == 0xA0:  # initiate upload
-            return [b"\xc2" + data[1:4] + len(LONG).to_bytes(4, "little")]
-        if command & 0xE3 == 0xA3:  # start upload
-            return self._send()
-        if command & 0xE3 == 0xA2:  # block acknowledged
-            self._first += data[1]
-            spare = (-len(LONG)) % 7
-            return self._send() if self._first < len(self._chunks) else [bytes([0xC1 | spare << 2]).ljust(8, b"\0")]
-        if command & 0xE1 == 0xC0:  # initiate download
-            self._downloading = 1
-            return [b"\xa0" + data[1:4] + b"\x7f\0\0\0"]
-        return []
-
-    def _send(self) -> Sequence[bytes]:
-        block = self._chunks[self._first : self._first + 127]
-        last = self._first + len(block) == len(self._chunks)
-        numbers = range(1, len(block) + 1)
-        return [bytes([n | (0x80 if last and n == len(block) else 0)]) + c for n, c in zip(numbers, block, strict=True)]
-
-    def _take(self, data: bytes) -> Sequence[bytes]:
-        if self._downloading == 2:  # end of the download
-            spare = data[0] >> 2 & 7
-            del self.received[len(self.received) - spare :]
-            return [b"\xa1".ljust(8, b"\0")]
-        self.received += data[1:]
-        number = data[0] & 0x7F
-        if data[0] & 0x80:
-            self._downloading = 2
-        return [bytes([0xA2, number, 0x7F]).ljust(8, b"\0")] if number == 127 or data[0] & 0x80 else []
-
-
-@pytest.fixture
-def cell() -> tuple[PumpedNetwork, LocalServer, LockstepBus]:
-    return make_cell(LocalServer)
-
-
-def make_cell(server: Callable[[int], LocalServer]) -> tuple[PumpedNetwork, LocalServer, LockstepBus]:
-    bus = LockstepBus(VirtualClock())
-    slave = server(5)
-    bus.attach(slave)
-    network = PumpedNetwork(bus.port())
-    network.add_node(5, make_od())
-    return network, slave, bus
-
-
 Cell = tuple[PumpedNetwork, LocalServer, LockstepBus]
 
 
-def test_sdo_expedited_and_segmented_both_ways(cell: Cell) -> None:
+@pytest.fixture
+def cell() -> Cell:
+    bus = LockstepBus(VirtualClock())
+    slave = LocalServer(5)
+    bus.attach(slave)
+    return PumpedNetwork(bus.port()), slave, bus
+
+
+def held(network: PumpedNetwork, dialogue: Generator[bytes | None, bytes, Any], node_id: int = 5, **how: Any) -> Any:
+    """What a dialogue returns."""
+    results: list[Any] = []
+
+    def keep() -> Generator[bytes | None, bytes, None]:
+        results.append((yield from dialogue))
+
+    hold_dialogues(network, {node_id: keep()}, timeout_s=how.pop("timeout_s", 1.0), **how)
+    return results[0]
+
+
+def test_sdo_expedited_both_ways_and_segmented_upload(cell: Cell) -> None:
     network, slave, bus = cell
-    sdo = network[5].sdo
-    sdo[0x2000].raw = 0xDEADBEEF
+    held(network, download(0x2000, 0, 0xDEADBEEF.to_bytes(4, "little")))
     assert slave.node.sdo[0x2000].raw == 0xDEADBEEF
-    sdo.download(0x2001, 0, LONG)
-    assert sdo.upload(0x2001, 0) == LONG
-    assert sdo[0x2000].raw == 0xDEADBEEF
+    assert held(network, read_value(make_od()[0x2000])) == 0xDEADBEEF
+    held(network, download(0x2002, 0, b"\x34\x12"))
+    assert held(network, upload(0x2002, 0)) == b"\x34\x12"
+    slave.node.sdo.download(0x2001, 0, LONG)
+    assert held(network, upload(0x2001, 0)) == LONG
     assert bus.clock.now_ns() == 0, "answers come at the same instant"
 
 
-def test_sdo_block_upload_and_download() -> None:
-    network, _, _ = make_cell(BlockServer)
-    with network[5].sdo.open(0x2001, 0, "rb", block_transfer=True, request_crc_support=False) as stream:
-        assert stream.read() == LONG
-    network, slave, _ = make_cell(BlockServer)
-    with network[5].sdo.open(0x2001, 0, "wb", block_transfer=True, size=len(LONG), request_crc_support=False) as stream:
-        stream.write(LONG)
-    assert isinstance(slave, BlockServer)
-    assert bytes(slave.received) == LONG
+def test_sdo_writes_of_more_than_four_bytes_are_refused(cell: Cell) -> None:
+    with pytest.raises(SdoCommunicationError, match="2001h:00 takes 5 bytes"):
+        held(cell[0], download(0x2001, 0, b"12345"))
 
 
 def test_sdo_abort_and_time_out_run_in_virtual_time(cell: Cell) -> None:
     network, _, bus = cell
     with pytest.raises(SdoAbortedError) as caught:
-        network[5].sdo.upload(0x5FFF, 0)
+        held(network, upload(0x5FFF, 0))
     assert caught.value.code == 0x06020000
-    absent = network.add_node(6, make_od())
-    absent.sdo.RESPONSE_TIMEOUT = 3600.0
-    with pytest.raises(SdoCommunicationError, match="No SDO response received"):
-        absent.sdo.upload(0x2000, 0)
-    assert bus.clock.now_ns() == 3600 * 10**9
+    with pytest.raises(SdoTimeoutError, match=r"No SDO response received within 3600 s, 2 times"):
+        held(network, upload(0x2000, 0), 6, timeout_s=3600.0, retries=1)
+    assert bus.clock.now_ns() == 7200 * 10**9
 
 
-def test_a_late_answer_arrives_within_its_time_out(cell: Cell) -> None:
+def test_nodes_are_served_side_by_side_and_requests_sent_again_are_counted(cell: Cell) -> None:
     network, slave, bus = cell
-    node = network.add_node(6, make_od())
+    slave.say(300 * MS, 0x586, b"\x43\x00\x20\x00\x78\x56\x34\x12")
+    read: dict[int, bytes] = {}
+
+    def keep(node_id: int) -> Generator[bytes | None, bytes, None]:
+        read[node_id] = yield from upload(0x2000, 0)
+
+    assert hold_dialogues(network, {6: keep(6), 5: keep(5)}, timeout_s=0.2, retries=2) == {6: 1, 5: 0}
+    assert (list(read), read[6]) == ([5, 6], b"\x78\x56\x34\x12")
+    assert bus.clock.now_ns() == 300 * MS
+
+
+@pytest.mark.parametrize("stale", [b"\x43\x18\x10\x01\x01\0\0\0", b"\x60\x00\x20\x00\0\0\0\0", b"\x43\x00\x20"])
+def test_an_answer_to_something_else_is_passed_over(cell: Cell, stale: bytes) -> None:
+    network, slave, _ = cell
+    slave.say(50 * MS, 0x586, stale)
     slave.say(100 * MS, 0x586, b"\x43\x00\x20\x00\x78\x56\x34\x12")
-    assert node.sdo[0x2000].raw == 0x12345678
-    assert bus.clock.now_ns() == 100 * MS
+    assert held(network, read_value(make_od()[0x2000]), 6) == 0x12345678
 
 
 def test_foreign_frames_of_a_wait_go_to_the_callback(cell: Cell) -> None:
-    network, slave, _ = cell
+    _, slave, bus = cell
     others: list[tuple[int, bytes, int]] = []
-    network.other = lambda *frame: others.append(frame)
+    mine: list[tuple[int, bytes, int]] = []
+    network = PumpedNetwork(bus.port(), other=lambda *frame: others.append(frame))
+    network.subscribe(0x705, lambda *frame: mine.append(frame))
     slave.say(1 * MS, 0x185, b"pdo")
     slave.say(2 * MS, 0x705 | RTR_FLAG, b"")
     slave.say(3 * MS, 0x705, b"\x05")
-    assert network.pump_until(lambda: network[5].nmt.state == "OPERATIONAL", 1.0)
+    assert network.pump_until(lambda: bool(mine), 1.0)
+    assert mine == [(0x705, b"\x05", 3 * MS)]
     assert others == [(0x185, b"pdo", 1 * MS), (0x705 | RTR_FLAG, b"", 2 * MS)]
 
 
-def test_feed_gives_frames_that_the_cycle_drained(cell: Cell) -> None:
+def test_feed_gives_frames_that_the_cycle_drained_to_all_subscribers(cell: Cell) -> None:
     network, _, _ = cell
-    network.feed([(0x705, b"\x04", 5), (0x185, b"pdo", 6), (0x705 | RTR_FLAG, b"\x05", 7)])
-    assert network[5].nmt.state == "STOPPED"
-    assert network.malformed == 0
+    taken: list[int] = []
+
+    def take(can_id: int, _data: bytes, t_ns: int) -> None:
+        taken.append(t_ns)
+
+    network.subscribe(0x705, take)
+    network.subscribe(0x705, take)
+    network.feed([(0x705, b"\x04", 5), (0x185, b"pdo", 6)])
+    network.unsubscribe(0x705, take)
+    network.feed([(0x705, b"\x04", 7)])
+    network.unsubscribe(0x705, take)
+    network.feed([(0x705, b"\x04", 8)])
+    assert taken == [5, 5, 7]
 
 
-@pytest.mark.parametrize("frame", [(0x705, b"", 0), (0x085, b"abc", 0), (0x585, b"\x43", 0)])
-def test_malformed_frames_are_counted_and_dropped(cell: Cell, frame: tuple[int, bytes, int]) -> None:
-    network, _, _ = cell
-    network.feed([frame])
-    assert network.malformed == 1
-    network[5].sdo[0x2000].raw = 5  # nothing stale is left in the client
+class Scripted(LocalServer):
+    """An LSS slave that answers a request with given bytes, or not at all."""
+
+    def __init__(self, **answers: str) -> None:
+        super().__init__(5)
+        self.heard: list[str] = []
+        self.answers = answers
+
+    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
+        assert can_id == 0x7E5 and len(data) == 8
+        self.heard.append(data.hex().rstrip("0"))
+        answer = self.answers.get(f"_{data[0]:02x}")
+        return [(0x7E4, bytes.fromhex(answer).ljust(8, b"\0"))] if answer else ()
 
 
-def test_what_needs_a_thread_is_refused(cell: Cell) -> None:
-    network, _, _ = cell
-    with pytest.raises(UsageError, match="080 cannot be sent periodically"):
-        network.sync.start(0.01)
-    with pytest.raises(UsageError, match="by number"):
-        network.add_node(canopen.RemoteNode(7, make_od()))
-    with network.connect() as same:
-        assert same is network
+def test_lss_messages_are_those_of_cia_305() -> None:
+    """CiA 305, LSS protocol specification: command specifiers, numbers little-endian, unused bytes 0."""
+    bus, slave = LockstepBus(VirtualClock()), Scripted(_43="44", _11="1100", _17="1701", _5e="5e09")
+    bus.attach(slave)
+    lss = Lss(PumpedNetwork(bus.port()))
+    lss.release()
+    assert lss.select(LssAddress(0xCA5E, 0x260, 0x10000, 7))
+    lss.configure_node_id(9)
+    assert lss.store() is False, "error 1: storing is not supported"
+    assert lss.inquire_node_ids() == [9]
+    assert slave.heard == ["04", "405eca", "416002", "42000001", "4307", "1109", "17", "5e"]
+    slave.answers = {"_11": "1101", "_17": "1702", "_43": "51"}
+    assert not lss.select(LssAddress(0xCA5E, 0x260, 0x10000, 8)), "an answer to something else"
+    with pytest.raises(LssAnswerError, match="LSS error 1"):
+        lss.configure_node_id(200)
+    with pytest.raises(LssAnswerError, match="could not store it: LSS error 2"):
+        lss.store()
+    slave.answers = {}
+    with pytest.raises(LssAnswerError, match="no answer to configure node id"):
+        lss.configure_node_id(9)

@@ -170,8 +170,9 @@ def test_the_command_line_and_the_scene_come_before_the_configuration(bare, monk
     from argparse import Namespace
     from dataclasses import replace
 
-    from canprobe.cli.parser import Target, target_of
+    from canprobe.cli.parser import target_of
     from canprobe.scene.load import load_scene
+    from canprobe.session.target import Target
 
     monkeypatch.setenv("CAN_INTERFACE", "pcan")
     monkeypatch.setenv("CAN_CHANNEL", "PCAN_USBBUS1")
@@ -195,8 +196,9 @@ def test_channels_of_a_scene_with_two_buses(bare):
     from argparse import Namespace
     from dataclasses import replace
 
-    from canprobe.cli.parser import Target, target_of
+    from canprobe.cli.parser import target_of
     from canprobe.scene.load import load_scene
+    from canprobe.session.target import Target
 
     scene = load_scene("press")
     scene = replace(scene, sensor=replace(scene.sensor, channel="can1"))

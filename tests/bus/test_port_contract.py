@@ -11,7 +11,6 @@ import pytest
 from canprobe.bus.interfaces import PythonCanPort, open_port
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import ControllerState, MonotonicClock, Port, Reports, TimedFrame, VirtualClock
-from canprobe.bus.socketcan import SocketCanPort
 from canprobe.errors import BusError, InterfaceError, UsageError
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
 
@@ -34,10 +33,6 @@ def socketcan() -> PortMaker:
     return lambda: open_port("socketcan", "vcan0", BITRATE, MonotonicClock())
 
 
-def socketcan_plain() -> PortMaker:
-    return lambda: SocketCanPort("vcan0", MonotonicClock(), batched=False)
-
-
 def python_can_socketcan() -> PortMaker:
     return lambda: PythonCanPort("socketcan", "vcan0", BITRATE, MonotonicClock())
 
@@ -47,7 +42,6 @@ def python_can_socketcan() -> PortMaker:
         lockstep,
         virtual,
         pytest.param(socketcan, marks=pytest.mark.vcan),
-        pytest.param(socketcan_plain, marks=pytest.mark.vcan),
         pytest.param(python_can_socketcan, marks=pytest.mark.vcan),
     ],
     ids=lambda maker: maker.__name__,

@@ -12,8 +12,8 @@ from scenes import without_torque
 from undrawn import undrawn_run
 
 import canprobe
-from canprobe.bus.sdo_client import upload
-from canprobe.cell.bringup import configuration_date
+from canprobe.bus.lockstep import Participant
+from canprobe.bus.network import upload
 from canprobe.cell.configuration import make_setups
 from canprobe.eds.packaged import eds_path
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
@@ -26,26 +26,24 @@ MS = 1_000_000
 
 def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), scene="free", rate_hz=400.0, **bring_up):
     """A session in lockstep; `beside` are participants besides its nodes."""
-    beside = list(beside)
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
     session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
-
-    def join(participant):
-        while beside:
-            session.lockstep.attach(beside.pop())
-        if hasattr(participant, "node_id"):
-            if nodes is not None:
-                if participant.node_id in nodes:
-                    participant.store.saved = nodes[participant.node_id]
-                nodes[participant.node_id] = participant
-            if change is not None:
-                change(participant)
-            return FaultyNode(participant, faults)
-        return participant
-
-    session.joins = join
+    world = session.world
+    for node in world.nodes:
+        if nodes is not None:
+            if node.node_id in nodes:
+                node.store.saved = nodes[node.node_id]
+            nodes[node.node_id] = node
+        if change is not None:
+            change(node)
+    world.participants[:] = [*beside, *(FaultyNode(node, faults) for node in world.nodes), world.recorder]
     return session
+
+
+def done_to(session):
+    """What bring-up says of each node, in their order."""
+    return [line.split(") ", 1)[1] for line in session.said if re.match(r"node \d+: \(.*\) configur", line)]
 
 
 def frames(tmp_path):
@@ -58,15 +56,14 @@ def writes_to(log, node_id):
     return [(d[1] | d[2] << 8, d[3]) for _, i, d in log if i == 0x600 + node_id and d[0] >> 5 == 1]
 
 
-class Somebody:
+class Somebody(Participant):
     """Does something 100 ms after the cell's port was opened, while it listens; or at a frame of the cell's."""
+
+    next_deadline_ns = None
 
     def __init__(self, act, at=None):
         self.next_deadline_ns = 100 * MS if at is None else None
         self._act, self._at = act, at
-
-    def start(self, t_ns):
-        return []
 
     def receive(self, can_id, data, t_ns):
         if self._at is not None and self._at(can_id, data):
@@ -149,8 +146,7 @@ def assert_left_pre_operational(tmp_path, before=(0x81,)):
 
 def test_the_nodes_are_configured_side_by_side(tmp_path):
     with open_session(tmp_path) as session:
-        reports = session.cell.bring_up_reports
-    assert [str(r) for r in reports] == [f"node {i}: (joint {i}) configured, software 1.0" for i in range(1, 7)]
+        assert done_to(session) == ["configured, software 1.0"] * 6
     asked = [i - 0x600 for _, i, _ in frames(tmp_path) if 0x600 < i < 0x680]
     for part in range(1, 6):
         so_far = asked[: len(asked) * part // 6]
@@ -161,9 +157,9 @@ def test_the_nodes_are_configured_side_by_side(tmp_path):
 def test_a_lost_answer_is_asked_for_again(tmp_path):
     lost = Fault(FaultKind.DROP, 3, 300 * MS, 300 * MS)
     with open_session(tmp_path, faults=[lost]) as session:
-        reports = session.cell.bring_up_reports
-    assert [report.repeated for report in reports] == [0, 0, 1, 0, 0, 0]
-    assert str(reports[2]) == "node 3: (joint 3) configured, software 1.0, 1 requests repeated"
+        done = done_to(session)
+    assert done.pop(2) == "configured, software 1.0, 1 requests repeated"
+    assert done == ["configured, software 1.0"] * 5
 
 
 def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
@@ -203,7 +199,7 @@ def test_a_kept_configuration_is_not_written_again(tmp_path):
     logs, kept = [], []
     for run in range(2):
         with open_session(tmp_path, nodes=nodes, scene="press", store=True) as session:
-            kept.append([report.kept for report in session.cell.bring_up_reports])
+            kept.append(["kept" in done for done in done_to(session)])
         nodes = {node_id: node.store.saved for node_id, node in nodes.items()}
         logs.append(frames(tmp_path))
         assert session.cell.faults == [], run
@@ -219,10 +215,10 @@ def test_another_scene_is_configured_anew_and_so_is_a_node_that_somebody_changed
     saved = {node_id: node.store.saved for node_id, node in nodes.items()}
     nodes = dict(saved)
     with open_session(tmp_path, nodes=nodes, rate_hz=200.0, store=True) as session:
-        assert not any(report.kept for report in session.cell.bring_up_reports)
+        assert not any("kept" in done for done in done_to(session))
     saved[3] = {**saved[3], 0x102001: 0}
     with open_session(tmp_path, nodes=dict(saved), store=True) as session:
-        assert [report.kept for report in session.cell.bring_up_reports] == [True, True, False, True, True, True]
+        assert ["kept" in done for done in done_to(session)] == [True, True, False, True, True, True]
 
 
 def test_any_write_over_sdo_takes_the_date_back():
@@ -230,7 +226,7 @@ def test_any_write_over_sdo_takes_the_date_back():
     session = open_session(None, nodes=nodes, store=True)
     with session:
         drive = nodes[1]
-        date = configuration_date(make_setups(session.plan)[0])
+        date = make_setups(session.plan)[0].configuration_date
         assert {sub: drive.dictionary.number(0x1020, sub) for sub in (1, 2)} == date and min(date.values()) > 0
         drive.receive(0x601, bytes.fromhex("2b6660001e000000"), drive.core.now_ns)
         assert [drive.dictionary.number(0x1020, sub) for sub in (1, 2)] == [0, 0]
@@ -238,8 +234,8 @@ def test_any_write_over_sdo_takes_the_date_back():
 
 def test_a_node_that_boots_late_is_reset_again(tmp_path):
     dark = Fault(FaultKind.FREEZE, 2, 200 * MS, 400 * MS)
-    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3) as session:
-        assert all(report.failure is None for report in session.cell.bring_up_reports)
+    with open_session(tmp_path, faults=[dark], boot_up_s=0.2, retries=3):
+        pass
     resets = [d for _, i, d in frames(tmp_path) if i == 0 and d[0] == 0x81]
     assert [d[1] for d in resets].count(2) >= 2 and [d[1] for d in resets].count(1) == 1
 
@@ -304,8 +300,8 @@ def answering_in_other_lengths(node):
 
 def test_an_answer_of_another_length_is_read_in_the_objects_own(tmp_path):
     """CiA 301, SDO upload initiate: an expedited answer need not tell its size. 60C2h:02 is -4, an INTEGER8."""
-    with open_session(tmp_path, change=answering_in_other_lengths) as session:
-        assert [report.failure for report in session.cell.bring_up_reports] == [None] * 6
+    with open_session(tmp_path, change=answering_in_other_lengths):
+        pass
     answers = {d[0] for _, i, d in frames(tmp_path) if 0x581 <= i <= 0x584 and d[1:4] == b"\xc2\x60\x02"}
     assert answers == {0x60, 0x42, 0x43, 0x41}
 
@@ -372,9 +368,9 @@ def late(by_s, **bring_up):
 def test_late_answers_are_taken_for_what_they_answer(tmp_path):
     """A write is read back from the same entry: a late answer to the one is none to the other."""
     with open_session(tmp_path, **late(0.06)) as session:
-        reports = session.cell.bring_up_reports
-    assert str(reports[2]).startswith("node 3: (joint 3) configured, software 1.0, ")
-    assert reports[2].repeated > 20 and reports[1].repeated == 0
+        done = done_to(session)
+    assert int(re.fullmatch(r"configured, software 1.0, (\d+) requests repeated", done[2])[1]) > 20
+    assert "repeated" not in done[1]
 
 
 def test_a_late_answer_is_no_segment():
@@ -407,12 +403,8 @@ def boots_twice(node):
 
 
 def test_a_node_that_boots_twice_is_brought_up(tmp_path):
-    said = []
-    session = open_session(tmp_path, change=boots_twice)
-    session._say = said.append
-    with session:
-        pass
-    assert "node 3: (joint 3) sent 2 boot-ups after its reset" in said
+    with open_session(tmp_path, change=boots_twice) as session:
+        assert "node 3: (joint 3) sent 2 boot-ups after its reset" in session.said
 
 
 def test_two_nodes_with_one_id_are_told_from_one_that_boots_twice(tmp_path):
@@ -484,7 +476,7 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
     arm = replace(session.scene.arm, serial_numbers=(1001, 1002, 1004, 1003, 1005, 1006))
     swapped = Session(replace(session.scene, arm=arm))
-    swapped.joins = session.joins
+    swapped.world.participants[:] = session.world.participants
     with (
         pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,
         swapped,

@@ -9,7 +9,7 @@ from undrawn import undrawn, undrawn_run
 import canprobe
 from canprobe.bus.disk import read_candump
 from canprobe.cell.controller import Command
-from canprobe.cell.cycle import MOST_FRAMES, Cycle, CycleSettings, Observers
+from canprobe.cell.cycle import MOST_FRAMES, Cycle, Observers
 from canprobe.protocol.frames import SYNC_ID
 
 TPDOS = (0x181, 0x182)
@@ -73,9 +73,19 @@ class Drives:
 def goes_on_at(arrivals, *, on_arrival=True, drives=True):
     """µs after the SYNC at which a cycle has its measurement, and how often it has looked."""
     port = Port(arrivals)
-    settings = CycleSettings(2_500_000, 0, 10**12, 127, tuple(look * 1000 for look in LOOKS), on_arrival)
-    watch = SimpleNamespace(push=lambda *_: True)
-    cycle = Cycle(port, settings, drives=Drives() if drives else None, tactile=None, watch=watch, other=lambda _: None)
+    budget = SimpleNamespace(looks_ns=tuple(look * 1000 for look in LOOKS))
+    plan = SimpleNamespace(
+        sync=SimpleNamespace(period_ns=2_500_000, overflow=0), traffic=SimpleNamespace(budget=budget)
+    )
+    cycle = Cycle(
+        port,
+        plan,
+        drives=Drives() if drives else None,
+        tactile=None,
+        watch=SimpleNamespace(push=lambda *_: True),
+        other=lambda _: None,
+        on_arrival=on_arrival,
+    )
     for _ in range(3):
         port.drains = 0
         cycle.begin()

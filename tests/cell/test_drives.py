@@ -3,18 +3,11 @@
 import numpy as np
 import pytest
 
-from canprobe.cell.drives import (
-    BASE_COUNTS,
-    CARRIED_CYCLES,
-    STEADY,
-    DriveAxis,
-    DriveGroup,
-    PositionTrack,
-    TactileReceiver,
-)
+from canprobe.cell.array import TactileReceiver
+from canprobe.cell.drives import BASE_COUNTS, CARRIED_CYCLES, STEADY, DriveAxis, DriveGroup, PositionTrack
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_frame
+from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
 from canprobe.robot.kinematics import MODELS, joints_to_counts
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
@@ -216,7 +209,8 @@ def payloads(counter, sync_counter, age_us=5000):
         sample_age_us=age_us,
         crc=0,
     )
-    return pack_frame(header, np.full((16, 16), counter, np.uint8))
+    whole = pack_whole(header, np.full((16, 16), counter, np.uint8))
+    return [whole[i : i + 8] for i in range(0, len(whole), 8)]
 
 
 def make_receiver():

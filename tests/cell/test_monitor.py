@@ -144,7 +144,8 @@ def test_two_buses_are_heard_as_one_cell():
 def test_the_command_listens_to_both_buses(capsys):
     """On python-can's own bus, which ends at the process: the heartbeats are waiting when the monitor opens."""
     buses = {name: can.Bus(interface="virtual", channel=name) for name in ("left", "right")}
-    heard = iter(api.monitor(on_two_buses(), interface="virtual", channel="left", sensor_channel="right"))
+    scene = on_two_buses()
+    heard = iter(api.monitor(api.Target.over(scene, "virtual", "left", None, "right").applied_to(scene)))
     next(heard)
     for name, node_id in (("left", 4), ("right", 16)):
         buses[name].send(can.Message(arbitration_id=0x700 + node_id, data=b"\x05", is_extended_id=False))

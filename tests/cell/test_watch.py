@@ -15,7 +15,7 @@ def told(watch: NodeWatch, node_id: int, code: int) -> None:
 
 
 def a_watch() -> NodeWatch:
-    return NodeWatch((1, 2), 127, 250_000_000)
+    return NodeWatch((1, 2))
 
 
 def size_of(watch: NodeWatch) -> int:

@@ -160,7 +160,7 @@ def test_emulated_nodes_cannot_be_reached_over_a_virtual_bus_of_one_process(tmp_
         (("run", "press", "--channel", "ü x"), "channel: expected text without spaces, in ASCII, got 'ü x'"),
         (("run", "press", "--bus", ""), "argument --bus: expected a name"),
         (("run", "press", "--out", ""), "argument --out: expected a name"),
-        (("scan", "--bus", "lockstep"), "has nobody on it"),
+        (("scan", "--bus", "lockstep"), "lives inside one run"),
     ],
 )
 def test_wrong_use(words, text, tmp_path):

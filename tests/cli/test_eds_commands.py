@@ -85,16 +85,10 @@ def test_a_file_that_cannot_be_served_is_told_fault_by_fault(capsys):
 
 def test_pairs_of_file_and_node_id_reach_the_api(monkeypatch):
     calls = []
-    monkeypatch.setattr(api, "emulate_eds", lambda files, **options: calls.append((files, options)))
+    monkeypatch.setattr(api, "emulate_eds", lambda files, target, **_: calls.append((files, target)))
     pairs = ["--eds", "a.eds", "--node-id", "5", "--eds", "b.dcf", "--node-id", "20"]
     assert main(["emulate", *pairs, "--bus", "virtual", "--channel", "c", "--bitrate", "500000"]) == 0
-    ((files, options),) = calls
-    assert files == [("a.eds", 5), ("b.dcf", 20)]
-    assert {key: options[key] for key in ("interface", "channel", "bitrate")} == {
-        "interface": "virtual",
-        "channel": "c",
-        "bitrate": 500_000,
-    }
+    assert calls == [([("a.eds", 5), ("b.dcf", 20)], api.Target("virtual", "c", 500_000))]
 
 
 def test_a_dcf_is_checked_for_the_node_that_it_configures(capsys):

@@ -225,20 +225,18 @@ def test_a_bus_that_python_can_does_not_know_is_wrong_usage(command, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
+def bus_of(scene):
+    return scene.bus.interface, scene.bus.channel, scene.bus.bitrate
+
+
 def test_run_passes_everything_on(calls, tmp_path, capsys):
     argv = ["--bus", "socketcan", "--channel", "can0=vcan3", "--bitrate", "500000", "--seed", "7", "--duration", "2.5"]
     assert main(["run", "free", *argv, "--out", str(tmp_path / "out")]) == 0
     ((name, (scene,), kwargs),) = calls
     assert (name, scene.name) == ("run", "free")
-    given = {key: kwargs[key] for key in ("interface", "channel", "bitrate", "seed", "duration_s", "out")}
-    assert given == {
-        "interface": "socketcan",
-        "channel": "vcan3",
-        "bitrate": 500_000,
-        "seed": 7,
-        "duration_s": 2.5,
-        "out": tmp_path / "out",
-    }
+    assert bus_of(scene) == ("socketcan", "vcan3", 500_000)
+    given = {key: kwargs[key] for key in ("seed", "duration_s", "out")}
+    assert given == {"seed": 7, "duration_s": 2.5, "out": tmp_path / "out"}
     assert capsys.readouterr().out == "all went well\n"
 
 
@@ -259,8 +257,8 @@ def test_patience_is_what_is_asked_for_and_for_emulated_nodes_only(command, call
 
 def test_run_takes_the_scenes_bus_by_default(calls):
     assert main(["run", "free"]) == 0
-    ((_, _, kwargs),) = calls
-    assert (kwargs["interface"], kwargs["channel"], kwargs["bitrate"]) == ("lockstep", "can0", 1_000_000)
+    ((_, (scene,), kwargs),) = calls
+    assert bus_of(scene) == ("lockstep", "can0", 1_000_000)
     assert (kwargs["seed"], kwargs["duration_s"]) == (None, None)
     assert (kwargs["out"].parent, kwargs["out"].name[:5]) == (Path("runs"), "free-")
 
@@ -295,9 +293,9 @@ def test_up_and_emulate_pass_everything_on(calls, tmp_path):
     truth = tmp_path / "truth.npz"
     argv = ["--channel", "vcan0", "--nodes", "16,1-2", "--seed", "4", "--truth", str(truth)]
     assert main(["emulate", "cylinder", *argv]) == 0
-    (_, _, up), (_, _, emulate) = calls
-    assert (up["interface"], up["channel"], up["bitrate"]) == ("socketcan", "vcan0", 1_000_000)
-    assert (emulate["interface"], emulate["channel"], emulate["node_ids"]) == ("socketcan", "vcan0", (1, 2, 16))
+    (_, (scene,), _), (_, (_, target), emulate) = calls
+    assert bus_of(scene) == ("socketcan", "vcan0", 1_000_000)
+    assert (target, emulate["node_ids"]) == (api.Target("socketcan", "vcan0", 1_000_000), (1, 2, 16))
     assert (emulate["seed"], emulate["truth_path"]) == (4, truth)
 
 
@@ -337,7 +335,8 @@ kind = "press"
 def test_emulate_serves_each_node_on_its_own_bus(words, channel, nodes, calls, tmp_path):
     (tmp_path / "two.toml").write_text(ON_TWO_BUSES)
     assert main(["emulate", str(tmp_path / "two.toml"), *words.split()]) == 0
-    assert (calls[0][2]["channel"], calls[0][2]["node_ids"]) == (channel, nodes)
+    ((_, (_, target), options),) = calls
+    assert (target.channel, options["node_ids"]) == (channel, nodes)
 
 
 @pytest.mark.parametrize(
@@ -357,7 +356,7 @@ def test_scan_prints_a_table_or_json(calls, capsys):
     header, row = capsys.readouterr().out.splitlines()
     assert header.split() == ["node_id", "state", "vendor_id", "product_code"]
     assert row.split() == ["1", "pre-operational", "0xca5e", "-"]
-    assert calls[0][:2] == ("scan", ("socketcan", "vcan0", 1_000_000))
+    assert calls[0][:2] == ("scan", (api.Target("socketcan", "vcan0", 1_000_000),))
 
 
 def test_scenes(capsys):

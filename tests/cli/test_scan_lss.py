@@ -11,6 +11,7 @@ from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
 from canprobe.cli import main
 from canprobe.emulator.world import make_world
+from canprobe.scene.load import scenes_folder
 
 CHANNEL = ("--bus", "socketcan", "--channel", "can0")
 DRIVE = "0xca5e:0x260:0x10000"
@@ -86,7 +87,7 @@ def test_the_only_blank_node_needs_no_name(serve, capsys):
 
 def test_a_scene_gives_its_nodes_their_ids(serve, capsys, tmp_path):
     """Serial numbers in the scene: ids as they stand there, whoever had which before; bring-up then checks them."""
-    text = (canprobe.scene.load._packaged_files()["free"]).read_text()
+    text = (scenes_folder() / "free.toml").read_text()
     scene = tmp_path / "mine.toml"
     scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1001, 1002, 1003, 1004, 1005, 1006]", 1))
     nodes = serve(str(scene), "--without-id", "1-6")
@@ -164,7 +165,7 @@ def test_a_wrong_emulate_line_is_one_clear_line(words, what, capsys):
 
 def test_a_scene_whose_serial_numbers_are_wrong_is_refused(tmp_path):
     scene = tmp_path / "mine.toml"
-    text = canprobe.scene.load._packaged_files()["free"].read_text()
+    text = (scenes_folder() / "free.toml").read_text()
     scene.write_text(text.replace("[arm]", "[arm]\nserial_numbers = [1, 2, 3, 4, 5, 5]", 1))
     with pytest.raises(canprobe.errors.SceneError, match="serial_numbers: expected a list of 6 items"):
         canprobe.load_scene(str(scene))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import VirtualClock
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
 
@@ -12,16 +12,13 @@ MS = 1_000_000
 ID = 0x185
 
 
-class Ticker:
+class Ticker(Participant):
     """Node 5: counts in a frame of its own every millisecond, answers 100h with 101h, and boots with 705h."""
 
-    node_id, name, listens = 5, "node 5", frozenset({0x100})
+    node_id, name, listens, next_deadline_ns = 5, "node 5", frozenset({0x100}), MS
 
     def __init__(self):
         self.count, self.next_deadline_ns, self.heard = 0, MS, []
-
-    def rerouted(self):
-        pass
 
     def start(self, t_ns):
         self.count, self.next_deadline_ns = 0, t_ns + MS

@@ -10,7 +10,7 @@ import canprobe
 from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
-from canprobe.cell.assembly import make_tactile
+from canprobe.cell.array import make_tactile
 from canprobe.errors import BusError, PlanError
 
 PERIOD_NS = 2_500_000

@@ -15,8 +15,8 @@ import canprobe
 from canprobe.bus.port import ControllerState
 from canprobe.bus.scheduling import Terminated
 from canprobe.cell.controller import Command
+from canprobe.cell.lift_off import WAY
 from canprobe.cell.supervision import TOUCH_FORCE
-from canprobe.cell.supervisor import WAY
 from canprobe.emulator.faults import FaultKind
 from canprobe.errors import SafetyStop
 from canprobe.protocol.frames import SYNC_ID, NmtState
@@ -94,7 +94,7 @@ def test_with_another_master_nothing_moves():
     (force,) = left_pressing(run.session)
     assert 1.8 < force < 2.2
     assert any(
-        fault.endswith("free it; a run does not begin while the array feels a force")
+        fault.endswith("free it; a run does not begin while the array measures a force")
         for fault in run.session.cell.faults
     )
 

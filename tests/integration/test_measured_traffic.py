@@ -124,7 +124,8 @@ def real_bus(monkeypatch):
     """can0 as a cell opens a real one, in virtual time and with the nodes of `free` on it; yields (scene, reports)."""
     scene = canprobe.load_scene("free")
     arm = dataclasses.replace(scene.arm, emulated=False)
-    scene = resolve_scene(dataclasses.replace(scene, arm=arm), interface="socketcan", duration_s=0.3)
+    scene = dataclasses.replace(scene, arm=arm, bus=dataclasses.replace(scene.bus, interface="socketcan"))
+    scene = resolve_scene(scene, duration_s=0.3)
     bus, reports = LockstepBus(VirtualClock()), []
     for node in make_world(canprobe.plan(scene), scene.arm.node_ids).nodes:
         bus.attach(node)

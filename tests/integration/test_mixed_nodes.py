@@ -10,7 +10,7 @@ import pytest
 import canprobe
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
-from canprobe.cell.assembly import make_cell
+from canprobe.cell.cell import Cell
 from canprobe.cell.controller import Command
 from canprobe.emulator.world import make_world
 from canprobe.errors import UsageError
@@ -40,7 +40,7 @@ def test_an_arm_of_its_own_and_an_emulated_sensor():
         target = q[0] + np.array([0, 0, 0, 0, 0, 0.1 * np.sin(len(q) / 40)])
         return Command(q_target=target, done=len(q) > 200)
 
-    with make_cell(plan, bus.port()) as cell:
+    with Cell(plan, bus.port()) as cell:
         cell.run(nod)
     assert cell.faults == []
     assert len(samples) == pytest.approx(100, abs=2) and set(np.diff(samples)) == {2}

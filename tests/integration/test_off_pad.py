@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.supervision import Reaction
+from canprobe.cell.supervision import Reaction, limits_of
 from canprobe.errors import SafetyStop
 from canprobe.session.session import Session, resolve_scene
 from canprobe.tasks.from_plan import make_task

@@ -33,8 +33,8 @@ def test_curvature_across_an_axial_path_is_observed_within_ten_percent(axial):
     assert found.estimates >= 20
     assert found.observed_fraction == 1.0
     assert found.patch_fraction == 1.0
-    assert found.kappa_true == pytest.approx((1 / 0.036, 0.0), abs=1e-6)
-    assert found.kappa_rms_percent < 10.0
+    assert found.kappa_true_per_m == pytest.approx((1 / 0.036, 0.0), abs=1e-6)
+    assert found.kappa_rms_error_percent < 10.0
     last = controller.shape.records[-1].estimate
     assert last.method == "recursive+patch"
     truth = session.truth["direction1"][-1]

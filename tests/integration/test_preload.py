@@ -23,13 +23,8 @@ def press_begun_pressed(**limits):
     x, y, z = scene.object.position_mm
     raised = true_object(replace(scene.object, position_mm=(x, y, z + 8.3)))
 
-    def raise_object(participant):
-        plant = session.world.plant
-        plant.config = replace(plant.config, object=raised)
-        plant._solved = None
-        return participant
-
-    session.joins = raise_object
+    plant = session.world.plant
+    plant.config = replace(plant.config, object=raised)
     with pytest.raises(SafetyStop) as stopped, session:
         session.run(make_task(session.plan))
     return stopped.value.reason, session
@@ -38,7 +33,7 @@ def press_begun_pressed(**limits):
 def test_no_drive_is_enabled():
     reason, session = press_begun_pressed()
     assert BY_KEY["preload"].reaction is Reaction.STOP and "preload" in session.cell.supervisor.first
-    force = float(reason.removeprefix("the array feels ").split(" N before the run")[0])
+    force = float(reason.removeprefix("the array measures ").split(" N before the run")[0])
     assert force == pytest.approx(session.truth["force"].max(), rel=0.15) and force > 0.5
     assert "limits.preload_max_n = 0.15" in reason and "free the probe" in reason
     assert np.ptp(session.truth["q"], axis=0).max() == 0.0

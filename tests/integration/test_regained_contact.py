@@ -34,15 +34,9 @@ class Disturbed(Wrapped):
         )
         super().__init__(make_task(self.session.plan))
         self.move_mm = move_mm
-        self.witness = None
+        self.witness = Witness(self.session.world.plant, 1_250_000)
         self.positions = []
-        self.session.joins = self.join
-
-    def join(self, participant):
-        if self.witness is None:
-            self.witness = Witness(self.session.world.plant, 1_250_000)
-            self.session.lockstep.attach(self.witness)
-        return participant
+        self.session.world.participants.insert(0, self.witness)
 
     def step(self, measurement):
         if measurement.cycle == AT_CYCLE:

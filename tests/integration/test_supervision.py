@@ -14,10 +14,10 @@ from injected import FREE_CYCLE, HOLD_CYCLE, Injected, altered, send
 
 import canprobe
 from canprobe.bus.port import ControllerState
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY, CONDITIONS
 from canprobe.cell.controller import Command
 from canprobe.cell.supervision import Reaction
+from canprobe.cell.supervisor import JointGuard
 from canprobe.emulator.faults import FaultKind, FaultyNode
 from canprobe.errors import InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState, state_of
@@ -393,7 +393,7 @@ def test_the_workspace_ends_a_press():
 
 def test_the_workspace_ends_an_own_controllers_motion():
     scene = canprobe.load_scene("free")
-    T_base_tip_of = limits_of(Session(scene).plan).T_base_tip_of
+    T_base_tip_of = JointGuard(canprobe.plan(scene)).T_base_tip
     start = 1e3 * T_base_tip_of(np.radians(scene.arm.start_deg))[:3, 3]
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
@@ -414,13 +414,10 @@ def test_a_statusword_of_no_state_is_told_with_its_drive_and_the_others_are_stop
 def test_a_drive_that_is_never_in_a_state_is_not_enabled():
     session = Session(canprobe.load_scene("free"))
 
-    def join(participant):
-        if getattr(participant, "node_id", None) == 3:
-            altered(participant := FaultyNode(participant), 0x183, lambda d: b"\x01\x06" + d[2:])
-        return participant
-
-    session.joins = join
-    told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after it was told to enable operation"
+    participants = session.world.participants
+    participants[2] = FaultyNode(participants[2])
+    altered(participants[2], 0x183, lambda d: b"\x01\x06" + d[2:])
+    told = r"node 3: \(joint 3\) is in no CiA 402 state \(statusword 0x0601\) 2 s after the command to enable operation"
     with pytest.raises(NodeError, match=told), session:
         session.run(lambda _: Command())
     assert {node.state for node in session.world.nodes} == {NmtState.PRE_OPERATIONAL}

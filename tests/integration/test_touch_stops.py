@@ -81,15 +81,9 @@ def test_sensor_lives_but_never_sends_a_frame():
     session = press_session()
     frames = {pdo.cob_id for pdo in session.plan.pdos_of(16, "tpdo")}
 
-    def mute(participant):
-        if getattr(participant, "node_id", None) == 16:
-            original = participant.receive
-            participant.receive = lambda can_id, data, t_ns: [
-                f for f in original(can_id, data, t_ns) if f[0] not in frames
-            ]
-        return participant
-
-    session.joins = mute
+    (sensor,) = [node for node in session.world.nodes if node.node_id == 16]
+    original = sensor.receive
+    sensor.receive = lambda can_id, data, t_ns: [f for f in original(can_id, data, t_ns) if f[0] not in frames]
     reason, truth = run_until_stopped(session)
     assert "no tactile frame for" in reason
     assert truth["force"].max() == 0.0

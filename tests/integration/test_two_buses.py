@@ -8,7 +8,7 @@ from undrawn import undrawn_run
 
 import canprobe
 from canprobe.bus.disk import read_candump
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import JoinedPort, VirtualClock
 from canprobe.cell.controller import Command
 from canprobe.errors import InterfaceError, UsageError
@@ -57,14 +57,13 @@ def test_lines_of_both_buses_are_in_the_order_of_time(pressed):
     assert np.all(np.diff([frame[0] for frame in frames]) >= 0)
 
 
-class Answering:
+class Answering(Participant):
     """Answers a frame by one of the next identifier, `delay_ns` later."""
 
-    def __init__(self, delay_ns):
-        self.delay_ns, self.next_deadline_ns, self.answer = delay_ns, None, []
+    next_deadline_ns = None
 
-    def start(self, t_ns):
-        return []
+    def __init__(self, delay_ns):
+        self.delay_ns, self.answer = delay_ns, []
 
     def receive(self, can_id, data, t_ns):
         self.next_deadline_ns, self.answer = t_ns + self.delay_ns, [(can_id + 1, data)]

@@ -12,8 +12,8 @@ import canprobe.eds.packaged
 from canprobe.cell.configuration import make_setups
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning.choices import patch_radius_m, taxels_needed, window_choices
 from canprobe.planning.devices import tactile_objects
+from canprobe.planning.window import patch_radius_m, taxels_needed, window_choices
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.setup import Probe

@@ -12,28 +12,21 @@ import canprobe
 from canprobe.cli import main
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
-from canprobe.planning.choices import (
-    PITCH_M,
-    cut_patch,
-    measured_share,
-    opened,
-    patch_radius_m,
-    second_channel,
-    true_force_n,
-)
+from canprobe.planning.choices import opened, second_channel
 from canprobe.planning.devices import order_by_deadline
 from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
+from canprobe.planning.window import (
+    PITCH_M,
+    cut_patch,
+    measured_share,
+    patch_radius_m,
+    true_force_n,
+)
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.response_times import Message, worst_case_response
 from canprobe.scene.load import dump_scene, load_scene, parse_scene
 from canprobe.scene.resolve import resolve
-
-
-def changed(scene, **sections):
-    for name, values in sections.items():
-        scene = dataclasses.replace(scene, **{name: dataclasses.replace(getattr(scene, name), **values)})
-    return scene
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +58,10 @@ def test_the_packaged_scenes_leave_nothing_open(cylinder):
 
 def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
     """Neither alone is enough: the planner finds the pair, which costs no hardware."""
-    scene = changed(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     for half in ({"arm": {"grouped_rpdo": True}}, {"bus": {"cob_ids": "by_deadline"}}):
         with pytest.raises(PlanError):
-            canprobe.plan(changed(scene, **half))
+            canprobe.plan(change(scene, **half))
     plan = opened_plan(scene)
     assert chosen(plan)["arm.grouped_rpdo"] == "true" and chosen(plan)["bus.cob_ids"] == '"by_deadline"'
     assert plan.traffic.budget.slack_ns > 0
@@ -76,7 +69,7 @@ def test_500_hz_needs_grouped_targets_and_priorities_by_deadline(cylinder):
 
 
 def test_ways_out_name_changes_that_fit_only_together(cylinder):
-    scene = changed(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
+    scene = change(cylinder, cycle={"rate_hz": 500.0}, sensor={"rate_hz": 250.0})
     with pytest.raises(PlanError) as refused:
         canprobe.plan(scene)
     ways = refused.value.ways_out
@@ -85,41 +78,41 @@ def test_ways_out_name_changes_that_fit_only_together(cylinder):
 
 
 def test_an_image_beside_the_arm_gets_a_bus_of_its_own_or_can_fd(cylinder):
-    image = changed(cylinder, sensor={"mode": "image"})
+    image = change(cylinder, sensor={"mode": "image"})
     split = opened_plan(image)
     assert [(bus.channel, bus.node_ids) for bus in split.buses] == [("can0", (1, 2, 3, 4, 5, 6)), ("can1", (16,))]
     assert {pdo.channel for pdo in split.pdos if pdo.kind == "tactile"} == {"can1"}
     assert all(bus.traffic.load < 1 for bus in split.buses)
-    fd = opened_plan(changed(image, sensor={"eds": "tactile_array_fd.eds"}))
+    fd = opened_plan(change(image, sensor={"eds": "tactile_array_fd.eds"}))
     assert len(fd.buses) == 1 and fd.scene.bus.fd is True and chosen(fd)["bus.fd"] == "true"
 
 
 def test_what_is_written_is_kept(cylinder):
-    scene = changed(cylinder, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
+    scene = change(cylinder, sensor={"mode": "image", "channel": "auto"}, bus={"fd": "auto"})
     assert canprobe.plan(scene).scene.arm.grouped_rpdo is False
     with pytest.raises(PlanError, match="none of 2 ways"):
-        canprobe.plan(changed(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
+        canprobe.plan(change(scene, sensor={"channel": "can0"}, arm={"grouped_rpdo": "auto"}, bus={"fd": False}))
 
 
 def test_the_sensor_gives_less_last_of_all(cylinder):
-    assert canprobe.plan(changed(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
-    fast = changed(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
+    assert canprobe.plan(change(cylinder, sensor={"mode": "auto"})).scene.sensor.mode == "window"
+    fast = change(cylinder, cycle={"rate_hz": 1e6 / 2100}, sensor={"rate_hz": 1e6 / 4200, "mode": "auto"})
     assert canprobe.plan(fast).scene.sensor.mode == "features"
     assert opened_plan(fast).scene.sensor.mode == "window"
-    assert canprobe.plan(changed(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
+    assert canprobe.plan(change(load_scene("listen"), sensor={"mode": "auto"})).scene.sensor.mode == "image"
 
 
 def test_nothing_fits_says_how_many_were_tried_and_what_would(cylinder):
     with pytest.raises(PlanError) as refused:
-        opened_plan(changed(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"}))
+        opened_plan(change(cylinder, cycle={"rate_hz": 1000.0}, sensor={"rate_hz": 500.0, "mode": "auto"}))
     first, *_, last = refused.value.problems
     assert first.startswith("none of 32 ways to fill what is left open fits; the nearest: sensor.mode = ")
     assert "1280 µs of the 1000 µs" in last and refused.value.ways_out[0].startswith("cycle.rate_hz = ")
 
 
 def test_priorities_follow_the_deadlines_and_are_never_restricted(cylinder):
-    grouped = changed(cylinder, arm={"grouped_rpdo": True})
-    default, ordered = canprobe.plan(grouped), canprobe.plan(changed(grouped, bus={"cob_ids": "by_deadline"}))
+    grouped = change(cylinder, arm={"grouped_rpdo": True})
+    default, ordered = canprobe.plan(grouped), canprobe.plan(change(grouped, bus={"cob_ids": "by_deadline"}))
     by_id = sorted(ordered.pdos, key=lambda pdo: pdo.cob_id)
     assert [pdo.deadline_ns for pdo in by_id] == sorted(pdo.deadline_ns for pdo in ordered.pdos)
     assert not any(is_restricted(pdo.cob_id) for pdo in ordered.pdos)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import pytest
+from scenes import change
 
 import canprobe
 from canprobe.planning.measured import TrafficMeter, expected_messages
@@ -128,9 +127,7 @@ def test_too_many_frames_are_not_planned(plan):
 
 
 def test_what_is_sent_on_a_change_may_come_more_often_than_planned_but_not_less():
-    plan = canprobe.plan(
-        dataclasses.replace(scene := load_scene("free"), arm=dataclasses.replace(scene.arm, grouped_rpdo=True))
-    )
+    plan = canprobe.plan(change(load_scene("free"), arm={"grouped_rpdo": True}))
     for every_ms, planned in ((100, True), (50, True), (200, False)):
         frames = [(0x080, b"\1", k * PERIOD) for k in range(801)]
         frames += [(0x200 + n, bytes(2), k * 1_000_000 + n) for n in range(1, 7) for k in range(1, 2000, every_ms)]

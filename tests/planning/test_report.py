@@ -1,10 +1,10 @@
 """The cycles of a plan as they go: a schedule that a bus could have, never later than the analysis allows."""
 
-import dataclasses
 import itertools
 import json
 
 import pytest
+from scenes import change
 
 import canprobe
 from canprobe.cli import main
@@ -15,12 +15,10 @@ from canprobe.scene.load import load_scene
 
 def scenes():
     cylinder = load_scene("cylinder")
-    arm, sensor, bus = cylinder.arm, cylinder.sensor, cylinder.bus
     yield cylinder
-    yield dataclasses.replace(cylinder, arm=dataclasses.replace(arm, grouped_rpdo=True))
-    yield dataclasses.replace(cylinder, sensor=dataclasses.replace(sensor, mode="image", channel="can1"))
-    fd = dataclasses.replace(sensor, mode="image", eds="tactile_array_fd.eds")
-    yield dataclasses.replace(cylinder, sensor=fd, bus=dataclasses.replace(bus, fd=True))
+    yield change(cylinder, arm={"grouped_rpdo": True})
+    yield change(cylinder, sensor={"mode": "image", "channel": "can1"})
+    yield change(cylinder, sensor={"mode": "image", "eds": "tactile_array_fd.eds"}, bus={"fd": True})
     yield load_scene("listen")
     yield load_scene("free")
 

@@ -1,5 +1,6 @@
 """The bus part of a plan against the budget table of the cell, and what does not fit."""
 
+import dataclasses
 import importlib.resources
 import math
 import re
@@ -10,11 +11,14 @@ from scenes import change, reasons, refused, ways_out, without_torque
 
 import canprobe
 from canprobe.planning.devices import Abilities, identifier_problems
+from canprobe.planning.make import make_plan
+from canprobe.planning.measured import expected_messages
 from canprobe.planning.model import PlannedPdo
 from canprobe.planning.report import plan_dict
 from canprobe.planning.traffic import controller_starts
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene.load import dump_scene, load_scene, parse_scene
+from canprobe.scene.resolve import resolve
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +80,7 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
     assert error.ways_out == (
         'sensor.mode = "window": load 87 %, peak 4345 of 5000 µs',
         'sensor.mode = "features": load 69 %, peak 3400 of 5000 µs',
-        'a bus of its own for the sensor (sensor.channel = "can1"): load 92 %, peak 4585 of 5000 µs',
+        'a separate bus for the sensor (sensor.channel = "can1"): load 92 %, peak 4585 of 5000 µs',
         'CAN FD: bus.fd = true and sensor.eds = "tactile_array_fd.eds": load 79 %, peak 3937 of 5000 µs',
         "cycle.rate_hz = 250 with sensor.rate_hz = 125: load 95 %, peak 7585 of 8000 µs",
     ), "grouping alone does not make it fit and must not be named"
@@ -223,7 +227,7 @@ def test_nodes_with_identity_and_what_is_switched_off(cylinder_plan):
 
 
 def test_frames_that_may_be_on_the_bus(cylinder_plan):
-    ids = cylinder_plan.frame_ids
+    ids = set(expected_messages(cylinder_plan, cylinder_plan.buses[0]))
     assert {0x000, 0x080, 0x081, 0x090, 0x181, 0x206, 0x519, 0x590, 0x610, 0x701, 0x710, 0x77F} <= ids
     assert not {0x100, 0x187, 0x190, 0x301, 0x510, 0x51A, 0x711} & ids
 
@@ -293,6 +297,19 @@ class TestOtherDevices:
         assert [e.index for e in plan.pdos_of(1, "tpdo")[0].entries] == [0x6041, 0x6064]
         assert plan.not_available == (("motor torque (torque_permille of log.npz)", f"{plan.nodes[0].eds}{why}"),)
 
+    def test_each_drive_is_planned_by_its_own_eds(self, edit):
+        """Makes may be mixed in one arm: a drive without torque, and without dummies, leaves the others as they are."""
+        plain = load_scene("free")
+        scene = edit((r"(\[6077\][^\[]*PDOMapping=)1", r"\g<1>0"), (r"Dummy0004=1", "Dummy0004=0"))
+        setup = resolve(plain)
+        drives = list(setup.arm.drives)
+        drives[2] = dataclasses.replace(drives[2], eds=scene.arm.eds)
+        plan = make_plan(setup.changed("arm", drives=tuple(drives), grouped=True))
+        assert [node.eds == scene.arm.eds for node in plan.nodes] == [False, False, True, False, False, False]
+        assert [len(plan.pdos_of(n, "tpdo")[0].entries) for n in plan.node_ids] == [3, 3, 2, 3, 3, 3]
+        assert {pdo.number for pdo in plan.pdos} == {1}
+        assert [why.startswith(scene.arm.eds) for _, why in plan.not_available] == [True, True]
+
     def test_target_that_cannot_be_mapped_is_refused(self, edit):
         problems = reasons(edit((r"(\[607A\][^\[]*PDOMapping=)1", r"\g<1>0")))
         assert any("607Ah:00 is not mappable to a RPDO" in problem for problem in problems)
@@ -323,7 +340,6 @@ class TestOtherDevices:
         assert device.dummy(1, 8) is None
         assert device.pdo_numbers("rpdo") == (1, 2, 3, 4)
         assert device.fixed_mapping("tpdo", 1)[0] == 0x60410010
-        assert device.active_by_default("rpdo", 1)
 
 
 def test_plan_is_finite_everywhere(cylinder_plan):

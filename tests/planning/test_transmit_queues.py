@@ -7,6 +7,7 @@ from scenes import change, refused
 from undrawn import undrawn_run
 
 import canprobe
+from canprobe.planning import traffic
 from canprobe.planning.report import plan_dict, plan_text
 from canprobe.scene.load import load_scene
 
@@ -55,7 +56,5 @@ def test_no_frame_of_a_run_is_later_than_planned(name, cycle, tmp_path):
 
 def test_a_bound_that_is_not_found_is_none(monkeypatch):
     """Should SYNC and feedback push each other on without end, there is no bound rather than the last guess."""
-    from canprobe.planning import traffic as budget
-
-    monkeypatch.setattr(budget, "_ROUNDS", 1)
+    monkeypatch.setattr(traffic, "ROUNDS", 1)
     assert any("without bound" in problem for problem in refused(load_scene("free")).problems)

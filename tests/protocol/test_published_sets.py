@@ -17,8 +17,7 @@ import dataclasses
 import pytest
 from simulated_bus import instants, simulate
 
-from canprobe.errors import ProtocolError
-from canprobe.protocol.response_times import Errors, Message, worst_case_response
+from canprobe.protocol.response_times import Message, worst_case_response
 
 MS = 1_000_000
 
@@ -58,11 +57,11 @@ def test_the_sae_set_answered_by_others():
     messages = published(SAE)
     for rank, (message, answer_ms) in enumerate(zip(messages, SAE_ANSWERS_MS, strict=True)):
         like_itself = dataclasses.replace(message, name="stranger", cob_id=0x700, period_ns=10**12)
-        response = worst_case_response([*messages, like_itself], 125_000).of(message.name)
-        assert response.response_ns == round(answer_ms * MS), rank
-        exact = worst_case_response(messages, 125_000).of(message.name).response_ns
-        assert exact <= response.response_ns
-        assert (exact < response.response_ns) == (rank in (6, 11, 14, 16)), "the longest of all that are left"
+        answer = worst_case_response([*messages, like_itself], 125_000).responses[rank].response_ns
+        assert answer == round(answer_ms * MS), rank
+        exact = worst_case_response(messages, 125_000).responses[rank].response_ns
+        assert exact <= answer
+        assert (exact < answer) == (rank in (6, 11, 14, 16)), "the longest of all that are left"
 
 
 @pytest.mark.parametrize(
@@ -96,29 +95,16 @@ def test_published_sets_simulated_from_their_critical_instants(rows, bitrate):
 @pytest.mark.parametrize("rows", [SAE, CITED])
 def test_the_sae_benchmark_meets_every_deadline_at_125_kbit_and_not_at_100(rows):
     messages = [dataclasses.replace(m, deadline_ns=5 * MS) if m.name == "m1" else m for m in published(rows)]
-    assert worst_case_response(messages, 125_000).fits
+    assert all(r.fits for r in worst_case_response(messages, 125_000).responses)
     slower = worst_case_response(messages, 100_000)
     assert next(r.message.name for r in slower.responses if not r.fits) == "m6"  # 5.32 ms of its 5
 
 
 @pytest.mark.parametrize("rank, first_ms", [(0, 1.028), (7, 3.648)])
 def test_published_response_times_with_errors(rank, first_ms):
-    """Broster: each error costs 29 bits and the longest frame without its intermission, 0.644 ms."""
-    for count in range(11):
-        analysis = worst_case_response(published(BROSTER), 250_000, errors=Errors(burst=count, overhead_bits=29 - 3))
-        assert analysis.responses[rank].response_ns == round((first_ms + 0.644 * count + 0.012) * MS)
-
-
-def test_errors_by_rate_as_tindell_counts_them():
-    """One message of 135 bits alone: every error adds 31 + 135 bits, one more for each interval begun."""
-    alone = [Message("a", 1, 8, 10 * MS)]
-    assert worst_case_response(alone, errors=Errors(interval_ns=MS)).of("a").response_ns == 135_000 + 166_000
-    assert worst_case_response(alone, errors=Errors(interval_ns=200_000)).of("a").response_ns == 135_000 + 4 * 166_000
-    overrun = worst_case_response(alone, errors=Errors(interval_ns=166_000))
-    assert overrun.of("a").response_ns is None
-
-
-@pytest.mark.parametrize("errors", [Errors(burst=-1), Errors(interval_ns=0)])
-def test_senseless_errors_are_refused(errors):
-    with pytest.raises(ProtocolError):
-        worst_case_response([Message("a", 1, 8, MS)], errors=errors)
+    """Broster: each error costs 29 bits and the longest frame without its intermission, 0.644 ms. A burst of errors is
+    here a message above all others."""
+    for count in range(1, 11):
+        burst = Message("errors", 0, 0, 10**12, frame_ns=count * 644_000)
+        analysis = worst_case_response([burst, *published(BROSTER)], 250_000)
+        assert analysis.responses[1 + rank].response_ns == round((first_ms + 0.644 * count + 0.012) * MS)

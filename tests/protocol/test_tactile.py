@@ -11,19 +11,18 @@ from hypothesis import strategies as st
 
 from canprobe.errors import ProtocolError
 from canprobe.protocol.tactile import (
-    PDO_COUNT,
     WINDOWS,
     Features,
     FrameAssembler,
     TactileHeader,
     TactileMode,
     crc16_ccitt,
-    pack_frame,
-    pdo_count,
+    pack_whole,
 )
 
 FEATURES, WINDOW, IMAGE = TactileMode
 DEADLINE = 5_000_000
+PDO_COUNT = {FEATURES: 2, WINDOW: 9, IMAGE: 33}  # header included; with a window of 8×8 taxels
 
 
 def crc_by_bits(data, crc=0):
@@ -40,6 +39,11 @@ def header(counter=0, mode=WINDOW, row=0, col=0, overload=False):
 
 def cob_ids(mode):
     return range(0x511, 0x511 + PDO_COUNT[mode])
+
+
+def pack_frame(header, content):
+    whole = pack_whole(header, content)
+    return [whole[i : i + 8] for i in range(0, len(whole), 8)]
 
 
 def push_all(assembler, payloads, mode=WINDOW, t_ns=0):
@@ -453,7 +457,7 @@ def test_every_taxel_comes_back_to_its_place(side, data):
     row, col = (data.draw(st.integers(0, 16 - side), label=name) for name in ("row", "column"))
     pad = np.frombuffer(data.draw(st.binary(min_size=256, max_size=256)), np.uint8).reshape(16, 16)
     payloads = pack_frame(window_header(side, row, col), pad)
-    assert len(payloads) == PDOS[side] == pdo_count(MODE, side)
+    assert len(payloads) == PDOS[side]
     assert {len(payload) for payload in payloads} == {8}
     _, frame = assemble(side, payloads)
     assert frame.window == (row, col, side, side)

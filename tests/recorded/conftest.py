@@ -15,7 +15,7 @@ import canprobe
 from canprobe.bus.disk import CandumpWriter, RecordingPort
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import VirtualClock
-from canprobe.cell.assembly import make_cell
+from canprobe.cell.cell import Cell
 from canprobe.emulator.world import make_world
 from canprobe.scene.load import dump_scene
 from canprobe.session.session import resolve_scene
@@ -116,9 +116,9 @@ def delayed_run(tmp_path_factory):
     for participant in make_world(plan, scene.emulated_node_ids).participants:
         bus.attach(participant)
     with CandumpWriter(out / "bus.log", "can0") as writer:
-        port = RecordingPort(DelayedPort(bus.port(), rng), writer)
+        port = RecordingPort(DelayedPort(bus.port(), rng), writer.write)
         controller = Stalling(plan, bus.clock)
-        cell = make_cell(plan, port)
+        cell = Cell(plan, port)
         with cell:
             cell.run(controller)
     recorded = replace(scene, bus=replace(scene.bus, interface="socketcan"))

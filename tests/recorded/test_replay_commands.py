@@ -52,7 +52,8 @@ def told_cycles(session):
 @pytest.mark.parametrize("name", FAULTS)
 def test_the_log_gives_the_same_commands(name, tmp_path):
     session = Session(press(), tmp_path)
-    session.joins = lambda one: FaultyNode(one, FAULTS[name]) if hasattr(one, "node_id") else one
+    nodes = session.world.nodes
+    session.world.participants[: len(nodes)] = [FaultyNode(node, FAULTS[name]) for node in nodes]
     task = make_task(session.plan)
     with session:
         session.run(task)

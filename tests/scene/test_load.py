@@ -116,12 +116,12 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
         ("arm", "node_ids = [1, 2, 3, 4, 5, 5]", "arm.node_ids", ("all different",)),
         ("arm", "node_ids = [1, 2, 3, 4, 5, 127]", "arm.node_ids", ("from 1 to 126",)),
         ("arm", "node_ids = [1, 2, 3, 4, 5]", "arm.node_ids", ("a list of 6",)),
-        ("arm", "node_ids = [1, 2, 3, 4, 5, 16]", "sensor.node_id", ("of its own", "16")),
+        ("arm", "node_ids = [1, 2, 3, 4, 5, 16]", "sensor.node_id", ("arm.node_ids does not have", "16")),
         ("sensor", "node_id = 127", "sensor.node_id", ("from 1 to 126", "got 127")),
         ("sensor", "node_id = 0", "sensor.node_id", ("from 1 to 126", "got 0")),
         ("sensor", "mode = 'windw'", "sensor.mode", ("window, image, features", "did you mean window?")),
         ("sensor", "rate_hz = 500", "sensor.rate_hz", ("at most cycle.rate_hz = 400", "got 500")),
-        ("sensor", "emulated = false", "sensor.emulated", ("a real sensor cannot feel",)),
+        ("sensor", "emulated = false", "sensor.emulated", ("a real sensor cannot measure",)),
         ("shape", "method = 'rekursive'", "shape.method", ("did you mean recursive?",)),
         ("shape", "also = ['recursive']", "shape.also", ("besides the main one",)),
         ("shape", "also = ['ml', 'ml']", "shape.also", ("all different",)),
@@ -140,7 +140,7 @@ def test_one_wrong_line_is_one_problem(section, line, path, words):
 @pytest.mark.parametrize(
     ("text", "path", "word"),
     [
-        (SCAN.replace("[sensor]\n", ""), "sensor", "a scan follows what it feels"),
+        (SCAN.replace("[sensor]\n", ""), "sensor", "a scan follows the contact"),
         (SCAN.replace("[arm]\n", ""), "arm", "a scan moves the probe"),
         (SCAN.replace('[object]\nkind = "plane"\n', ""), "object", "touches nothing without an [object]"),
         (SCAN.replace('name = "test"\n', ""), "scene.name", "missing"),

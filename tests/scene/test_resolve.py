@@ -59,7 +59,7 @@ def test_a_task_holds_the_hardware_of_its_setup(name):
 
 
 def test_other_hardware_reaches_the_task():
-    setup = resolve(load_scene("cylinder")).with_array(mode="features").with_arm(grouped=True)
+    setup = resolve(load_scene("cylinder")).changed("array", mode="features").changed("arm", grouped=True)
     assert setup.task.array is setup.array and setup.array.mode == "features"
     assert setup.task.arm is setup.arm and setup.arm.grouped is True
 

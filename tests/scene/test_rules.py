@@ -9,8 +9,13 @@ import canprobe
 from canprobe.errors import UsageError
 from canprobe.scene.load import load_scene
 from canprobe.session.session import resolve_scene
+from canprobe.session.target import Target
 
 PRESS = load_scene("press")
+
+
+def put(scene, *, interface=None, channel=None, bitrate=None, sensor_channel=None, **values):
+    return resolve_scene(scene, Target.over(scene, interface, channel, bitrate, sensor_channel), **values)
 
 
 @pytest.mark.parametrize(
@@ -32,18 +37,18 @@ PRESS = load_scene("press")
 )
 def test_a_value_that_no_file_could_have(values, told):
     with pytest.raises(UsageError, match=told):
-        resolve_scene(PRESS, **values)
+        put(PRESS, **values)
 
 
 def test_numbers_of_numpy_become_those_of_python():
-    scene = resolve_scene(PRESS, seed=np.int64(3), duration_s=np.float32(0.5), bitrate=np.int32(500_000))
+    scene = put(PRESS, seed=np.int64(3), duration_s=np.float32(0.5), bitrate=np.int32(500_000))
     values = [scene.seed, scene.task.duration_s, scene.bus.bitrate]
     assert [type(value) for value in values] == [int, float, int]
     assert json.loads(json.dumps(values)) == [3, 0.5, 500_000]
 
 
 def test_what_is_not_given_stays():
-    assert resolve_scene(PRESS) == PRESS
+    assert resolve_scene(PRESS) == put(PRESS) == PRESS
 
 
 @pytest.mark.parametrize("call", [canprobe.plan, canprobe.run, lambda scene: canprobe.open_cell(scene).__enter__()])

@@ -11,28 +11,23 @@ from types import SimpleNamespace
 import pytest
 
 import canprobe
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import MonotonicClock, Port, TimedFrame, VirtualClock
-from canprobe.cell.assembly import make_cell
+from canprobe.cell.cell import Cell
 from canprobe.errors import BusError, NodeError
 from canprobe.protocol.frames import Frame
 from canprobe.session.children import END_TIMEOUT_S, EmulatorChild
-from canprobe.session.session import resolve_scene
 
 
-class Nodes:
+class Nodes(Participant):
     """The nodes of the process: they say nothing until they boot, all but ``silent``."""
 
+    next_deadline_ns: int | None = None
+
     def __init__(self, boots_ns: int, silent: int | None, beside: Sequence[Frame] = ()) -> None:
-        self.next_deadline_ns: int | None = boots_ns
+        self.next_deadline_ns = boots_ns
         self._silent = silent
         self._beside = tuple(beside)
-
-    def start(self, t_ns: int) -> list[Frame]:
-        return []
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> list[Frame]:
-        return []
 
     def advance(self, t_ns: int) -> list[Frame]:
         self.next_deadline_ns = None
@@ -80,7 +75,8 @@ def test_a_node_that_does_not_boot_in_time_is_named_with_the_way_out(tmp_path: P
 
 def test_in_the_background_of_a_script_it_ends_at_once_too(tmp_path: Path) -> None:
     """A shell without job control starts there with SIGINT ignored, and the nodes' process inherits it."""
-    child = EmulatorChild(resolve_scene(canprobe.load_scene("free"), interface="virtual"), tmp_path, "nodes")
+    free = canprobe.load_scene("free")
+    child = EmulatorChild(replace(free, bus=replace(free.bus, interface="virtual")), tmp_path, "nodes")
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         child.start()
@@ -102,7 +98,7 @@ def test_what_others_send_meanwhile_is_heard_by_the_cell(tmp_path: Path) -> None
     bus = LockstepBus(VirtualClock())
     bus.attach(Nodes(1_000_000_000, None, beside=[(0x080, b"")]))
     port = bus.port()
-    cell = make_cell(canprobe.plan(canprobe.load_scene("free")), port)
+    cell = Cell(canprobe.plan(canprobe.load_scene("free")), port)
     cell.listen()
     await_on(port, tmp_path, hear=cell.hear)
     sent: list[int] = []

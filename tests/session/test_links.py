@@ -180,7 +180,7 @@ def test_without_ip_it_says_so(ip):
     ip["can0"] = (None, "")
     said = check()
     ip["can0"] = ("not JSON", "")
-    assert said == check() == ["can0: its setting is not checked: `ip` of iproute2 does not tell it"]
+    assert said == check() == ["can0: its setting is not checked: `ip` of iproute2 does not show it"]
     assert read_link("can0") is None
 
 

@@ -15,7 +15,7 @@ from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import EMCY_BASE, Emcy
 from canprobe.session import up as joint_report
 from canprobe.session.session import Session
-from canprobe.session.up import news_teller, telling_notes
+from canprobe.session.up import reporting_notes
 from canprobe.tasks.untouched import Answer
 
 REPORTED = "by its encoders the arm stands at"
@@ -67,7 +67,8 @@ def cell(monkeypatch):
 
     def make(*args, **more):
         Opened.session = Session(*args, **more)
-        Opened.session.joins = Opened.joins
+        participants = Opened.session.world.participants
+        participants[:] = map(Opened.joins, participants)
         if Opened.operator is not None:
             Opened.operator.session = Opened.session
         return Opened.session
@@ -109,8 +110,8 @@ def test_a_drive_that_obeys_the_wrong_way_round_is_named(cell):
     cell.joins, said = on_node(2, lambda node: Obeying(node, -1.0)), []
     with pytest.raises(NodeError, match=r"^node 2: \(joint 2\) it turned the wrong way$"):
         canprobe.api.check_joints(scene(), say=said.append)
-    assert "joint 2 at 65.00 deg: told +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
-    assert sum("as it must" in line for line in said) == 5
+    assert "joint 2 at 65.00 deg: asked +1.00 deg, turned -1.00 deg: it turned the wrong way" in said
+    assert sum("as expected" in line for line in said) == 5
     assert_disabled(cell.session)
 
 
@@ -121,7 +122,7 @@ def test_a_flipped_polarity_that_no_encoder_shows_is_seen_by_the_operator(cell):
     with pytest.raises(NodeError, match=r"^node 3: \(joint 3\) the operator did not see it turn that way: polarity"):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
     (line,) = [line for line in said if line.startswith("joint 3 ")]
-    assert line.startswith("joint 3 at -15.00 deg: told +1.00 deg, turned +1.00 deg: the operator did not see")
+    assert line.startswith("joint 3 at -15.00 deg: asked +1.00 deg, turned +1.00 deg: the operator did not see")
     assert f"{REPORTED} 90.00, 65.00, -15.00," in said[-1]  # and the pose is not the arm's
     assert_disabled(cell.session)
 
@@ -145,7 +146,7 @@ def test_an_interrupt_between_two_joints_disables_and_reports_what_was_done(cell
     cell.operator, said = Interrupting(), []
     with pytest.raises(KeyboardInterrupt):
         canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
-    assert said[-2].startswith("joint 1 at 90.00 deg: told +1.00 deg, turned +1.0")
+    assert said[-2].startswith("joint 1 at 90.00 deg: asked +1.00 deg, turned +1.0")
     assert_disabled(cell.session)
 
 
@@ -157,7 +158,7 @@ def test_a_scene_without_an_arm_is_refused():
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        (("--check-joints",), "needs a terminal; --yes asks nobody"),
+        (("--check-joints",), "needs a terminal; --yes leaves that out"),
         (("--yes",), "--yes goes with --check-joints"),
         (("--check-joints", "--yes", "--bridge", "mcap"), "--check-joints feeds no --bridge"),
     ],
@@ -181,8 +182,8 @@ def test_each_kind_is_told_when_it_comes_and_counted_at_the_end():
             session.lockstep.port().send_batch([(EMCY_BASE + 4, Emcy(0x8210, 0x11).pack())])
         return Command(done=measurement.cycle > 80)
 
-    with telling_notes(session, lines.append):
-        session.run(disturb, news_teller(session, lines.append))
+    with reporting_notes(session, lines.append) as report_news:
+        session.run(disturb, report_news)
         assert len(lines) == 1, "the second of the same kind is no news"
     what = "noted: node 4: EMCY 8210h, PDO not processed due to length error, "
     first, last = (session.cell.start_ns * 1e-9 + cycle * 0.0025 for cycle in (60, 70))  # on the clock of bus.log

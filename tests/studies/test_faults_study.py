@@ -5,11 +5,10 @@ import json
 import numpy as np
 import pytest
 
-from canprobe.cell.assembly import limits_of
+from canprobe.cell.supervision import limits_of
 from canprobe.cell.supervisor import Supervisor
 from canprobe.cli import main
 from canprobe.emulator.faults import Fault, FaultKind
-from canprobe.session.children import EmulatorChild
 from canprobe.studies import fault_scores as fault_witness
 from canprobe.studies.fault_scores import Peak, score_force
 from canprobe.studies.faults import (
@@ -26,7 +25,7 @@ from canprobe.studies.faults import (
     seeded_plan,
     table_rows,
 )
-from canprobe.studies.faults_vcan import HOLD_S, ProcessCase, ProcessFault, _Run, draw_process_case, served_scene
+from canprobe.studies.faults_vcan import HOLD_S, ProcessFault, draw_process_case, score_end
 from canprobe.studies.faults_vcan import findings as findings_on_vcan
 from canprobe.tasks import touch
 
@@ -217,17 +216,14 @@ def test_every_process_fault_gets_its_turn_at_random_times():
 )
 def test_the_score_sees_a_lost_log_and_a_wrong_end(tmp_path, fault, status, files, seen):
     log, summary, error = files
-    child = EmulatorChild(served_scene(), None, "vcan0")  # never started
-    run = _Run(ProcessCase(0, fault, 0.0), child, tmp_path)
     (tmp_path / "run").mkdir()
     (tmp_path / "stderr").write_text(error)
     (tmp_path / "run" / "bus.log").write_text(log)
     if summary is not None:
         (tmp_path / "run" / "summary.json").write_text(json.dumps(summary))
-    run._score(status)
-    child.end()
-    assert len(run.failures) == len(seen)
-    assert all(words in failure for words, failure in zip(seen, run.failures, strict=True))
+    failures = score_end(fault, status, tmp_path)
+    assert len(failures) == len(seen)
+    assert all(words in failure for words, failure in zip(seen, failures, strict=True))
 
 
 def test_failures_are_told():

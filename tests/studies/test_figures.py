@@ -26,7 +26,7 @@ from canprobe.studies.faults import draw_ends, draw_faults
 from canprobe.studies.pipeline import draw_pipeline
 from canprobe.studies.realtime import draw_realtime
 from canprobe.studies.realtime_cases import CycleTimes, Measured
-from canprobe.studies.soak import Sample, draw_soak
+from canprobe.studies.soak import draw_soak
 from canprobe.studies.workprec import draw_workprec
 from canprobe.studies.workprec_cell import FASTER, FIDELITIES, MODES, RATES_HZ, REAL, draw_cell
 
@@ -145,8 +145,8 @@ def realtime(path):
 
     def times(rate):
         late, some = (1e3 * rng.lognormal(mean, 0.6, 4000) for mean in (4, 6))
-        return CycleTimes(2_500_000, late.astype(int), some.astype(int), 2 * some.astype(int), 3 * some.astype(int),
-                          0, 0, 4000 / rate, None)  # fmt: skip
+        some = some.astype(int)
+        return CycleTimes(2_500_000, late.astype(int), 4000 / rate, some, 2 * some, 3 * some)
 
     cases = [
         Measured(case, "window", 400.0, times(400.0)) for case in ("whole controller", "plain canopen", "bare clock")
@@ -157,7 +157,8 @@ def realtime(path):
 
 
 def soak(path):
-    samples = [Sample(60.0 * k, 128.0, 84.0, 24_000 * k, k // 9, 0, 0, 400.0 + 90 * np.sin(k), 0, 0) for k in range(61)]
+    still = {"master_mib": 128.0, "nodes_mib": 84.0, "missed_pdos": 0}
+    samples = [still | {"t_s": 60.0 * k, "overruns": k // 9, "latency_us": 400.0 + 90 * np.sin(k)} for k in range(61)]
     draw_soak(samples, path)
 
 

@@ -2,7 +2,6 @@
 
 import mmap
 import os
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ from canprobe.bus.socketcan import has_socketcan
 from canprobe.cli import main
 from canprobe.studies.realtime import findings
 from canprobe.studies.realtime_cases import CycleTimes, Measured, answer_latencies, holding_scene, woken
-from canprobe.studies.soak import Sample, resident_mib
+from canprobe.studies.soak import COLUMNS, resident_mib
 from canprobe.studies.soak import findings as findings_of_soak
 
 
@@ -36,17 +35,9 @@ def test_no_sync_no_latency(tmp_path):
 
 
 def times(cycles, overruns, seconds, response_us=(), compute_us=()):
-    return CycleTimes(
-        period_ns=2_500_000,
-        lateness_ns=np.zeros(cycles, np.int64),
-        response_ns=np.array(response_us, np.int64) * 1000,
-        compute_ns=np.array(compute_us, np.int64) * 1000,
-        latency_ns=np.zeros(0, np.int64),
-        overruns=overruns,
-        missed=0,
-        seconds=seconds,
-        processor_share=None,
-    )
+    late = np.where(np.arange(cycles) < overruns, 2_000_000, 0)
+    response, compute = (1000 * np.array(us, np.int64) for us in (response_us, compute_us))
+    return CycleTimes(2_500_000, late, seconds, response, compute)
 
 
 def test_findings_tell_rates_and_shares():
@@ -94,26 +85,26 @@ def test_a_loop_that_is_late_passes_over_the_deadlines_that_are_past():
     lateness: list[int] = []
     assert list(woken(Clock(), 1000, 4, lateness)) == [1000, 2000, 5000, 6000]
     assert lateness == [0, 100, 2600, 0]
-    times = CycleTimes.of_wakes(1000, lateness, 5e-6)
+    times = CycleTimes(1000, np.array(lateness), 5e-6)
     assert (times.overruns, times.cycles, times.missed) == (1, 4, 0)
 
 
 # The arithmetic of study `soak`; the study itself runs on vcan0 only.
 
-ZERO = Sample(0.0, 90.0, 80.0, 0, 0, 0, 0, 400.0, 0, 0)
+ZERO = {column.key: 0 for column in COLUMNS} | {"master_mib": 90.0, "nodes_mib": 80.0, "latency_us": 400.0}
 
 
 def hour(leak_mib_h=0.0, drift_us=0.0, lost=0):
     return [
-        replace(
-            ZERO,
-            t_s=60.0 * k,
-            master_mib=90.0 + leak_mib_h * k / 60,
-            cycles=24_000 * k,
-            latency_us=400.0 + drift_us * k / 60,
-            frames_counted=1000 * k,
-            frames_on_bus=1000 * k + (lost if k == 60 else 0),
-        )
+        ZERO
+        | {
+            "t_s": 60.0 * k,
+            "master_mib": 90.0 + leak_mib_h * k / 60,
+            "cycles": 24_000 * k,
+            "latency_us": 400.0 + drift_us * k / 60,
+            "frames_counted": 1000 * k,
+            "frames_on_bus": 1000 * k + (lost if k == 60 else 0),
+        }
         for k in range(61)
     ]
 

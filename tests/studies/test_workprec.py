@@ -52,7 +52,7 @@ def row(method, cost, force, *, held=True, step=625.0, stiffness=PAD, stands=Tru
 
 
 def test_the_knee_is_the_cheapest_that_is_accurate_enough():
-    rows = [row("a", 5.0, 1.01 * ENOUGH["force"]), row("b", 7.0, 0.9), row("c", 6.0, None), row("d", 9.0, 1e-5)]
+    rows = [row("a", 5.0, 1.01 * ENOUGH["force_percent"]), row("b", 7.0, 0.9), row("c", 6.0, None), row("d", 9.0, 1e-5)]
     assert [r["verdict"] for r in rows] == ["coarse", "enough", "broke down", "enough"]
     assert knee(rows, PAD)["method"] == "b"
     assert knee(rows[:1], PAD) is None

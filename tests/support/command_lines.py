@@ -6,7 +6,7 @@ import argparse
 import re
 import shlex
 
-from canprobe.cli import _parser
+from canprobe.cli import parser_of
 
 
 def command_lines(script: str) -> list[list[str]]:
@@ -34,6 +34,6 @@ def _collect(words: list[str], found: list[list[str]]) -> None:
 def parse(arguments: list[str]) -> argparse.Namespace:
     """What the command would be called with; an unknown command or option fails the test."""
     try:
-        return _parser(arguments).parse_args(arguments)
+        return parser_of(arguments).parse_args(arguments)
     except SystemExit as leaving:
         raise AssertionError(f"canprobe {shlex.join(arguments)}: not understood") from leaving

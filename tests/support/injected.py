@@ -8,9 +8,9 @@ from wrapped import Wrapped
 
 import canprobe
 from canprobe.bus.port import ControllerState
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.conditions import BY_KEY
 from canprobe.cell.controller import Command, Controller
+from canprobe.cell.supervision import limits_of
 from canprobe.emulator.faults import Fault, FaultyNode
 from canprobe.errors import CanprobeError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
@@ -36,21 +36,20 @@ class Injected:
         self.session = Session(scene, say=self._say)
         self.limits = limits_of(self.session.plan)
         self.nodes = {}
-        self.session.joins = self._join
+        world = self.session.world
+        world.participants[: len(world.nodes)] = map(self._join, world.nodes)
         self.task = make_task(self.session.plan)
         self.at, self.action, self.until, self.own = at, action, at + until, own
         self.injected_ns = self.answered_ns = self.error = None
         self.held = 0
         self._run()
 
-    def _join(self, participant):
-        if not hasattr(participant, "node_id"):
-            return participant
+    def _join(self, node):
         sensor = self.session.scene.sensor
-        of_sensor = sensor is not None and participant.node_id == sensor.node_id
-        ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(participant.node_id, "tpdo")] if of_sensor else ()
-        self.nodes[participant.node_id] = FaultyNode(participant, (), ids)
-        return self.nodes[participant.node_id]
+        of_sensor = sensor is not None and node.node_id == sensor.node_id
+        ids = [pdo.cob_id for pdo in self.session.plan.pdos_of(node.node_id, "tpdo")] if of_sensor else ()
+        self.nodes[node.node_id] = FaultyNode(node, (), ids)
+        return self.nodes[node.node_id]
 
     def _say(self, text):
         if text.startswith("lift off"):

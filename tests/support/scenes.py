@@ -15,7 +15,7 @@ from canprobe.errors import PlanError
 from canprobe.scene.model import Scene
 
 
-def change(scene: Scene, **sections: dict[str, Any]) -> Scene:
+def change(scene: Scene, /, **sections: dict[str, Any]) -> Scene:
     """A scene with some fields of some sections replaced."""
     changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
     return dataclasses.replace(scene, **changed)

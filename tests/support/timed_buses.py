@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from canprobe.bus.lockstep import Participant
 from canprobe.bus.port import VirtualClock
 from canprobe.bus.timed import TimedBus
 from canprobe.protocol.frames import Frame
@@ -12,7 +13,7 @@ BIT = 1000  # ns, at 1 Mbit/s
 INTERMISSION = 3 * BIT
 
 
-class Scripted:
+class Scripted(Participant):
     """Says fixed frames at fixed times and fixed answers to fixed identifiers; remembers what it heard."""
 
     def __init__(
@@ -25,9 +26,6 @@ class Scripted:
     @property
     def next_deadline_ns(self) -> int | None:
         return min(self.timed, default=None)
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        return ()
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
         self.heard.append((can_id, data, t_ns))
@@ -46,7 +44,7 @@ def make_bus(*participants, **options):
     return bus, seen
 
 
-class Source:
+class Source(Participant):
     """Sends one message: queues a frame of its own at given times."""
 
     def __init__(self, frame: Frame, times: Sequence[int]):
@@ -56,12 +54,6 @@ class Source:
     @property
     def next_deadline_ns(self) -> int | None:
         return self.times[0] if self.times else None
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        return ()
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         self.times.pop(0)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from canprobe.bus.lockstep import Participant
 from canprobe.protocol.frames import Frame
 
 # A babbling idiot: a node that talks without being asked, as a broken controller does.
 
 
-class Babbler:
+class Babbler(Participant):
     """Queues one frame again and again; a participant for a lockstep bus.
 
     Args:
@@ -21,6 +22,7 @@ class Babbler:
 
     name = "babbling idiot"
     listens: frozenset[int] = frozenset()
+    next_deadline_ns: int | None = None
 
     def __init__(self, frame: Frame, period_ns: int, first_ns: int = 0, last_ns: int | None = None) -> None:
         if period_ns <= 0:
@@ -28,15 +30,7 @@ class Babbler:
         self._frame = frame
         self._period_ns = period_ns
         self._last_ns = last_ns
-        self.next_deadline_ns: int | None = first_ns
-
-    def start(self, t_ns: int) -> Sequence[Frame]:
-        """Nothing yet."""
-        return ()
-
-    def receive(self, can_id: int, data: bytes, t_ns: int) -> Sequence[Frame]:
-        """It does not listen."""
-        return ()
+        self.next_deadline_ns = first_ns
 
     def advance(self, t_ns: int) -> Sequence[Frame]:
         """Say it once more."""

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import canprobe
-from canprobe.cell.assembly import limits_of
 from canprobe.cell.controller import Measurement
+from canprobe.cell.supervisor import JointGuard
 from canprobe.cli.operator import TerminalOperator
 from canprobe.robot.kinematics import UPENN, counts_to_joints, joints_to_counts
 from canprobe.tasks.untouched import Answer, JointCheck
@@ -21,8 +21,14 @@ START = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
 
 
 @pytest.fixture(scope="module")
-def limits():
-    return limits_of(canprobe.plan(canprobe.load_scene("free")))
+def plan():
+    scene = canprobe.load_scene("free")
+    return canprobe.plan(replace(scene, cycle=replace(scene.cycle, rate_hz=1 / PERIOD_S)))
+
+
+@pytest.fixture(scope="module")
+def guard(plan):
+    return JointGuard(plan)
 
 
 class Scripted:
@@ -58,12 +64,8 @@ def run(check, motors=None, start=START):
     raise AssertionError("no end")
 
 
-def check_of(limits, operator=None, **options):
-    return JointCheck(UPENN, limits, PERIOD_S, operator, **options)
-
-
-def test_each_joint_turns_alone_slowly_and_comes_back(limits):
-    check = check_of(limits)
+def test_each_joint_turns_alone_slowly_and_comes_back(plan):
+    check = JointCheck(plan, None)
     targets, last = run(check)
     away = targets - START
     assert last.done and [f.joint for f in check.findings] == list(range(6))
@@ -81,10 +83,10 @@ def test_each_joint_turns_alone_slowly_and_comes_back(limits):
     ("factor", "fault"),
     [(-1.0, "it turned the wrong way"), (0.0, "it did not turn"), (0.5, "it turned 0.50 times as far")],
 )
-def test_a_motor_that_does_something_else_is_named(limits, joint, factor, fault):
+def test_a_motor_that_does_something_else_is_named(plan, joint, factor, fault):
     motors = np.eye(6)
     motors[joint, joint] = factor
-    check = check_of(limits)
+    check = JointCheck(plan, None)
     run(check, motors)
     findings = {f.joint: f.fault for f in check.findings}
     assert findings[joint].startswith(fault)
@@ -96,44 +98,45 @@ def test_a_motor_that_does_something_else_is_named(limits, joint, factor, fault)
     assert {other for other, text in findings.items() if text is not None and other != joint} == dragged
 
 
-def test_swapped_drives_are_told(limits):
+def test_swapped_drives_are_told(plan):
     motors = np.eye(6)[[1, 0, 2, 3, 4, 5]]
-    check = check_of(limits)
+    check = JointCheck(plan, None)
     run(check, motors)
     faults = [finding.fault for finding in check.findings]
     assert faults[0] == faults[1] == "it did not turn" and faults[2:] == [None] * 4
 
 
-def test_a_motor_that_runs_along_is_told(limits):
+def test_a_motor_that_runs_along_is_told(plan):
     motors = np.eye(6)
     motors[2, 1] = 0.3
-    check = check_of(limits)
+    check = JointCheck(plan, None)
     run(check, motors)
     assert check.findings[1].fault.startswith("the motor of joint 3 turned by")
 
 
-def test_at_a_stop_a_joint_turns_the_other_way(limits):
+def test_at_a_stop_a_joint_turns_the_other_way(plan, guard):
     start = START.copy()
-    start[1] = limits.joint_high[1] - math.radians(0.5)
-    check = check_of(limits)
+    start[1] = guard.high[1] - math.radians(0.5)
+    check = JointCheck(plan, None)
     targets, _ = run(check, start=start)
     assert check.findings[1].asked_deg == pytest.approx(-1.0)
-    assert np.all(targets <= limits.joint_high + 1e-12) and np.all(targets >= limits.joint_low - 1e-12)
+    assert np.all(targets <= guard.high + 1e-12) and np.all(targets >= guard.low - 1e-12)
 
 
-def test_beyond_a_stop_nothing_moves(limits):
+def test_beyond_a_stop_nothing_moves(plan, guard):
     start = START.copy()
-    start[4] = limits.joint_low[4] - math.radians(2.0)
-    check = check_of(limits)
+    start[4] = guard.low[4] - math.radians(2.0)
+    check = JointCheck(plan, None)
     assert check.inspect(START) is None
     assert check.inspect(start) == "joint 5 stands at -31.0 deg, outside -29.0 to 199.0 deg: move it there by hand," + (
         " or its zero is wrong"
     )
 
 
-def test_a_workspace_without_room_is_left_alone(limits):
-    tip = limits.T_base_tip_of(START)[:3, 3]
-    check = check_of(replace(limits, workspace=np.array([tip - 1e-5, tip + 1e-5])))
+def test_a_workspace_without_room_is_left_alone(plan, guard):
+    tip = guard.T_base_tip(START)[:3, 3]
+    limits = replace(plan.setup.limits, workspace=np.array([tip - 1e-5, tip + 1e-5]))
+    check = JointCheck(replace(plan, setup=replace(plan.setup, limits=limits)), None)
     targets, last = run(check)
     assert last.done
     skipped = [finding.skipped for finding in check.findings]
@@ -142,9 +145,9 @@ def test_a_workspace_without_room_is_left_alone(limits):
     assert np.ptp(targets[:, :5]) == pytest.approx(np.ptp(START[:5]))
 
 
-def test_nothing_moves_before_the_operator_says_so(limits):
+def test_nothing_moves_before_the_operator_says_so(plan):
     operator = Scripted(Answer.NO, Answer.YES, Answer.YES, Answer.YES, Answer.NO, Answer.QUIT)
-    check = check_of(limits, operator)
+    check = JointCheck(plan, operator)
     targets, last = run(check)
     assert last.done
     assert [(f.joint, f.skipped, f.fault) for f in check.findings] == [
@@ -157,8 +160,8 @@ def test_nothing_moves_before_the_operator_says_so(limits):
     assert targets[-1] == pytest.approx(START) and np.all(targets[:, 3:] == START[3:])
 
 
-def test_an_operator_who_ends_while_a_joint_is_away_gets_it_back_first(limits):
-    check = check_of(limits, Scripted(Answer.YES, Answer.QUIT))
+def test_an_operator_who_ends_while_a_joint_is_away_gets_it_back_first(plan):
+    check = JointCheck(plan, Scripted(Answer.YES, Answer.QUIT))
     targets, last = run(check)
     assert last.done and targets[-1] == pytest.approx(START)
     assert [(f.joint, f.fault) for f in check.findings] == [(0, None)]

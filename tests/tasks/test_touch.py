@@ -1,6 +1,7 @@
 """How a summary tells of contact that a scan lost."""
 
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -74,6 +75,24 @@ def test_the_force_follows_what_is_asked_for_and_a_stop_ends_it(press):
     assert log["force_n"][last - 60 : last].mean() == pytest.approx(3.0, abs=0.1)
     assert press.truth["force"][last - 60 : last].mean() == pytest.approx(3.0, rel=1 / 12)
     assert task.reason is None and press.cell.faults == []
+
+
+def test_a_stop_lets_a_calibration_go_of_its_ball():
+    """Stopped in its second touch, it does not leave the probe pressing."""
+    scene = resolve_scene(canprobe.load_scene("calibrate"))
+    session = Session(replace(scene, bus=replace(scene.bus, timed=False)))
+    queue, task = deque(), make_task(session.plan)
+    controller = RequestedTask(task, None, (queue,), 2.5e-3)
+
+    def step(measurement):
+        if len(task.touches) == 1 and task.phase == 3 and not queue:
+            queue.append(request("stop"))
+        return controller.step(measurement)
+
+    with session:
+        session.run(step)
+    assert session.truth["force"][-1] == 0.0 and session.cell.faults == []
+    assert len(task.touches) == 1 and task.reason is None
 
 
 def test_up_holds_until_a_start_and_holds_again_after_a_stop():

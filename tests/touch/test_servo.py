@@ -119,7 +119,7 @@ def test_local_surface_bends_away_from_the_outward_normal_where_convex():
     local = LocalSurface(np.zeros(3), np.array((0.0, 0.0, 1.0)), SurfaceGains())
     local.set_curvature(np.diag((20.0, 0.0, 0.0)))
     local.correct(local.point, local.normal, dt=1e6)
-    foot, normal = local.foot(np.array((1e-3, 0.0, 5.0)))
+    foot, normal = local.foot((1e-3, 0.0, 5.0))
     assert foot == pytest.approx((1e-3, 0.0, -10e-6))
     assert normal[0] == pytest.approx(0.02, rel=1e-3)
 

@@ -127,7 +127,6 @@ def test_patches_are_kept_by_path_not_by_time(truth):
     assert [round(1e3 * p.travelled_m, 3) for p in kept] == [1 + 2 * i for i in range(12)]
     assert kept[0].t_s == 0.0
     assert len(merge_patches(patches, [[0, 0, 0]], spacing=4e-3)) == 6
-    assert len(merge_patches(patches, [[0, 0, 0]]).thinned(6e-3)) == 4
 
 
 def test_patches_that_observed_nothing_are_left_out(truth):
@@ -213,7 +212,7 @@ def test_bad_maps_and_queries_are_refused(truth):
     with pytest.raises(UsageError, match=r"path: expected shape \(n, 3\)"):
         dataclasses.replace(surface_map, path=np.zeros((4, 2)))
     with pytest.raises(UsageError, match="spacing: expected a number above 0"):
-        surface_map.thinned(0.0)
+        merge_patches(surface_map.patches, surface_map.path, spacing=0.0)
     with pytest.raises(UsageError, match="reach: expected a number above 0"):
         closest(surface_map, [0, 0, 0], reach=-1.0)
     with pytest.raises(UsageError, match="point: expected finite"):

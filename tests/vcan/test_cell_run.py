@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import canprobe
+from canprobe.planning.measured import expected_messages
 
 pytestmark = pytest.mark.vcan
 NODES = (1, 2, 3, 4, 5, 6, 16)
@@ -39,7 +40,7 @@ def test_a_touch_in_two_processes(bench: Any) -> None:
     bench.assert_left_safe(results.last, *NODES)
     assert not Path(f"/proc/{child}").exists()
     planned = canprobe.plan(canprobe.load_scene(scene))
-    assert set(results.last) <= planned.frame_ids
+    assert set(results.last) <= {can_id for bus in planned.buses for can_id in expected_messages(planned, bus)}
     assert {pdo.cob_id for pdo in planned.pdos} <= set(results.last)
     with np.load(bench.folder / "results" / "truth.npz") as truth:
         assert truth["force"].max() == pytest.approx(results.summary["contact"]["force_max_n"])

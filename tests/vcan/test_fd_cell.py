@@ -44,12 +44,9 @@ def heard(port: SocketCanPort, count: int) -> list[tuple[int, bytes]]:
     return found
 
 
-@pytest.mark.parametrize("batched", [True, False])
-def test_long_frames_pass_and_a_classical_socket_is_spared_them(fd_channel: str, batched: bool) -> None:
+def test_long_frames_pass_and_a_classical_socket_is_spared_them(fd_channel: str) -> None:
     clock = MonotonicClock()
-    one, two, classic = (
-        SocketCanPort(fd_channel, clock, batched=batched, data_bitrate=fast) for fast in (FAST, FAST, None)
-    )
+    one, two, classic = (SocketCanPort(fd_channel, clock, data_bitrate=fast) for fast in (FAST, FAST, None))
     frames = [(0x181, b"\x01"), (0x512, LONG), (0x513, LONG[:12]), (0x80, b"")]
     try:
         one.send_batch(frames)

@@ -12,7 +12,7 @@ import pytest
 
 from canprobe.cli import main
 from canprobe.vcan import launch as vcan
-from canprobe.vcan.launch import LocalJob, Signals, caught_signals, supervise
+from canprobe.vcan.launch import LocalJob, caught_signals, supervise
 
 
 class Scripted:
@@ -36,30 +36,23 @@ class Scripted:
         self.told.append("kill")
 
 
-def pending(*numbers: int) -> Signals:
-    signals = Signals()
-    for number in numbers:
-        signals._remember(number, None)
-    return signals
-
-
 def test_status_signals_and_the_third_one_kills() -> None:
-    assert supervise(Scripted(polls=2), Signals(), None) == (5, False)
+    assert supervise(Scripted(polls=2), [], None) == (5, False)
     job = Scripted(dies_of=signal.SIGTERM)
-    assert supervise(job, pending(signal.SIGINT, signal.SIGTERM), None) == (143, False)
+    assert supervise(job, [signal.SIGINT, signal.SIGTERM], None) == (143, False)
     assert job.told == [signal.SIGINT, signal.SIGTERM]
     job = Scripted()
-    assert supervise(job, pending(signal.SIGINT, signal.SIGINT, signal.SIGINT), None) == (130, False)
+    assert supervise(job, [signal.SIGINT, signal.SIGINT, signal.SIGINT], None) == (130, False)
     assert job.told == [signal.SIGINT, signal.SIGINT, "kill"]
 
 
 def test_time_out_terminates_then_kills(monkeypatch: pytest.MonkeyPatch) -> None:
     job = Scripted(dies_of=signal.SIGTERM)
-    assert supervise(job, Signals(), 0.0) == (124, True)
+    assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM]
     monkeypatch.setattr("canprobe.vcan.launch._GRACE_S", 0.0)
     job = Scripted()
-    assert supervise(job, Signals(), 0.0) == (124, True)
+    assert supervise(job, [], 0.0) == (124, True)
     assert job.told == [signal.SIGTERM, "kill"]
 
 
@@ -67,7 +60,7 @@ def test_time_out_terminates_then_kills(monkeypatch: pytest.MonkeyPatch) -> None
     ("script", "status"), [("exit 7", 7), ("kill -9 $$", 137), ("exec nosuchprogram", 127), ("sleep 1000 & exit 0", 0)]
 )
 def test_local_status(script: str, status: int) -> None:
-    assert supervise(LocalJob(["sh", "-c", script], os.environ), Signals(), None) == (status, False)
+    assert supervise(LocalJob(["sh", "-c", script], os.environ), [], None) == (status, False)
 
 
 def test_a_signal_to_us_reaches_the_command_and_leaves_us_alive() -> None:

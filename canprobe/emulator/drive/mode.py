@@ -1,24 +1,24 @@
-"""What every mode of operation shares: the drive's parts, its feedback, what stops it, halt, and the statusword's
-bits.
+"""What every mode of operation shares: the parts of the drive, halt, and the bits of controlword and statusword.
 
-A mode lives between `start` and `leave`, in operation enabled only.
+A mode lives between `start` and `leave`, in operation enabled only. One more mode is a class that derives from
+`CyclicMode` if it has a target for every SYNC, or from `ProfiledMode` if it makes its own way; `modes.MODES` lists it.
 Source: CiA 402-2, controlword bits 4–6, 8 and 9, statusword bits 10–13, halt option code 605Dh.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 
 from canprobe.emulator.drive.parameters import PEAK_PERMILLE, DriveParameters, Units
-from canprobe.emulator.drive.reference import AxisPlant, Motion
+from canprobe.emulator.drive.reference import STEP_NS, AxisPlant, Motion
 from canprobe.emulator.node.dictionary import Dictionary, Value
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.protocol import cia402
+from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.frames import FOLLOWING_ERROR, RPDO_TIMEOUT, SYNC_LOST
 
-# What a drive tells the plant's position loop: the torque limit 6072h and the feed-forwards 60B1h and 60B2h.
+# What a drive gives to the plant's position loop: the torque limit 6072h and the feed-forwards 60B1h and 60B2h.
 #
 # The feed-forwards act in the mode that gives them; leaving it takes them back. In cyclic synchronous velocity 60B1h is
 # part of the target already, and in cyclic synchronous torque both are: there the loop gets none.
@@ -28,51 +28,47 @@ _LIMIT, _SPEED, _TORQUE = 0x6072, 0x60B1, 0x60B2
 
 
 class DriveLoop:
-    """Torque limit and feed-forwards of one axis; the plant hears of changes only.
-
-    Attributes:
-        changed: a position mode has to `feed_forward` in this cycle.
+    """Torque limit and feed-forwards of one axis; the plant gets changes only.
 
     Args:
         axis: of the plant, 0-based.
         plant: shared with the other drives.
         parameters: of the drive.
         dictionary: of the drive.
+
+    Attributes:
+        changed: a position mode has to `feed_forward` in this cycle.
     """
 
     def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, dictionary: Dictionary) -> None:
         self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
-        self._told: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
+        self._given: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
         self.changed = True
-        for index in (_SPEED, _TORQUE):
-            dictionary.on_write(index, self._written)
-        dictionary.on_write(_LIMIT, lambda _sub, _value: self._tell(*self._told[1:]))
+        for index in (_LIMIT, _SPEED, _TORQUE):
+            dictionary.on_write(index, lambda _sub, _value: self._give(*self._given[1:]))
 
     def feed_forward(self) -> None:
         """Take limit and offsets as they are now."""
-        self._tell(self._number(_SPEED) * self._parameters.units.speed_scale, float(self._number(_TORQUE)))
+        self._give(self._number(_SPEED) * self._parameters.units.speed_scale, float(self._number(_TORQUE)))
         self.changed = False
 
     def feed_torque(self) -> None:
         """Take limit and torque offset: every cycle of a velocity mode."""
-        self._tell(0.0, float(self._number(_TORQUE)))
+        self._give(0.0, float(self._number(_TORQUE)))
 
     def release(self) -> None:
         """Limit only."""
-        self._tell(0.0, 0.0)
+        self._give(0.0, 0.0)
 
-    def _written(self, subindex: int, value: Value) -> None:
-        self.changed = True
-
-    def _tell(self, speed: float, torque: float) -> None:
+    def _give(self, speed: float, torque: float) -> None:
         self.changed = True
         wanted = (self._parameters.max_torque, speed, torque)
-        if wanted != self._told:
-            self._told = wanted
+        if wanted != self._given:
+            self._given = wanted
             self._plant.set_loop(self._axis, *wanted)
 
 
-# What a drive tells of itself: actual and demand values, brought up to date only where somebody reads them.
+# What a drive reports of itself: actual and demand values, brought up to date only where somebody reads them.
 #
 # Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
 # Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
@@ -86,7 +82,7 @@ class DriveFeedback:
 
     Attributes:
         counts: motor position at the last `measure`.
-        plant_torque: tells the torque that the plant needs for its motion now, permille.
+        plant_torque: returns the torque that the plant needs for its motion now, permille.
     """
 
     def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
@@ -102,12 +98,12 @@ class DriveFeedback:
             0x606C: lambda: self._velocity / units.speed_scale,
             0x60F4: lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale,
         }
-        self.tell_torque(self.plant_torque)
+        self.show_torque(self.plant_torque)
         for index in self._sources:
             if node.dictionary.has_index(index):
                 sample = self._sampler(index, _I16 if index in _TORQUES else _I32)
                 node.pdos.on_trigger(index, sample)
-                node.dictionary.on_read(index, self._reader(sample))
+                node.dictionary.on_read(index, lambda _sub, sample=sample: sample(self._core.now_ns))  # type: ignore[misc]
 
     def reset(self, t_ns: int) -> None:
         """Velocity starts anew."""
@@ -125,8 +121,8 @@ class DriveFeedback:
             self.counts, self._t_ns = counts, t_ns
         return self.counts
 
-    def tell_torque(self, source: Callable[[], float]) -> None:
-        """Take the torque, permille, from `source` from now on: the plant's, or that of a drive that controls it."""
+    def show_torque(self, source: Callable[[], float]) -> None:
+        """Take the torque, permille, from `source` from now on: the plant's, or that of a mode that controls it."""
         self._sources.update(dict.fromkeys(_TORQUES, source))
 
     def _sampler(self, index: int, limit: int) -> Callable[[int], None]:
@@ -140,61 +136,6 @@ class DriveFeedback:
             values[key] = number if -limit <= number < limit else min(max(number, -limit), limit - 1)
 
         return sample
-
-    def _reader(self, sample: Callable[[int], None]) -> Callable[[int], None]:
-        return lambda _subindex: sample(self._core.now_ns)
-
-
-# The faults that a drive has found: reported, shown in 603Fh, and forgotten at a fault reset.
-#
-# Source: CiA 402-2, object 603Fh; CiA 301, "Emergency object".
-
-
-class DriveFaults:
-    """Codes of the faults that are there.
-
-    Attributes:
-        following_error: whether one of them is, for statusword bit 13.
-    """
-
-    def __init__(self, node: SlaveNode, detected: Callable[[int], None]) -> None:
-        """`detected(t_ns)` starts the fault reaction."""
-        self._node, self._detected = node, detected
-        self._codes: list[int] = []
-        self._injected: list[int] = []
-        self._timer = node.core.timers.new(self._find_injected)
-        self.following_error = False
-
-    def reset(self) -> None:
-        """Power on."""
-        self._injected.clear()
-        self.forget()
-
-    def find(self, code: int, t_ns: int) -> None:
-        """A fault is there."""
-        self._codes.append(code)
-        self.following_error = self.following_error or code == FOLLOWING_ERROR
-        self._node.dictionary.put(0x603F, 0, code)
-        self._node.emcy.report(code)
-        self._detected(t_ns)
-
-    def inject(self, code: int) -> None:
-        """Find a fault at the next `advance`."""
-        self._injected.append(code)
-        self._timer.arm(self._node.core.now_ns)
-
-    def forget(self) -> None:
-        """Fault reset: all are gone."""
-        for code in self._codes:
-            self._node.emcy.clear(code)
-        self._codes.clear()
-        self.following_error = False
-        self._node.dictionary.put(0x603F, 0, 0)
-
-    def _find_injected(self, due_ns: int) -> None:
-        codes, self._injected = self._injected, []
-        for code in codes:
-            self.find(code, due_ns)
 
 
 # What makes a drive stop by itself in operation enabled: a silent master, and a motor that does not follow.
@@ -236,13 +177,11 @@ class Supervision:
         self._timer.arm(t_ns + self._parameters.patience_ns)
         self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
         if self._misses >= self._parameters.misses:
-            self._node.emcy.report(RPDO_TIMEOUT)
-            self._on_loss(RPDO_TIMEOUT, t_ns)
+            self._lose(RPDO_TIMEOUT, t_ns)
 
     def following_error(self, error_counts: float, t_ns: int) -> bool:
         """Whether the error has been outside 6065h for the time of 6066h."""
-        window = self._parameters.following_window
-        if abs(error_counts) <= window:
+        if abs(error_counts) <= self._parameters.following_window:
             self._outside_ns = None
             return False
         if self._outside_ns is None:
@@ -250,8 +189,11 @@ class Supervision:
         return t_ns - self._outside_ns >= self._parameters.following_timeout_ns
 
     def _sync_missing(self, due_ns: int) -> None:
-        self._node.emcy.report(SYNC_LOST)
-        self._on_loss(SYNC_LOST, due_ns)
+        self._lose(SYNC_LOST, due_ns)
+
+    def _lose(self, code: int, t_ns: int) -> None:
+        self._node.emcy.report(code)
+        self._on_loss(code, t_ns)
 
 
 # What every mode of operation shares: the drive's parts, the controlword's own bits, halt, and the statusword's.
@@ -260,36 +202,49 @@ REACHED = 1 << cia402.TARGET_REACHED
 FOLLOWS = 1 << cia402.DRIVE_FOLLOWS
 
 
-@dataclass(frozen=True, slots=True)
 class DriveParts:
-    """What a mode works with.
+    """The parts of one drive, which its application and its modes share.
 
-    Attributes:
+    Args:
+        node: the drive's.
+        axis: of the plant, 0-based.
+        plant: shared with the other drives.
+        fault: `fault(code, t_ns)` when a mode has found one.
+        on_loss: `on_loss(code, t_ns)` when the master is taken for dead.
         show: the mode's part of the statusword may have changed.
-        fault: `fault(code, t_ns)`.
     """
 
-    node: SlaveNode
-    axis: int
-    plant: AxisPlant
-    parameters: DriveParameters
-    motion: Motion
-    feedback: DriveFeedback
-    supervision: Supervision
-    loop: DriveLoop
-    show: Callable[[], None]
-    fault: Callable[[int, int], None]
+    def __init__(
+        self,
+        node: SlaveNode,
+        axis: int,
+        plant: AxisPlant,
+        *,
+        fault: Callable[[int, int], None],
+        on_loss: Callable[[int, int], None],
+        show: Callable[[], None],
+    ) -> None:
+        self.node, self.axis, self.plant, self.fault, self.show = node, axis, plant, fault, show
+        self.parameters = DriveParameters(node.dictionary)
+        self.motion = Motion(axis, plant, node.core.timers)
+        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units)
+        self.supervision = Supervision(node, self.parameters, on_loss)
+        self.loop = DriveLoop(axis, plant, self.parameters, node.dictionary)
 
 
 class DriveMode:
     """Mode 0, none: it stands still. Base of the others.
 
     Attributes:
+        number: in 6060h; bit number - 1 of 6502h.
+        needs: indices of the objects without which the EDS does not describe the mode.
         target: index of the object that a cyclic mode lives by; None: SYNC and RPDOs are not watched.
         limited: statusword bit 11.
         halted: controlword bit 8.
     """
 
+    number = OperationMode.NONE
+    needs: tuple[int, ...] = ()
     target: int | None = None
 
     def __init__(self, parts: DriveParts) -> None:
@@ -358,12 +313,6 @@ class DriveMode:
         limit = self._parameters.max_torque
         return limit < PEAK_PERMILLE and abs(self.parts.feedback.plant_torque()) >= limit
 
-    def _look(self) -> tuple[int, float] | None:
-        """For a mode's timer: now, and where the motor is; None when the following error has become a fault."""
-        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
-        counts = self.parts.feedback.measure(t_ns)
-        return None if self._lags(t_ns, counts) else (t_ns, counts)
-
     def _lags(self, t_ns: int, counts: float) -> bool:
         """Watch the following error; True when it has become a fault."""
         if not self._supervision.following_error(self._motion.demand(t_ns) - counts, t_ns):
@@ -372,10 +321,37 @@ class DriveMode:
         return True
 
 
+class ProfiledMode(DriveMode):
+    """A mode that makes its own profile; while its timer runs it looks at the motor every `STEP_NS`."""
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._timer = parts.node.core.timers.new(self._look)
+
+    def leave(self, t_ns: int) -> None:
+        """Look no more."""
+        self._timer.cancel()
+
+    def watch(self, t_ns: int, counts: float) -> None:
+        """The motor is at `counts`, and its following error is no fault."""
+
+    def _look(self, due_ns: int) -> None:
+        t_ns = self.parts.node.core.now_ns  # a late timer sees the motor of now
+        counts = self.parts.feedback.measure(t_ns)
+        if not self._lags(t_ns, counts):
+            self._timer.arm_next(due_ns, STEP_NS)
+            self.watch(t_ns, counts)
+
+
 class CyclicMode(DriveMode):
-    """A mode with a target for every SYNC; without one it keeps the last, until the master is taken for dead."""
+    """A mode with a target for every SYNC, until the master is taken for dead.
+
+    Attributes:
+        repeats: without a new target the last one is latched again.
+    """
 
     target: int
+    repeats = True
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -394,13 +370,14 @@ class CyclicMode(DriveMode):
     def sync(self, t_ns: int, counts: float) -> None:
         """Watch the master, latch the target."""
         fresh, self._fresh = self._fresh, False
-        self._supervision.sync(fresh, t_ns)
-        self._commanded = self._commanded or fresh
-        if self._commanded and not self.halted and self._supervision.watching:
+        supervision = self._supervision
+        supervision.sync(fresh, t_ns)
+        self._commanded = fresh or (self._commanded and self.repeats)
+        if self._commanded and not self.halted and supervision.watching:
             self.latch(t_ns)
 
     def latch(self, t_ns: int) -> None:
         """Follow the target from now on."""
 
-    def _target_written(self, subindex: int, value: object) -> None:
+    def _target_written(self, subindex: int, value: Value) -> None:
         self._fresh = True

@@ -5,11 +5,11 @@ Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 60
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from functools import partial
 from math import inf
 
 from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME
-from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, key_of
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value
 
 # Factor group: the master's position units ↔ motor counts, polarity, and where the zero is.
 #
@@ -61,8 +61,6 @@ def _quotient(dictionary: Dictionary, index: int) -> float:
     return (dictionary.number(index, 1) or 1) / (dictionary.number(index, 2) or 1)
 
 
-# Parameters of a CiA 402 drive as its application uses them, read from the dictionary whenever one is written.
-
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
 DEFAULT_MISSES = 5
@@ -90,22 +88,22 @@ class DriveParameters:
         misses: 2000h, SYNCs missed before the master is taken for dead.
         patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half.
         low, high: 607Dh, position units; low >= high means no limits.
-        abort_connection, quick_stop, shutdown, disable, halt, fault_reaction: option codes.
-        acceleration, deceleration, quick_deceleration, homing_acceleration: 6083h–6085h, 609Ah, counts/s².
+        abort_connection, quick_stop, shutdown, disable: option codes.
+        acceleration, deceleration, homing_acceleration: 6083h, 6084h, 609Ah, counts/s².
+        quick_stop_rate, halt_rate, fault_rate: deceleration by 605Ah, 605Dh, 605Eh: the slow-down ramp 6084h or the
+            quick stop ramp 6085h, counts/s²; 0 means the brake at once.
         max_speed: the lower of 607Fh and 6080h, counts/s; infinite for neither.
         max_torque: 6072h, permille.
     """
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        missed_syncs = dictionary.entries.get(key_of(MISSED_SYNCS))
-        self._has_misses = missed_syncs is not None and missed_syncs.name == MISSED_SYNCS_NAME
+        self._has_misses = dictionary.has_named(MISSED_SYNCS, MISSED_SYNCS_NAME)
         self.units = Units()
         self.read()
-        for index in _INDICES:
-            dictionary.on_write(index, lambda _sub, _value: self.read())
+        dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _OPTIONS.items():
-            dictionary.on_check(index, _check_among(allowed))
+            dictionary.on_check(index, partial(_check_among, allowed))
         dictionary.on_check(0x60C2, _check_interpolation)
 
     def read(self) -> None:
@@ -119,22 +117,16 @@ class DriveParameters:
         cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
         self.patience_ns = self.misses * cycle_ns + cycle_ns // 2
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
-        self._read_options()
-        self._read_dynamics()
-
-    def _read_options(self) -> None:
-        number = self._dictionary.number
-        self.abort_connection = number(0x6007, 0, 3)
-        self.quick_stop = number(0x605A, 0, 2)
+        self.abort_connection, self.quick_stop = number(0x6007, 0, 3), number(0x605A, 0, 2)
         self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
-        self.halt = number(0x605D, 0, 1)
-        self.fault_reaction = number(0x605E, 0, 2)
-
-    def _read_dynamics(self) -> None:
-        number, magnitude = self._dictionary.number, self.units.magnitude
-        self.deceleration, self.quick_deceleration = number(0x6084) * magnitude, number(0x6085) * magnitude
+        magnitude = self.units.magnitude
+        slow, quick = number(0x6084) * magnitude, number(0x6085) * magnitude
         self.acceleration = (number(0x6083) or DEFAULT_ACCELERATION) * magnitude
         self.homing_acceleration = (number(0x609A) or DEFAULT_ACCELERATION) * magnitude
+        self.deceleration = slow
+        self.quick_stop_rate = slow if self.quick_stop in (1, 5) else quick
+        self.halt_rate = quick if number(0x605D, 0, 1) == 2 else slow
+        self.fault_rate = {1: slow, 2: quick}.get(number(0x605E, 0, 2), 0)
         turns_per_s = number(0x6080) / 60.0
         self.max_speed = min(number(0x607F) * magnitude or inf, turns_per_s * self.units.turn or inf)
         self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
@@ -142,21 +134,6 @@ class DriveParameters:
     def _window(self, index: int) -> float:
         value = self._dictionary.number(index, 0, NO_WINDOW)
         return inf if value == NO_WINDOW else value * self.units.magnitude
-
-    @property
-    def quick_stop_rate(self) -> float:
-        """Deceleration of a quick stop: the slow-down ramp for 605Ah = 1, 5, the quick stop ramp for 2, 6."""
-        return self.deceleration if self.quick_stop in (1, 5) else self.quick_deceleration
-
-    @property
-    def halt_rate(self) -> float:
-        """Deceleration of a halt, 605Dh: the slow-down ramp (1) or the quick stop ramp (2)."""
-        return self.quick_deceleration if self.halt == 2 else self.deceleration
-
-    @property
-    def fault_rate(self) -> float:
-        """Deceleration of the fault reaction, 605Eh; 0 means the brake at once."""
-        return {1: self.deceleration, 2: self.quick_deceleration}.get(self.fault_reaction, 0)
 
     @property
     def fence(self) -> tuple[float, float]:
@@ -172,15 +149,11 @@ class DriveParameters:
         return target if low <= target <= high or low >= high else min(max(target, low), high)
 
 
-def _check_among(allowed: frozenset[int]) -> Callable[[int, Value], None]:
-    def check(subindex: int, value: Value) -> None:
-        if value not in allowed:
-            raise SdoAbort(Abort.VALUE)
-
-    return check
+def _check_among(allowed: frozenset[int], subindex: int, value: Value) -> None:
+    if value not in allowed:
+        raise SdoAbort(Abort.VALUE)
 
 
 def _check_interpolation(subindex: int, value: Value) -> None:
-    too_fine = subindex == 2 and int(value) < -9
-    if (subindex == 1 and not value) or too_fine or (subindex == 2 and int(value) > 0):
+    if (subindex == 1 and not value) or (subindex == 2 and not -9 <= int(value) <= 0):
         raise SdoAbort(Abort.VALUE)

@@ -9,11 +9,13 @@ from typing import NamedTuple, Protocol
 from canprobe.emulator.node.core import Timers
 from canprobe.emulator.plant.ideal_arm import MotorDynamics
 
-# Trapezoidal motion to a target, from any position and speed, as pieces of constant acceleration.
+# Trapezoidal motion to a target, constant velocity, and what a constant torque does to the motor, as pieces one after
+# the other, from any position and speed.
 #
 # A motor that moves the wrong way, or too fast to stop in time, is braked to rest first and turned round. One that is
 # faster than allowed is braked to the profile velocity.
-# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0.
+# Source: CiA 402-2, profile position mode, objects 6081h, 6083h, 6084h, motion profile type 6086h = 0; cyclic
+# synchronous velocity and torque modes; software position limits 607Dh.
 
 
 class Piece(NamedTuple):
@@ -32,28 +34,61 @@ class Piece(NamedTuple):
         )
 
 
+class Decay(NamedTuple):
+    """Velocity that tends exponentially towards `final`: s, counts, counts/s, counts/s, 1/s."""
+
+    duration_s: float
+    position: float
+    velocity: float
+    final: float
+    damping: float
+
+    def at(self, t_s: float) -> tuple[float, float]:
+        """As of `Piece`."""
+        decay = exp(-self.damping * t_s)
+        excess = self.velocity - self.final
+        return self.position + self.final * t_s + excess * (1.0 - decay) / self.damping, self.final + excess * decay
+
+
+class Rates(NamedTuple):
+    """Limits of a move: counts/s and counts/s², all positive."""
+
+    speed: float
+    acceleration: float
+    deceleration: float
+
+
 class Profile:
-    """Pieces one after the other, at rest at `end` after them.
+    """A reference as a function of the time since its start: pieces one after the other, at rest at `end` after them.
 
     Attributes:
-        duration_s: s.
+        duration_s: s; infinite for a motion without an end.
         end: position at rest, counts.
     """
 
-    def __init__(self, pieces: tuple[Piece, ...], end: float) -> None:
+    def __init__(self, pieces: tuple[Piece | Decay, ...], end: float) -> None:
         self._pieces = pieces
         self.end = end
         self.duration_s = sum(piece.duration_s for piece in pieces)
+        self._low, self._high = -inf, inf
+
+    def fenced(self, low: float, high: float) -> Profile:
+        """The same cut off at the software limits, counts: the motor waits there. One outside may only come in."""
+        start, _ = self.at(0.0)
+        self._low, self._high = min(low, start), max(high, start)
+        return self
 
     def at(self, t_s: float) -> tuple[float, float]:
         """Position (counts) and velocity (counts/s) `t_s` after the start."""
-        if t_s >= self.duration_s:
-            return self.end, 0.0
-        for piece in self._pieces:
+        position, velocity, over = self.end, 0.0, t_s >= self.duration_s
+        for piece in () if over else self._pieces:
             if t_s < piece.duration_s:
-                return piece.at(t_s)
+                position, velocity = piece.at(t_s)
+                break
             t_s -= piece.duration_s
-        return self.end, 0.0
+        if self._low <= position <= self._high:
+            return position, velocity
+        return min(max(position, self._low), self._high), 0.0
 
 
 def braking(position: float, velocity: float, deceleration: float) -> Profile:
@@ -62,19 +97,9 @@ def braking(position: float, velocity: float, deceleration: float) -> Profile:
     return Profile((piece,), piece.at(piece.duration_s)[0])
 
 
-def trapezoid(
-    position: float, velocity: float, target: float, *, speed: float, acceleration: float, deceleration: float
-) -> Profile:
-    """To rest at a target.
-
-    Args:
-        position: at the start, counts.
-        velocity: at the start, counts/s.
-        target: counts.
-        speed: of the flat part, counts/s, positive.
-        acceleration: counts/s², positive.
-        deceleration: counts/s², positive.
-    """
+def trapezoid(position: float, velocity: float, target: float, rates: Rates) -> Profile:
+    """From a position (counts) and velocity (counts/s) to rest at a target (counts)."""
+    speed, acceleration, deceleration = rates
     pieces: list[Piece] = []
     stop = position + 0.5 * velocity * abs(velocity) / deceleration
     sign = copysign(1.0, target - stop) if target != stop else copysign(1.0, velocity)
@@ -96,121 +121,45 @@ def trapezoid(
     return Profile(tuple(pieces), target)
 
 
-# Endless references: constant velocity, and what a constant torque does to the motor; both end at a fence.
-#
-# Source: CiA 402-2, cyclic synchronous velocity and torque modes; software position limits 607Dh.
+def uniform(position: float, velocity: float) -> Profile:
+    """Constant velocity without an end."""
+    return Profile((Piece(inf, position, velocity, 0.0),), position)
 
 
-class Trajectory(Protocol):
-    """A reference as a function of the time since its start."""
-
-    duration_s: float
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-
-
-class ConstantVelocity:
-    """A straight line without an end."""
-
-    duration_s = inf
-
-    def __init__(self, position: float, velocity: float) -> None:
-        self._position, self._velocity = position, velocity
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        return self._position + self._velocity * t_s, self._velocity
-
-
-class TorqueRun:
-    """Motion under a constant torque, solved exactly; velocity stays within a limit.
+def torque_run(
+    position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
+) -> Profile:
+    """Motion under a constant torque, solved exactly; it has no end, and velocity stays within a limit.
 
     Friction first brings a motor to rest that moves against the torque, then keeps it there unless the torque is
     above the Coulomb torque. Gravity, contact and the other joints do not act, as in the ideal arm.
+
+    Args:
+        position: at the start, counts.
+        velocity: at the start, counts/s; cut to the limit.
+        permille: torque, 1/1000 of the rated torque.
+        dynamics: of the motor.
+        speed_limit: counts/s, may be infinite.
     """
-
-    duration_s = inf
-
-    def __init__(
-        self, position: float, velocity: float, permille: float, dynamics: MotorDynamics, speed_limit: float
-    ) -> None:
-        """Start.
-
-        Args:
-            position: counts.
-            velocity: counts/s; cut to the limit.
-            permille: torque, 1/1000 of the rated torque.
-            dynamics: of the motor.
-            speed_limit: counts/s, may be infinite.
-        """
-        self._torque, self._dynamics, self._limit = permille, dynamics, speed_limit
-        velocity = min(max(velocity, -speed_limit), speed_limit)
-        self._first = self._phase(position, velocity, copysign(1.0, velocity)) if velocity else None
-        rest_s, position = self._first.rest(position) if self._first else (0.0, position)
-        self._turn_s = rest_s
-        self._rest = position
-        moves = abs(permille) > dynamics.coulomb
-        self._second = self._phase(position, 0.0, copysign(1.0, permille)) if moves and rest_s < inf else None
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        if self._first is not None and t_s < self._turn_s:
-            return self._first.at(t_s)
-        if self._second is None:
-            return self._rest, 0.0
-        return self._second.at(t_s - self._turn_s)
-
-    def _phase(self, position: float, velocity: float, sign: float) -> _Phase:
-        gain, coulomb, damping = self._dynamics
-        final = gain * (self._torque - sign * coulomb) / damping
-        return _Phase(position, velocity, final, damping, self._limit)
-
-
-class _Phase:
-    """Velocity from `velocity` towards `final`, exponentially, without a change of sign; cut at the limit."""
-
-    def __init__(self, position: float, velocity: float, final: float, damping: float, limit: float) -> None:
-        self._position, self._velocity, self._final, self._damping = position, velocity, final, damping
-        self._cut_s, self._cut_velocity = inf, 0.0
-        if abs(final) > limit and final * velocity >= 0.0:
-            self._cut_velocity = copysign(limit, final)
-            self._cut_s = log((velocity - final) / (self._cut_velocity - final)) / damping
-
-    def rest(self, position: float) -> tuple[float, float]:
-        """When and where the motor is at rest; (inf, position) if never."""
-        if self._final * self._velocity >= 0.0:
-            return inf, position
-        t_s = log(1.0 - self._velocity / self._final) / self._damping
-        return t_s, self.at(t_s)[0]
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        free = min(t_s, self._cut_s)
-        decay = exp(-self._damping * free)
-        excess = self._velocity - self._final
-        velocity = self._final + excess * decay
-        position = self._position + self._final * free + excess * (1.0 - decay) / self._damping
-        if t_s > self._cut_s:
-            return position + self._cut_velocity * (t_s - self._cut_s), self._cut_velocity
-        return position, velocity
-
-
-class Fenced:
-    """A trajectory whose part outside the software limits is cut off: the motor waits at the limit."""
-
-    def __init__(self, inner: Trajectory, low: float, high: float) -> None:
-        """`low` and `high` in counts, infinite for none; a motor outside already may only come in."""
-        start, _ = inner.at(0.0)
-        self._inner, self._low, self._high = inner, min(low, start), max(high, start)
-        self.duration_s = inner.duration_s
-
-    def at(self, t_s: float) -> tuple[float, float]:
-        """Position (counts) and velocity (counts/s)."""
-        position, velocity = self._inner.at(t_s)
-        if self._low <= position <= self._high:
-            return position, velocity
-        return min(max(position, self._low), self._high), 0.0
+    gain, coulomb, damping = dynamics
+    velocity = min(max(velocity, -speed_limit), speed_limit)
+    pieces: list[Piece | Decay] = []
+    if velocity:
+        final = gain * (permille - copysign(coulomb, velocity)) / damping
+        if final * velocity < 0.0:
+            pieces.append(Decay(log(1.0 - velocity / final) / damping, position, velocity, final, damping))
+            (position, _), velocity = pieces[0].at(pieces[0].duration_s), 0.0
+    if not velocity:
+        if abs(permille) <= coulomb:
+            return Profile((*pieces, Piece(inf, position, 0.0, 0.0)), position)
+        final = gain * (permille - copysign(coulomb, permille)) / damping
+    driven = Decay(inf, position, velocity, final, damping)
+    if abs(final) > speed_limit:
+        limit = copysign(speed_limit, final)
+        driven = driven._replace(duration_s=log((velocity - final) / (limit - final)) / damping)
+        pieces.append(driven)
+        return Profile((*pieces, Piece(inf, driven.at(driven.duration_s)[0], limit, 0.0)), position)
+    return Profile((*pieces, driven), position)
 
 
 # The reference that one drive gives to its axis of the plant: ramps, trajectories, hold, slowing to standstill.
@@ -220,7 +169,10 @@ STANDSTILL_COUNTS = 0.1
 """Motion in one step below which the motor is at rest."""
 PATIENCE_STEPS = 400
 NOTHING_S = 1e-9
-"""Rest of a trajectory that is none."""
+"""Rest of a trajectory below which it has ended."""
+
+Done = Callable[[int], None] | None
+"""Called with the time, ns, when a motion is over."""
 
 
 class AxisPlant(Protocol):
@@ -263,11 +215,11 @@ class Motion:
         self._timer = timers.new(self._step)
         self._start = self._end = 0.0
         self._t0 = self._t1 = 0
-        self._trajectory: Trajectory | None = None
+        self._trajectory: Profile | None = None
         self._begin_ns = 0
         self._patience = 0
         self._was = 0.0
-        self._done: Callable[[int], None] | None = None
+        self._done: Done = None
 
     @property
     def busy(self) -> bool:
@@ -304,7 +256,11 @@ class Motion:
         moving = self._t0 <= t_ns <= self._t1 + STEP_NS // 2
         return (self._end - self._start) / (self._t1 - self._t0) * 1e9 if moving else 0.0
 
-    def follow(self, trajectory: Trajectory, t_ns: int, done: Callable[[int], None] | None = None) -> None:
+    def move(self, target: float, t_ns: int, rates: Rates, done: Done = None) -> None:
+        """Move to `target`, counts, from the present position and speed; as `follow`."""
+        self.follow(trapezoid(self.demand(t_ns), self.speed(t_ns), target, rates), t_ns, done)
+
+    def follow(self, trajectory: Profile, t_ns: int, done: Done = None) -> None:
         """Follow a trajectory from now on; `done(t_ns)` when the motor is at rest behind its end."""
         self._trajectory, self._begin_ns, self._done = trajectory, t_ns, done
         self._patience, self._was = PATIENCE_STEPS, inf
@@ -313,7 +269,7 @@ class Motion:
             self._ramp(here, here, t_ns, t_ns + STEP_NS)
         self._step(t_ns)
 
-    def decelerate(self, t_ns: int, rate: float, done: Callable[[int], None] | None = None) -> None:
+    def decelerate(self, t_ns: int, rate: float, done: Done = None) -> None:
         """Slow the reference down by `rate` counts/s² and call `done(t_ns)` at standstill, one step from now or later.
 
         Standstill is the motor's, not the reference's: it is waited for, a second at most. A rate of 0 stops the
@@ -371,11 +327,11 @@ class Motion:
 
 # An axis for a drive that has no plant: the motor is exactly where its reference is.
 #
-# Nothing loads it: there is no torque, and a following error never arises. Only a drive that controls torque asks how
-# the motor would answer to it; it is told an inertia and a viscous damping, without Coulomb friction.
+# Nothing loads it: there is no torque, and a following error never arises. To the torque of a drive it answers as an
+# inertia with viscous damping, without Coulomb friction.
 
 
-class IdealAxis:
+class IdealAxis(AxisPlant):
     """Follows straight references without a lag. The axis number that calls carry means nothing here."""
 
     def __init__(self) -> None:
@@ -383,11 +339,9 @@ class IdealAxis:
         self._t0 = self._t1 = self._now = 0
 
     def advance(self, t_ns: int) -> None:
-        """Time has come to `t_ns`."""
         self._now = max(self._now, t_ns)
 
     def motor_counts(self, axis: int) -> float:
-        """Position, counts."""
         if self._now >= self._t1:
             return self._end
         return self._start + (self._end - self._start) * max(0, self._now - self._t0) / (self._t1 - self._t0)
@@ -397,12 +351,11 @@ class IdealAxis:
         return 0
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
-        """Of a motor of its own: from rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
+        """From rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""
         return MotorDynamics(gain=1000.0, coulomb=0.0, damping=1.0)
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Nothing: there is no loop and no torque."""
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
-        """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
         self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns

@@ -1,8 +1,8 @@
 """A CiA 301 node without I/O: object dictionary, SDO, PDO, SYNC, EMCY, error control, LSS and storage.
 
 `slave_node.SlaveNode` has one method for what comes in (`receive(can_id, data, t)`) and one for time (`advance(t)`);
-both return frames to send, and the node says when it wants to be called next. It puts the services together; each has
-its state in `core`, which they share: identity, NMT state, time, timers, dictionary, application.
+both return frames to send, and `next_deadline_ns` is when `advance` has to be called. It puts the services together;
+they share `core`: identity, NMT state, time, timers, dictionary.
 
 - `dictionary` keeps values and makes every check that an access over the bus must pass, with the abort codes of CiA
   301.
@@ -10,6 +10,6 @@ its state in `core`, which they share: identity, NMT state, time, timers, dictio
 - `pdo_engine` and `rpdo_tpdo` route PDOs, hold parameters and mapping rules, events, inhibit times and SYNC.
 - `error_control` is heartbeat, guarding and emergencies; `lss_slave` node ids and stored parameters.
 
-An application (`canprobe.emulator.drive`, `canprobe.emulator.array`) hooks onto entries of the dictionary and is told
-of SYNC.
+An application (`canprobe.emulator.drive`, `canprobe.emulator.array`) hooks onto entries of the dictionary and gets
+every SYNC.
 """

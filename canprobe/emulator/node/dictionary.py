@@ -63,6 +63,10 @@ class SdoAbort(ProtocolError):  # noqa: N818 - the standard's word
         super().__init__(f"{code.name.lower().replace('_', ' ')} ({code:08X}h)")
 
 
+def nothing(*_: object) -> None:
+    """Does nothing: what a callback is until somebody sets it."""
+
+
 # One entry of the object dictionary: its type, its rights, its limits, and the bytes of a value.
 #
 # Source: CiA 301, "Data type entry usage" and "Object dictionary", EDS keywords of CiA 306.
@@ -119,12 +123,16 @@ class Entry:
         """Bytes on the wire → value. Raises SdoAbort when the length is not the object's."""
         if not self.bits:
             return bytes(data)
-        if len(data) * 8 != self.bits:
-            raise SdoAbort(Abort.TOO_LONG if len(data) * 8 > self.bits else Abort.TOO_SHORT)
+        self.check_size(len(data))
         if self.real:
             number: float = struct.unpack(self.real, data)[0]
             return number
         return int.from_bytes(data, "little", signed=self.signed)
+
+    def check_size(self, size: int) -> None:
+        """Raises SdoAbort when a value of a fixed size has another size than `size` bytes."""
+        if self.bits and size * 8 != self.bits:
+            raise SdoAbort(Abort.TOO_LONG if size * 8 > self.bits else Abort.TOO_SHORT)
 
     def check_limits(self, value: Value) -> None:
         """Raises SdoAbort when the value is outside the EDS's limits."""
@@ -191,7 +199,7 @@ class Dictionary:
         values: present values by key; cyclic code reads and writes here directly.
         written: called with the keys of values that were stored together: one over SDO, or those of an RPDO that are
             `watched`.
-        watched: keys of which `written` has to be told when an RPDO brings them.
+        watched: keys of which `written` is called when an RPDO brings them.
         configured: called with the index after a value was stored over SDO.
     """
 
@@ -203,9 +211,9 @@ class Dictionary:
         self._checks: dict[int, list[Check]] = {}
         self._hooks: dict[int, list[Hook]] = {}
         self._refreshers: dict[int, Callable[[int], None]] = {}
-        self.written: Callable[[Sequence[int]], None] = _nothing
+        self.written: Callable[[Sequence[int]], None] = nothing
         self.watched: Container[int] = ()
-        self.configured: Callable[[int], None] = _nothing
+        self.configured: Callable[[int], None] = nothing
         self.restore(self.entries)
 
     def restore(self, keys: Iterable[int]) -> None:
@@ -232,6 +240,11 @@ class Dictionary:
         """Whether any entry of that index exists."""
         return index in self._indices
 
+    def has_named(self, index: int, name: str) -> bool:
+        """Whether the EDS has an object with this name there; of another maker a manufacturer's index is another's."""
+        entry = self.entries.get(key_of(index))
+        return entry is not None and entry.name == name
+
     def number(self, index: int, subindex: int = 0, default: int = 0) -> int:
         """An integer value, or `default` where the EDS has no such entry."""
         value = self.values.get(key_of(index, subindex), default)
@@ -250,6 +263,11 @@ class Dictionary:
     def on_write(self, index: int, hook: Hook) -> None:
         """`hook(subindex, value)` after a value of `index` was stored over SDO or RPDO."""
         self._hooks.setdefault(index, []).append(hook)
+
+    def on_change(self, act: Callable[[], None], *indices: int) -> None:
+        """`act()` after a value of one of the indices was stored over SDO or RPDO."""
+        for index in indices:
+            self.on_write(index, lambda _subindex, _value: act())
 
     def on_read(self, index: int, refresh: Callable[[int], None]) -> None:
         """`refresh(subindex)` before a value of `index` is read over SDO; it may raise SdoAbort."""
@@ -299,7 +317,3 @@ class Dictionary:
         for hook in self._hooks.get(index, ()):
             hook(subindex, value)
         self.written((entry.key,))
-
-
-def _nothing(key: object) -> None:
-    return None

@@ -1,4 +1,4 @@
-"""Heartbeat, node guarding and emergencies: how a node says that it is well, and that it is not.
+"""Heartbeat, node guarding and emergencies: how a node reports that it is well, and that it is not.
 
 Source: CiA 301, "Error control services", objects 1016h and 1017h.
 """
@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Hashable, Mapping
+from functools import partial
 
-from canprobe.emulator.node.core import NO_ROUTES, NodeCore, Route, Timer
+from canprobe.emulator.node.core import INVALID, NO_ROUTES, NodeCore, Route, Service, Timer, check_cob_id
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value
 from canprobe.protocol.frames import (
     HEARTBEAT_BASE,
@@ -17,7 +18,6 @@ from canprobe.protocol.frames import (
     RTR_FLAG,
     Emcy,
     NmtState,
-    is_restricted,
     pack_heartbeat,
 )
 
@@ -25,7 +25,6 @@ from canprobe.protocol.frames import (
 #
 # Source: CiA 301, "Emergency object", objects 1001h, 1003h, 1014h, 1015h.
 
-INVALID = 1 << 31
 _GENERIC = 0x01
 # Bits of 1001h by the first nibble of the code: current, voltage, temperature, communication/profile, manufacturer.
 _REGISTER_BITS = {0x2: 0x02, 0x3: 0x04, 0x4: 0x08, 0x7: 0x80, 0xF: 0x80}
@@ -43,8 +42,8 @@ _MOST_WAITING = 16
 """Messages kept while the inhibit time runs; of a flood the oldest go."""
 
 
-class Emergency:
-    """Reports errors once, tells when they are gone, and remembers them.
+class Emergency(Service):
+    """Reports errors once, and when they are gone, and remembers them.
 
     Attributes:
         any: whether any error is present.
@@ -69,13 +68,6 @@ class Emergency:
         self._waiting.clear()
         self._timer.cancel()
         self._show()
-
-    def entered(self, t_ns: int) -> None:
-        """Nothing: errors of the stopped state stay in the history only."""
-
-    def routes(self) -> Mapping[int, Route]:
-        """A producer listens to nothing."""
-        return NO_ROUTES
 
     @property
     def active(self) -> frozenset[int]:
@@ -138,7 +130,7 @@ class Emergency:
     def _show(self) -> None:
         dictionary = self._core.dictionary
         self.any = bool(self._active)
-        dictionary.put(0x1001, 0, self._register() if self._active else 0)
+        dictionary.put(0x1001, 0, self._register())
         del self._history[self._room :]
         dictionary.put(0x1003, 0, len(self._history))
 
@@ -158,81 +150,66 @@ class Emergency:
             raise SdoAbort(Abort.VALUE)
 
     def _check_cob_id(self, subindex: int, value: Value) -> None:
-        new, old = int(value), self._core.dictionary.number(0x1014)
-        changed_while_valid = not (new | old) & INVALID and (new ^ old) & 0x7FF
-        if new & 0x7FFFF800 or changed_while_valid or (not new & INVALID and is_restricted(new & 0x7FF)):
-            raise SdoAbort(Abort.VALUE)
+        check_cob_id(value, self._core.dictionary.number(0x1014), reserved=0x7FFFF800)
 
 
 # Heartbeat producer and consumer.
 
 
-class HeartbeatProducer:
-    """Tells the NMT state every 1017h milliseconds, and at once when it changes or 1017h is written."""
+class HeartbeatProducer(Service):
+    """Reports the NMT state every 1017h milliseconds, and at once when it changes or 1017h is written."""
 
     def __init__(self, core: NodeCore) -> None:
         self._core = core
         self._timer = core.timers.new(self._due)
-        self._period_ns = 0
         core.dictionary.on_write(0x1017, lambda _sub, _value: self._begin(core.now_ns))
 
     def reset(self, t_ns: int) -> None:
-        """The boot-up message stands for the first heartbeat."""
-        self._period_ns = self._core.dictionary.number(0x1017) * 1_000_000
+        """Silent until `boot_up`."""
         self._timer.cancel()
 
     def entered(self, t_ns: int) -> None:
-        """Boot-up out of initialisation, else a heartbeat with the new state."""
+        """A heartbeat with the new state."""
         self._begin(t_ns)
 
     def boot_up(self, t_ns: int) -> None:
         """Send the boot-up message, which is the first heartbeat."""
         self._core.send(*pack_heartbeat(self._core.node_id, NmtState.INITIALISING))
-        if self._period_ns:
-            self._timer.arm(t_ns + self._period_ns)
+        if self._period_ns():
+            self._timer.arm(t_ns + self._period_ns())
 
-    def routes(self) -> Mapping[int, Route]:
-        """A producer listens to nothing."""
-        return NO_ROUTES
+    def _period_ns(self) -> int:
+        return self._core.dictionary.number(0x1017) * 1_000_000
 
     def _begin(self, t_ns: int) -> None:
-        self._period_ns = self._core.dictionary.number(0x1017) * 1_000_000
         self._timer.cancel()
-        if self._period_ns:
-            self._beat()
-            self._timer.arm(t_ns + self._period_ns)
-
-    def _beat(self) -> None:
-        self._core.send(*pack_heartbeat(self._core.node_id, self._core.state))
+        if self._period_ns():
+            self._due(t_ns)
 
     def _due(self, due_ns: int) -> None:
-        self._beat()
-        self._timer.arm_next(due_ns, self._period_ns)
+        self._core.send(*pack_heartbeat(self._core.node_id, self._core.state))
+        self._timer.arm_next(due_ns, self._period_ns())
 
 
-class HeartbeatConsumer:
+class HeartbeatConsumer(Service):
     """Watches the producers of 1016h, each from its first heartbeat on."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
         """`on_loss(t_ns)` is called when a producer is lost."""
         self._core, self._emcy, self._on_loss = core, emcy, on_loss
-        self._timers: dict[int, Timer] = {}
-        self._periods: dict[int, int] = {}
+        self._watched: dict[int, tuple[Timer, int]] = {}  # by node id: its timer, its period in ns
         core.dictionary.on_check(0x1016, self._check)
-        core.dictionary.on_write(0x1016, lambda _sub, _value: self._configure())
+        core.dictionary.on_change(self._configure, 0x1016)
 
     def reset(self, t_ns: int) -> None:
         """Read 1016h; nobody has been heard."""
         self._configure()
 
-    def entered(self, t_ns: int) -> None:
-        """Error control runs in every state."""
-
     def routes(self) -> Mapping[int, Route]:
         """Heartbeat identifiers of the producers watched."""
         if self._core.state is NmtState.INITIALISING:
             return NO_ROUTES
-        return {HEARTBEAT_BASE + node_id: self._heard(node_id) for node_id in self._periods}
+        return {HEARTBEAT_BASE + node_id: partial(self._heard, node_id) for node_id in self._watched}
 
     def _entries(self) -> dict[int, tuple[int, int]]:
         """Subindex → (node id, period in ms) of the entries in use."""
@@ -244,32 +221,25 @@ class HeartbeatConsumer:
         return found
 
     def _configure(self) -> None:
-        periods = {node_id: period * 1_000_000 for node_id, period in self._entries().values()}
-        for node_id, timer in self._timers.items():
+        for node_id, (timer, _) in self._watched.items():
             timer.cancel()
             self._emcy.clear(HEARTBEAT_LOST, node_id)
-        self._periods = periods
-        self._timers = {node_id: self._core.timers.new(self._timed_out(node_id)) for node_id in periods}
+        self._watched = {
+            node_id: (self._core.timers.new(partial(self._timed_out, node_id)), period * 1_000_000)
+            for node_id, period in self._entries().values()
+        }
         self._core.reroute()
 
-    def _heard(self, node_id: int) -> Route:
-        timer, period = self._timers[node_id], self._periods[node_id]
-
-        def heard(data: bytes, t_ns: int) -> None:
-            if len(data) != 1:
-                return
-            timer.arm(t_ns + period)
+    def _heard(self, node_id: int, data: bytes, t_ns: int) -> None:
+        if len(data) == 1:
+            timer, period_ns = self._watched[node_id]
+            timer.arm(t_ns + period_ns)
             if self._emcy.any:
                 self._emcy.clear(HEARTBEAT_LOST, node_id)
 
-        return heard
-
-    def _timed_out(self, node_id: int) -> Callable[[int], None]:
-        def timed_out(due_ns: int) -> None:
-            self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
-            self._on_loss(due_ns)
-
-        return timed_out
+    def _timed_out(self, node_id: int, due_ns: int) -> None:
+        self._emcy.report(HEARTBEAT_LOST, bytes((node_id,)), source=node_id)
+        self._on_loss(due_ns)
 
     def _check(self, subindex: int, value: Value) -> None:
         node_id, period = int(value) >> 16 & 0xFF, int(value) & 0xFFFF
@@ -284,11 +254,11 @@ class HeartbeatConsumer:
 #
 # Source: CiA 301, "Node guarding protocol", "Life guarding", objects 100Ch and 100Dh; error 8130h.
 
-_MASTER = 0  # whoever guards this node: the protocol does not tell its id
+_MASTER = 0  # whoever guards this node: the protocol does not carry its id
 _TOGGLE = 0x80
 
 
-class NodeGuarding:
+class NodeGuarding(Service):
     """Answers remote requests with toggle bit and state, and watches them from the first on, while 1017h is 0."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_loss: Callable[[int], None]) -> None:
@@ -297,16 +267,12 @@ class NodeGuarding:
         self._timer = core.timers.new(self._timed_out)
         self._toggle = self._life_ns = 0
         self._heartbeat = False
-        for index in (0x100C, 0x100D, 0x1017):
-            core.dictionary.on_write(index, lambda _sub, _value: self._configure())
+        core.dictionary.on_change(self._configure, 0x100C, 0x100D, 0x1017)
 
     def reset(self, t_ns: int) -> None:
         """The first answer after a boot-up has the toggle bit 0."""
         self._toggle = 0
         self._configure()
-
-    def entered(self, t_ns: int) -> None:
-        """Guarding goes on in every state."""
 
     def routes(self) -> Mapping[int, Route]:
         """The remote request for this node's error control identifier."""

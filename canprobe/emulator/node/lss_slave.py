@@ -9,10 +9,9 @@ Source: CiA 305, "LSS slave", "LSS services".
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from enum import Enum
 
-from canprobe.emulator.node.core import NO_ROUTES, Application, NodeCore, Route
-from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value
+from canprobe.emulator.node.core import NodeCore, Route, Service
+from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, nothing
 from canprobe.protocol.frames import (
     BIT_RATES,
     LSS_ANSWER_ID,
@@ -35,14 +34,6 @@ from canprobe.protocol.frames import (
 SELECT = range(LssCommand.SELECT_VENDOR, LssCommand.SELECT_SERIAL + 1)
 IDENTIFY = range(LssCommand.IDENTIFY_VENDOR, LssCommand.IDENTIFY_SERIAL_HIGH + 1)
 _MASK = 0xFFFFFFFF
-
-
-class Match(Enum):
-    """What a question of fastscan means to this slave."""
-
-    NO = 0
-    YES = 1
-    FOUND = 2  # the whole address: it is selected
 
 
 class LssSearch:
@@ -73,19 +64,19 @@ class LssSearch:
             and serial_low <= mine.serial_number <= serial_high
         )
 
-    def fastscan(self, data: bytes, mine: LssAddress) -> Match:
-        """The bits of one number from the asked one upwards."""
+    def fastscan(self, data: bytes, mine: LssAddress) -> tuple[bool, bool]:
+        """The bits of one number from the asked one upwards: whether they are mine, and with them the whole address."""
         bit, position, following = data[5:]
         if not (bit < 32 or bit == NOTHING_ASKED) or position > 3 or following > 3:
-            return Match.NO
+            return False, False
         if bit == NOTHING_ASKED:
             self._position = 0
-            return Match.YES
+            return True, False
         asked = _MASK << bit & _MASK
         if position != self._position or (_number_in(data) ^ mine.numbers[position]) & asked:
-            return Match.NO
+            return False, False
         self._position = following
-        return Match.FOUND if bit == 0 and following < position else Match.YES
+        return True, bit == 0 and following < position
 
     def _complete(self, data: bytes, sequence: range) -> list[int]:
         """Take one number of a sequence; all of them where it is the last one and none was left out, else nothing."""
@@ -129,28 +120,18 @@ class Store:
         changed: called after every "save" and "load"; it may raise SdoAbort, then nothing has changed.
     """
 
-    def __init__(self, core: NodeCore, application: Application) -> None:
-        self._core, self._application = core, application
+    def __init__(self, core: NodeCore, keep: Callable[[], bytes]) -> None:
+        """`keep()` returns what "save" stores of the application beside the dictionary."""
+        self._core, self._keep = core, keep
         self.saved: dict[int, Value] = {}
         self.kept = b""
         self.node_id: int | None = None
-        self.changed: Callable[[], None] = _nothing
+        self.changed: Callable[[], None] = nothing
         self.volatile: set[int] = set()
         core.dictionary.configured = self._unverify
-        core.dictionary.on_check(0x1010, self._save)
-        core.dictionary.on_check(0x1011, self._load)
-        core.dictionary.on_write(0x1010, self._show)
-        core.dictionary.on_write(0x1011, self._show)
-
-    def reset(self, t_ns: int) -> None:
-        """Nothing: the node calls `recall`."""
-
-    def entered(self, t_ns: int) -> None:
-        """Nothing."""
-
-    def routes(self) -> Mapping[int, Route]:
-        """Listens to nothing."""
-        return NO_ROUTES
+        for index, act in ((0x1010, self._save), (0x1011, self._load)):
+            core.dictionary.on_check(index, act)
+            core.dictionary.on_write(index, self._show)
 
     def recall(self, communication_only: bool) -> None:
         """Defaults of the EDS, then what was stored; all of it, or the communication area alone."""
@@ -163,12 +144,7 @@ class Store:
 
     def keep_node_id(self, node_id: int) -> None:
         """Store a node id (LSS store configuration). Raises SdoAbort when it could not be written."""
-        before, self.node_id = self.node_id, node_id
-        try:
-            self.changed()
-        except SdoAbort:
-            self.node_id = before
-            raise
+        self._replace(self.saved, self.kept, node_id)
 
     def _save(self, subindex: int, value: Value) -> None:
         if value != SAVE or subindex not in _GROUPS:
@@ -178,25 +154,25 @@ class Store:
         for key, entry in dictionary.entries.items():
             if entry.writable and entry.readable and key >> 8 in _GROUPS[subindex] and key >> 8 not in skip:
                 saved[key] = dictionary.values[key]
-        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._application.keep())
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else self._keep(), self.node_id)
 
     def _load(self, subindex: int, value: Value) -> None:
         if value != LOAD or subindex not in _GROUPS:
             raise SdoAbort(Abort.CANNOT_STORE)
         saved = {key: kept for key, kept in self.saved.items() if key >> 8 not in _GROUPS[subindex]}
-        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"")
+        self._replace(saved, self.kept if subindex == _COMMUNICATION_ONLY else b"", self.node_id)
 
-    def _replace(self, saved: dict[int, Value], kept: bytes) -> None:
-        before = self.saved, self.kept
-        self.saved, self.kept = saved, kept
+    def _replace(self, saved: dict[int, Value], kept: bytes, node_id: int | None) -> None:
+        before = self.saved, self.kept, self.node_id
+        self.saved, self.kept, self.node_id = saved, kept, node_id
         try:
             self.changed()
         except SdoAbort:
-            self.saved, self.kept = before
+            self.saved, self.kept, self.node_id = before
             raise
 
     def _unverify(self, index: int) -> None:
-        """Another value came over SDO: what 1020h says of the configuration is no longer true."""
+        """Another value came over SDO: 1020h no longer identifies the configuration."""
         if index == _VERIFY or index in _NEVER or index in self.volatile:
             return
         for subindex in (1, 2):
@@ -208,17 +184,12 @@ class Store:
                 self._core.dictionary.put(index, sub, 1)
 
 
-def _nothing() -> None:
-    return None
-
-
 # LSS slave: the node gets its id over the bus. Without one it stays in initialisation and hears LSS alone.
 
-Answer = bytes | None
 _INQUIRE = range(LssCommand.INQUIRE_VENDOR, LssCommand.INQUIRE_SERIAL + 1)
 
 
-class LssSlave:
+class LssSlave(Service):
     """The LSS service of one node.
 
     Args:
@@ -238,21 +209,6 @@ class LssSlave:
         self.pending = core.node_id
         self.state = LssState.WAITING
         self._search = LssSearch()
-        self._in_both_states: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.IDENTIFY_UNCONFIGURED: self._identify_unconfigured,
-            **dict.fromkeys(IDENTIFY, self._identify),
-        }
-        self._in_waiting: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.FASTSCAN: self._fastscan,
-            **dict.fromkeys(SELECT, self._select),
-        }
-        self._in_configuration: dict[int, Callable[[bytes], Answer]] = {
-            LssCommand.CONFIGURE_NODE_ID: self._configure_node_id,
-            LssCommand.CONFIGURE_BIT_TIMING: self._configure_bit_timing,
-            LssCommand.STORE: self._store_configuration,
-            LssCommand.INQUIRE_NODE_ID: self._inquire_node_id,
-            **dict.fromkeys(_INQUIRE, self._inquire),
-        }
 
     @property
     def address(self) -> LssAddress:
@@ -273,11 +229,8 @@ class LssSlave:
         """Back to waiting, nothing heard."""
         self._enter(LssState.WAITING)
 
-    def entered(self, t_ns: int) -> None:
-        """LSS works in every NMT state."""
-
     def routes(self) -> Mapping[int, Route]:
-        """The LSS master's messages."""
+        """The LSS master's messages, in every NMT state."""
         return {LSS_REQUEST_ID: self._receive}
 
     def _receive(self, data: bytes, t_ns: int) -> None:
@@ -286,9 +239,9 @@ class LssSlave:
         if data[0] == LssCommand.SWITCH_GLOBAL:
             self._switch(data[1], t_ns)
             return
-        in_state = self._in_configuration if self.state is LssState.CONFIGURATION else self._in_waiting
-        act = self._in_both_states.get(data[0]) or in_state.get(data[0])
-        answer = act(data) if act is not None else None
+        answer = self._searched(data)
+        if answer is None and self.state is LssState.CONFIGURATION:
+            answer = self._configured(data)
         if answer is not None:
             self._core.send(LSS_ANSWER_ID, answer)
 
@@ -304,58 +257,44 @@ class LssSlave:
         self.state = state
         self._search.forget()
 
-    # ------------------------------------------------------------------ being found
-
-    @property
-    def _is_blank(self) -> bool:
-        """It has no id and was not given one yet: the searches are for such nodes alone."""
-        return self.unconfigured and self.pending == UNCONFIGURED
-
-    def _select(self, data: bytes) -> Answer:
-        if not self._search.selects(data, self.address):
-            return None
-        self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.SELECTED)
-
-    def _identify(self, data: bytes) -> Answer:
-        return pack_lss(LssCommand.IDENTIFIED) if self._search.identifies(data, self.address) else None
-
-    def _identify_unconfigured(self, _: bytes) -> Answer:
-        return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED) if self._is_blank else None
-
-    def _fastscan(self, data: bytes) -> Answer:
-        match = self._search.fastscan(data, self.address) if self._is_blank else Match.NO
-        if match is Match.FOUND:
+    def _searched(self, data: bytes) -> bytes | None:
+        """Answer the questions by which a master finds the slave; fastscan is for slaves without an id alone."""
+        command, waits = data[0], self.state is LssState.WAITING
+        blank = self.unconfigured and self.pending == UNCONFIGURED  # no id, and it was not given one yet
+        if command in IDENTIFY and self._search.identifies(data, self.address):
+            return pack_lss(LssCommand.IDENTIFIED)
+        if command == LssCommand.IDENTIFY_UNCONFIGURED and blank:
+            return pack_lss(LssCommand.IDENTIFIED_UNCONFIGURED)
+        if waits and command in SELECT and self._search.selects(data, self.address):
             self._enter(LssState.CONFIGURATION)
-        return pack_lss(LssCommand.IDENTIFIED) if match is not Match.NO else None
+            return pack_lss(LssCommand.SELECTED)
+        if waits and command == LssCommand.FASTSCAN and blank:
+            matches, found = self._search.fastscan(data, self.address)
+            if found:
+                self._enter(LssState.CONFIGURATION)
+            return pack_lss(LssCommand.IDENTIFIED) if matches else None
+        return None
 
-    # ------------------------------------------------------------------ being configured
-
-    def _configure_node_id(self, data: bytes) -> Answer:
-        fits = 1 <= data[1] <= 127 or data[1] == UNCONFIGURED
-        if fits:
-            self.pending = data[1]
-        return _verdict(LssCommand.CONFIGURE_NODE_ID, LssError.NONE if fits else LssError.REFUSED)
-
-    def _configure_bit_timing(self, data: bytes) -> Answer:
-        same = data[1] == 0 and BIT_RATES.get(data[2]) == self.bitrate
-        return _verdict(LssCommand.CONFIGURE_BIT_TIMING, LssError.NONE if same else LssError.REFUSED)
-
-    def _store_configuration(self, _: bytes) -> Answer:
-        try:
-            self._store.keep_node_id(self.pending)
-        except SdoAbort:
-            return _verdict(LssCommand.STORE, LssError.STORE_FAILED)
-        return _verdict(LssCommand.STORE, LssError.NONE)
-
-    def _inquire(self, data: bytes) -> Answer:
-        return pack_number(LssCommand(data[0]), self.address.numbers[data[0] - _INQUIRE[0]])
-
-    def _inquire_node_id(self, _: bytes) -> Answer:
-        """The active id; in initialisation the pending one, which is about to be."""
-        node_id = self.pending if self.unconfigured else self._core.node_id
-        return pack_lss(LssCommand.INQUIRE_NODE_ID, bytes((node_id,)))
-
-
-def _verdict(command: LssCommand, error: LssError) -> bytes:
-    return pack_lss(command, bytes((error,)))
+    def _configured(self, data: bytes) -> bytes | None:
+        """Answer what a master asks and orders in configuration state."""
+        command, error = data[0], LssError.NONE
+        if command in _INQUIRE:
+            return pack_number(LssCommand(command), self.address.numbers[command - _INQUIRE[0]])
+        if command == LssCommand.INQUIRE_NODE_ID:  # in initialisation the pending one, which is about to be active
+            return pack_lss(LssCommand(command), bytes((self.pending if self.unconfigured else self._core.node_id,)))
+        if command == LssCommand.CONFIGURE_NODE_ID:
+            if 1 <= data[1] <= 127 or data[1] == UNCONFIGURED:
+                self.pending = data[1]
+            else:
+                error = LssError.REFUSED
+        elif command == LssCommand.CONFIGURE_BIT_TIMING:
+            if data[1] != 0 or BIT_RATES.get(data[2]) != self.bitrate:
+                error = LssError.REFUSED
+        elif command == LssCommand.STORE:
+            try:
+                self._store.keep_node_id(self.pending)
+            except SdoAbort:
+                error = LssError.STORE_FAILED
+        else:
+            return None
+        return pack_lss(LssCommand(command), bytes((error,)))

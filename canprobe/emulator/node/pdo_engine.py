@@ -10,13 +10,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Mapping, Sequence
 
-from canprobe.emulator.node.core import NO_ROUTES, Application, NodeCore, Route
+from canprobe.emulator.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
-from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Tpdo
+from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
 from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, NmtState, is_restricted
-
-Sampler = Callable[[int], None]
 
 
 class _Group:
@@ -27,8 +25,6 @@ class _Group:
         packing: how each is then packed.
     """
 
-    __slots__ = ("every", "first", "packing", "samplers", "start", "tpdos")
-
     def __init__(self, every: int, start: int) -> None:
         self.every, self.start = every, start
         self.first: int | None = None
@@ -37,11 +33,17 @@ class _Group:
         self.packing: list[Packing] = []
 
 
-class PdoEngine:
-    """The PDOs of one node."""
+class PdoEngine(Service):
+    """The PDOs of one node.
 
-    def __init__(self, core: NodeCore, emcy: Emergency, application: Application) -> None:
-        self._core, self._application = core, application
+    Args:
+        core: of the node.
+        emcy: reports what is wrong with an RPDO.
+        on_sync: `on_sync(t_ns, counter)` at a SYNC in operational, before the TPDOs are packed.
+    """
+
+    def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int], None]) -> None:
+        self._core, self._on_sync = core, on_sync
         self._samplers: dict[int, Sampler] = {}
         self._rpdos: list[Rpdo] = []
         self._tpdos: list[Tpdo] = []
@@ -58,7 +60,7 @@ class PdoEngine:
             self._tpdos.append(tpdo := Tpdo(core, rules))
             self._watch(rules, tpdo)
         core.dictionary.written = self._written
-        core.dictionary.on_write(0x1007, lambda _sub, _value: self._rebuild())
+        core.dictionary.on_change(self._rebuild, 0x1007)
 
     def _watch(self, rules: PdoRules, pdo: Rpdo | Tpdo) -> None:
         def reconfigure(subindex: int, value: Value) -> None:
@@ -148,7 +150,7 @@ class PdoEngine:
         Args:
             t_ns: its time.
             counter: its counter, 0 without one.
-            elapsed: SYNCs since the last one heard, lost ones included (the counter tells).
+            elapsed: SYNCs since the last one heard; the counter shows the lost ones, which are included.
         """
         core = self._core
         self._sync_ns = t_ns
@@ -156,7 +158,7 @@ class PdoEngine:
         for rpdo in self._waiting:
             if rpdo.pending is not None:
                 rpdo.apply(rpdo.pending)
-        self._application.sync(t_ns, counter)
+        self._on_sync(t_ns, counter)
         for group in self._groups:
             if group.first is None and counter == group.start:
                 group.first = count
@@ -168,13 +170,12 @@ class PdoEngine:
                     core.out += [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
                 except (struct.error, TypeError):
                     for tpdo in group.tpdos:
-                        tpdo.send()  # the one with the value that does not fit says so
+                        tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
-                tpdo.before(t_ns)
-                tpdo.send()
+                tpdo.send(t_ns)
 
     def _rebuild(self) -> None:
         dictionary = self._core.dictionary
@@ -191,7 +192,7 @@ class PdoEngine:
                 key = tpdo.type, tpdo.start if counted else 0
                 groups.setdefault(key, _Group(*key)).tpdos.append(tpdo)
             else:
-                tpdo.before = _all(self._samplers_of([tpdo]))
+                tpdo.samplers = self._samplers_of([tpdo])
         phases = {(group.every, group.start): group.first for group in self._groups}
         self._groups = list(groups.values())
         for group in self._groups:  # a PDO that is written to in operational does not shift the phase of the others
@@ -220,14 +221,6 @@ def _both(first: Route | None, second: Route) -> Route:
     return route
 
 
-def _all(samplers: list[Sampler]) -> Sampler:
-    def sample(t_ns: int) -> None:
-        for sampler in samplers:
-            sampler(t_ns)
-
-    return sample
-
-
 # SYNC consumer: length, counter, lost SYNCs, and the time-out of the communication cycle period.
 #
 # Source: CiA 301, "Synchronization object (SYNC)", objects 1005h, 1006h, 1019h; errors 8100h, 8240h.
@@ -236,7 +229,7 @@ _PRODUCER = 1 << 30
 _HEARD = frozenset({NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL})
 
 
-class SyncConsumer:
+class SyncConsumer(Service):
     """Hears SYNC and passes it to the PDOs as `on_sync(t_ns, counter, elapsed)` in operational."""
 
     def __init__(self, core: NodeCore, emcy: Emergency, on_sync: Callable[[int, int, int], None]) -> None:
@@ -248,8 +241,7 @@ class SyncConsumer:
         dictionary.on_check(0x1005, self._check_cob_id)
         dictionary.on_check(0x1019, self._check_overflow)
         dictionary.on_write(0x1005, lambda _sub, _value: core.reroute())
-        dictionary.on_write(0x1006, lambda _sub, _value: self._configure())
-        dictionary.on_write(0x1019, lambda _sub, _value: self._configure())
+        dictionary.on_change(self._configure, 0x1006, 0x1019)
 
     def reset(self, t_ns: int) -> None:
         """Read the parameters."""

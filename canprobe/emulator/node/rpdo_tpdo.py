@@ -5,26 +5,23 @@ Source: CiA 301, objects 1400h–1BFFh (RPDO and TPDO communication and mapping 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import Any
 
 from canprobe.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
-from canprobe.emulator.node.core import NodeCore
-from canprobe.emulator.node.dictionary import Abort, Dictionary, Entry, SdoAbort, Slot, Value, key_of
+from canprobe.emulator.node.core import INVALID, NodeCore, check_cob_id
+from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Slot, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
-from canprobe.protocol.frames import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT, RTR_FLAG, is_restricted
+from canprobe.protocol.frames import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT, RTR_FLAG
 from canprobe.protocol.pdo import FD_MAX_BITS, MAX_BITS, PdoEntry, PdoLayout
 
 # What may be written to PDO communication and mapping parameters, and when.
 
-INVALID = 1 << 31
 COB_ID, TYPE, INHIBIT, EVENT, START = 1, 2, 3, 5, 6
-_UNUSED_BITS = 0x3FFFF800  # reserved, 29-bit frame, upper 18 bits of its identifier
 _RESERVED_RPDO = range(0xF1, 0xFE)
 _RESERVED_TPDO = range(0xF1, 0xFC)
-DUMMIES = range(0x0001, 0x0008)
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,14 +47,14 @@ class PdoRules:
     @property
     def long(self) -> bool:
         """Whether PDOs of up to 64 bytes were switched on, in a device that has them."""
-        entry = self.dictionary.entries.get(key_of(LONG_PDOS, 0)) if self.transmits else None
-        return entry is not None and entry.name == LONG_PDOS_NAME and bool(self.dictionary.number(LONG_PDOS))
+        dictionary = self.dictionary
+        return self.transmits and dictionary.has_named(LONG_PDOS, LONG_PDOS_NAME) and bool(dictionary.number(LONG_PDOS))
 
     def check_communication(self, subindex: int, value: Value) -> None:
         """Raises SdoAbort for a value that the standard forbids now."""
         new, old = int(value), self.dictionary.number(self.communication, subindex)
         if subindex == COB_ID:
-            self._check_cob_id(new, old)
+            check_cob_id(new, old)
         elif subindex == TYPE:
             if new in (_RESERVED_TPDO if self.transmits else _RESERVED_RPDO):
                 raise SdoAbort(Abort.VALUE)
@@ -65,13 +62,6 @@ class PdoRules:
             too_big = subindex == START and new > 240
             if too_big or (self.valid and new != old):
                 raise SdoAbort(Abort.VALUE)
-
-    def _check_cob_id(self, new: int, old: int) -> None:
-        stays_valid = not (new | old) & INVALID
-        if new & _UNUSED_BITS or (stays_valid and (new ^ old) & 0x7FF):
-            raise SdoAbort(Abort.VALUE)
-        if not new & INVALID and is_restricted(new & 0x7FF):
-            raise SdoAbort(Abort.VALUE)
 
     def check_mapping(self, subindex: int, value: Value) -> None:
         """Raises SdoAbort for a mapping that cannot be, or cannot be changed now."""
@@ -95,17 +85,20 @@ class PdoRules:
             raise SdoAbort(Abort.MAPPING_LENGTH)
         return found
 
+    def present(self) -> tuple[PdoEntry, ...]:
+        """All mapped entries; none where the mapping makes no sense."""
+        try:
+            return self.entries()
+        except SdoAbort:
+            return ()
+
     def entry(self, word: int) -> PdoEntry:
         """One mapping word. Raises SdoAbort when its object does not exist, may not be mapped or has another length."""
         target = self.dictionary.entries.get(word >> 8)
-        if target is None or not self._mappable(target) or target.bits != word & 0xFF:
+        mappable = target is not None and (target.in_tpdo if self.transmits else target.in_rpdo)
+        if target is None or not mappable or target.real or not target.bits or target.bits != word & 0xFF:
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return PdoEntry.from_word(word, target.signed, target.name)
-
-    def _mappable(self, target: Entry) -> bool:
-        if target.real or not target.bits:
-            return False
-        return target.in_tpdo if self.transmits else target.in_rpdo
 
 
 # One RPDO: reception, length check, event timer, and what happens to its values.
@@ -123,21 +116,6 @@ class Rpdo:
         pending: data waiting for that SYNC.
     """
 
-    __slots__ = (
-        "_core",
-        "_emcy",
-        "_event_ns",
-        "_layout",
-        "_rules",
-        "_slots",
-        "_timer",
-        "_unpack",
-        "cob_id",
-        "keys",
-        "pending",
-        "synchronous",
-    )
-
     def __init__(self, core: NodeCore, emcy: Emergency, rules: PdoRules) -> None:
         self._core, self._emcy, self._rules = core, emcy, rules
         self._timer = core.timers.new(self._timed_out)
@@ -153,15 +131,11 @@ class Rpdo:
     def configure(self) -> None:
         """Read the parameters. A mapping that makes no sense leaves the PDO without values."""
         dictionary, index = self._core.dictionary, self._rules.communication
-        try:
-            entries = self._rules.entries()
-        except SdoAbort:
-            entries = ()
         self.stop()
         if self._emcy.any:
             self._forgive()  # what was wrong with the old parameters
         self.cob_id = dictionary.number(index, COB_ID) & 0x7FF if self._rules.valid else None
-        self._layout = PdoLayout(self.cob_id or 0, entries)
+        self._layout = PdoLayout(self.cob_id or 0, self._rules.present())
         self._unpack = self._layout.raw_unpack  # the length is checked before
         self.keys = tuple(key_of(signal.index, signal.subindex) for signal in self._layout.signals)
         self._slots = tuple(dictionary.slot(key) for key in self.keys)
@@ -199,7 +173,7 @@ class Rpdo:
     def apply(self, data: bytes) -> None:
         """Store the values, each as `Dictionary.write_value` does; one that it would refuse is dropped."""
         self.pending = None
-        dictionary, told = self._core.dictionary, []
+        dictionary, reported = self._core.dictionary, []
         values, watched = dictionary.values, dictionary.watched
         for value, (key, subindex, low, high, checks, hooks) in zip(self._unpack(data), self._slots, strict=True):
             if not low <= value <= high:
@@ -213,9 +187,9 @@ class Rpdo:
             except SdoAbort:
                 continue
             if key in watched:
-                told.append(key)
-        if told:
-            dictionary.written(told)
+                reported.append(key)
+        if reported:
+            dictionary.written(reported)
 
     def _forgive(self) -> None:
         for code in (PDO_TOO_SHORT, PDO_TOO_LONG, RPDO_TIMEOUT):
@@ -233,6 +207,7 @@ class Rpdo:
 BUFFERED, ON_REQUEST = 252, 253
 _NO_RTR = 1 << 30  # of the COB-ID
 
+Sampler = Callable[[int], None]
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
 Packing = tuple[int, Callable[..., bytes], Fetch]
 """Identifier, what packs the values, what takes them from the dictionary."""
@@ -250,7 +225,7 @@ class Tpdo:
 
     Attributes:
         active: valid and with something mapped.
-        before: samples what is mapped, at a time.
+        samplers: bring what is mapped up to date, each by `sampler(t_ns)`.
         keys: mapped dictionary keys.
         packing: how to make the frame; of an active PDO.
         type: transmission type.
@@ -259,48 +234,23 @@ class Tpdo:
         requested: an event waits for the next SYNC (type 0).
     """
 
-    __slots__ = (
-        "_buffer",
-        "_cob_id",
-        "_core",
-        "_earliest_ns",
-        "_event_ns",
-        "_event_timer",
-        "_inhibit_ns",
-        "_inhibit_timer",
-        "_layout",
-        "_rules",
-        "active",
-        "before",
-        "keys",
-        "packing",
-        "remote_id",
-        "requested",
-        "start",
-        "type",
-    )
-
     def __init__(self, core: NodeCore, rules: PdoRules) -> None:
         self._core, self._rules = core, rules
         self._event_timer = core.timers.new(self._event_due)
-        self._inhibit_timer = core.timers.new(self._inhibit_over)
+        self._inhibit_timer = core.timers.new(self._send_now)
         self._layout = PdoLayout(0, ())
-        self.packing: Packing = 0, self._layout.raw_pack, _no_values
+        self.packing: Packing = 0, self._layout.raw_pack, lambda _values: ()
         self._cob_id = self._event_ns = self._inhibit_ns = self._earliest_ns = 0
         self.active = self.requested = False
         self._buffer: bytes | None = None
         self.keys: tuple[int, ...] = ()
         self.remote_id: int | None = None
         self.type = self.start = 0
-        self.before: Callable[[int], None] = _nothing
+        self.samplers: Sequence[Sampler] = ()
 
     def configure(self) -> None:
         """Read the parameters. A mapping that makes no sense leaves the PDO silent."""
-        number, index = self._core.dictionary.number, self._rules.communication
-        try:
-            entries = self._rules.entries()
-        except SdoAbort:
-            entries = ()
+        number, index, entries = self._core.dictionary.number, self._rules.communication, self._rules.present()
         self.stop()
         cob_id = number(index, COB_ID)
         self._cob_id = cob_id & 0x7FF
@@ -327,7 +277,7 @@ class Tpdo:
         self._buffer = None
 
     def started(self, t_ns: int) -> None:
-        """Operational: an event-driven PDO tells its first values."""
+        """Operational: an event-driven PDO sends its first values."""
         if self.active and self.by_event:
             self._earliest_ns = t_ns
             self.event(t_ns)
@@ -348,15 +298,14 @@ class Tpdo:
         elif self._inhibit_timer.due_ns is None:
             self._inhibit_timer.arm(self._earliest_ns)
 
-    def send(self) -> None:
-        """Pack the present values and send them."""
+    def send(self, t_ns: int) -> None:
+        """Pack the values of `t_ns` and send them."""
         self.requested = False
-        self._core.send(self._cob_id, self._packed())
+        self._core.send(self._cob_id, self._packed(t_ns))
 
     def sample(self, t_ns: int) -> None:
         """Type 252: pack the values of this SYNC, for the next remote request."""
-        self.before(t_ns)
-        self._buffer = self._packed()
+        self._buffer = self._packed(t_ns)
 
     def remote(self, data: bytes, t_ns: int) -> None:
         """A remote request. Synchronous PDOs answer with the values of the last SYNC, the others with the present."""
@@ -364,17 +313,18 @@ class Tpdo:
             self.event(t_ns)
         elif self._buffer is not None:
             self._core.send(self._cob_id, self._buffer)
-        else:
-            if self.type in (BUFFERED, ON_REQUEST):
-                self.before(t_ns)
-            self._core.send(self._cob_id, self._packed())  # an event that waits for a SYNC goes on waiting
+        else:  # an event that waits for a SYNC goes on waiting
+            self._core.send(self._cob_id, self._packed(t_ns if self.type in (BUFFERED, ON_REQUEST) else None))
 
-    def _packed(self) -> bytes:
+    def _packed(self, t_ns: int | None) -> bytes:
+        """The values of `t_ns`; None: as they were sampled last."""
+        if t_ns is not None:
+            for sampler in self.samplers:
+                sampler(t_ns)
         return self._layout.pack(*self.packing[2](self._core.dictionary.values))
 
     def _send_now(self, t_ns: int) -> None:
-        self.before(t_ns)
-        self.send()
+        self.send(t_ns)
         self._earliest_ns = t_ns + self._inhibit_ns
         if self._event_ns:
             self._event_timer.arm(t_ns + self._event_ns)
@@ -382,14 +332,3 @@ class Tpdo:
     def _event_due(self, due_ns: int) -> None:
         now_ns = self._core.timers.now_ns
         self.event(now_ns if now_ns - due_ns > self._event_ns else due_ns)  # late: do not catch up
-
-    def _inhibit_over(self, due_ns: int) -> None:
-        self._send_now(due_ns)
-
-
-def _no_values(values: Mapping[int, Any]) -> tuple[int, ...]:
-    return ()
-
-
-def _nothing(t_ns: int) -> None:
-    return None

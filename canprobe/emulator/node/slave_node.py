@@ -15,8 +15,9 @@ from collections.abc import Callable, Container
 
 from canopen.objectdictionary import ObjectDictionary
 
-from canprobe.emulator.node.core import NMT_TRANSITIONS, Application, NodeCore, Route, Service
-from canprobe.emulator.node.dictionary import Dictionary
+from canprobe.bus.lockstep import Participant
+from canprobe.emulator.node.core import NMT_GOALS, NodeCore, Route, Service
+from canprobe.emulator.node.dictionary import Dictionary, nothing
 from canprobe.emulator.node.error_control import Emergency, HeartbeatConsumer, HeartbeatProducer, NodeGuarding
 from canprobe.emulator.node.lss_slave import LssSlave, Store
 from canprobe.emulator.node.pdo_engine import PdoEngine, SyncConsumer
@@ -26,10 +27,38 @@ from canprobe.protocol.frames import NMT_ID, UNCONFIGURED, Frame, NmtCommand, Nm
 OdOf = Callable[[int], ObjectDictionary]
 """Parses a node's EDS for a node id."""
 _ON_COMMUNICATION_ERROR = {0: NmtState.PRE_OPERATIONAL, 2: NmtState.STOPPED}  # 1029h:01; 1: no change
-_COMMANDS = frozenset(NmtCommand)
 
 
-class SlaveNode:
+class Application:
+    """What a device does with its CANopen node. The base class does nothing; subclasses override what they need."""
+
+    def attach(self, node: SlaveNode) -> None:
+        """Once, at construction of the node: hang checks, hooks and samplers on its dictionary and PDOs."""
+
+    def keep(self) -> bytes:
+        """What "save" (1010h) stores of the device beside its dictionary."""
+        return b""
+
+    def recall(self, kept: bytes) -> None:
+        """Before `reset`: what was stored; empty when nothing was, or after "load" (1011h)."""
+
+    def reset(self, t_ns: int) -> None:
+        """The node boots; the dictionary holds its defaults or what was stored."""
+
+    def entered(self, t_ns: int) -> None:
+        """The NMT state has just changed."""
+
+    def sync(self, t_ns: int, counter: int) -> None:
+        """A SYNC in operational: synchronous RPDOs have been applied, TPDOs are packed next."""
+
+    def advance(self, t_ns: int) -> None:
+        """Time has come to `t_ns`; called before anything that the node does then."""
+
+    def connection_lost(self, t_ns: int) -> None:
+        """The network is gone: heartbeat consumer, life guarding, NMT stop."""
+
+
+class SlaveNode(Participant):
     """One node, made from an EDS and an application.
 
     Attributes:
@@ -38,8 +67,9 @@ class SlaveNode:
         application: the device.
         next_deadline_ns: when `advance` has something to do, or None.
         lss: the LSS service; None where the node's id cannot be changed over the bus.
-        rerouted: called when `listens` has changed; a bus puts its own function there.
     """
+
+    next_deadline_ns: int | None = None
 
     def __init__(
         self,
@@ -59,30 +89,26 @@ class SlaveNode:
             od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
         """
         self.application = application if application is not None else Application()
-        self.core = core = NodeCore(node_id, Dictionary(od))
-        self.next_deadline_ns: int | None = None
-        core.timers.holder = self
+        self.core = core = NodeCore(node_id, Dictionary(od), self)
         self._boot_ns = boot_ns
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
-        self.rerouted: Callable[[], None] = _nothing
+        self._rerouted: Callable[[], None] = nothing
         self.emcy = Emergency(core)
-        self.pdos = PdoEngine(core, self.emcy, self.application)
-        self.store = Store(core, self.application)
+        self.pdos = PdoEngine(core, self.emcy, self.application.sync)
+        self.store = Store(core, self.application.keep)
         self._heartbeat = HeartbeatProducer(core)
-        servers = [SdoServer(core, index) for index in _sdo_servers(core)]
-        sync = SyncConsumer(core, self.emcy, self.pdos.sync)
+        channels = [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
         self._od_of = od_of
         self.lss = LssSlave(core, self.store, self._renamed) if od_of is not None else None
         self._services: tuple[Service, ...] = (
             *([self.lss] if self.lss is not None else []),
             self.emcy,
             self.pdos,
-            self.store,
-            sync,
+            SyncConsumer(core, self.emcy, self.pdos.sync),
             HeartbeatConsumer(core, self.emcy, self._communication_error),
             NodeGuarding(core, self.emcy, self._communication_error),
-            *servers,
+            *(SdoServer(core, index) for index in channels),
             self._heartbeat,
         )
         core.reroute = self._reroute
@@ -107,6 +133,15 @@ class SlaveNode:
     def dictionary(self) -> Dictionary:
         """The node's object dictionary with its present values."""
         return self.core.dictionary
+
+    @property
+    def kind(self) -> type:
+        """That of the device."""
+        return type(self.application)
+
+    def connect(self, rerouted: Callable[[], None]) -> None:
+        """Call `rerouted` from now on."""
+        self._rerouted = rerouted
 
     def start(self, t_ns: int) -> list[Frame]:
         """Power on."""
@@ -146,13 +181,12 @@ class SlaveNode:
         return out
 
     def _nmt(self, data: bytes, t_ns: int) -> None:
-        if len(data) != 2 or data[1] not in (0, self.core.node_id) or data[0] not in _COMMANDS:
+        if len(data) != 2 or data[1] not in (0, self.core.node_id) or data[0] not in NMT_GOALS:
             return
-        command = NmtCommand(data[0])
-        goal = NMT_TRANSITIONS.get((self.core.state, command))
+        goal = NMT_GOALS[NmtCommand(data[0])]
         if goal is NmtState.INITIALISING:
-            self._initialise(t_ns, command is NmtCommand.RESET_COMMUNICATION)
-        elif goal is not None:
+            self._initialise(t_ns, data[0] == NmtCommand.RESET_COMMUNICATION)
+        else:
             self._enter(goal, t_ns)
 
     def _renamed(self, t_ns: int) -> None:
@@ -197,7 +231,7 @@ class SlaveNode:
         if state is self.core.state:
             return
         self.core.state = state
-        for service in reversed(self._services):  # the heartbeat tells first
+        for service in reversed(self._services):  # the heartbeat first
             service.entered(t_ns)
         self.application.entered(t_ns)
         self._reroute()
@@ -227,12 +261,4 @@ class SlaveNode:
             routes[NMT_ID] = self._nmt
         elif self.lss is not None and self.lss.unconfigured:
             routes.update(self.lss.routes())
-        self.rerouted()
-
-
-def _nothing() -> None:
-    return None
-
-
-def _sdo_servers(core: NodeCore) -> list[int]:
-    return [0x1200, *(index for index in range(0x1201, 0x1280) if core.dictionary.has_index(index))]
+        self._rerouted()

@@ -9,7 +9,7 @@ import numpy as np
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.robot.kinematics import ELBOW_FORM, Array, PumaModel, tool_z_offset
 from canprobe.scene.setup import Dynamics, Fidelity
-from canprobe.touch.shapes import ObjectShape
+from canprobe.touch.shapes import PlacedShape
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class PlantConfig:
     radius_m: float = 0.040
     stiffness_n_m3: float = 1.27e8
     damping_s_m: float = 0.3
-    object: ObjectShape | None = None
+    object: PlacedShape | None = None
     taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
     bandwidth_hz: float = 30.0
     damping_ratio: float = 1.0

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from canprobe.robot.dynamics import LOWER
 from canprobe.robot.kinematics import PumaModel, Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.straight_line import Value, compiled, matrix_product
-from canprobe.touch.shapes import ObjectShape, Touches
+from canprobe.touch.shapes import PlacedShape, Touches
 
 Array = npt.NDArray[np.float64]
 Six = Sequence[float]
@@ -287,7 +287,7 @@ class Neighbourhood:
         joints_per_motor: Array,
         T_flange_probe: Array,
         base_offset: Array,
-        shape: ObjectShape,
+        shape: PlacedShape,
         *,
         radius: float,
         stiffness_n_m3: float,

@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from canprobe.touch.estimate.noise import CHI2_99
 from canprobe.touch.estimate.quadric import (
+    TO_Q,
     UNIT,
     Decision,
     curvature_jacobian,
@@ -17,80 +19,18 @@ from canprobe.touch.estimate.quadric import (
     spread_share,
     tensor,
     transport,
-    turned,
 )
-from canprobe.touch.linear_algebra import Array, homogeneous, inverted, read_only, solved, tangent_rotation
+from canprobe.touch.linear_algebra import (
+    Array,
+    homogeneous,
+    inverted,
+    principal,
+    read_only,
+    solved,
+    tangent_rotation,
+)
 from canprobe.touch.surface import SurfaceMatrix
 
-# What a source says about curvature: value and information, before any decision on what is observed.
-
-TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
-"""K11, K12, K22 to q."""
-_TO_Q2 = np.outer(TO_Q, TO_Q)
-REFUTED = 11.34
-"""χ² of 3 from which a surface is no plane: its 99 % point."""
-
-
-class CurvatureInformation(NamedTuple):
-    """What a source says about q = (K11, √2 K12, K22) in some contact frame.
-
-    Attributes:
-        q: (3,) its own value, 1/m; counts only where there is information.
-        information: (3, 3) inverse covariance, m².
-    """
-
-    q: Array
-    information: Array
-
-
-def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
-    """The evidence of a solution with all its parameters free.
-
-    Args:
-        c: (9,) parameters in the contact frame, in units of `length`.
-        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
-        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
-            not spread for is weighed down (`quadric.spread_share`). None where that has been seen to.
-        length: m.
-    """
-    information = inverted(_TO_Q2 * covariance)
-    if spread is not None:
-        share = spread_share(spread)
-        information = share @ information @ share
-    return CurvatureInformation(c[6:] / (UNIT * length), information * length**2)
-
-
-def mean_of(a: CurvatureInformation, b: CurvatureInformation) -> Array:
-    """(3,) the mean weighted with the information of both, which together must be definite."""
-    return solved(a.information + b.information, a.information @ a.q + b.information @ b.q)
-
-
-def curvature_covariance(c: Array, deviation: Array) -> Array:
-    """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
-
-    What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is
-    largest where the noise is: a region round a plane would grow with its own error and hold K = 0 always. So it
-    counts only where K = 0 is refuted, by 1 − (q/χ²)², χ² that of K = 0 with c13, c23, c33 known, q its 99 % point.
-
-    Args:
-        c: (9,) parameters in the contact frame.
-        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
-
-    Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
-    """
-    D, others = curvature_jacobian(c) @ deviation, deviation[3:6]
-    cross = D @ others.T
-    by_others = cross @ solved(others @ others.T, cross.T)
-    own = D @ D.T - by_others
-    chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
-    refuted = 1.0 - (REFUTED / max(chi2, REFUTED)) ** 2
-    return np.asarray(own + refuted * by_others, dtype=np.float64)
-
-
-# The answer of an estimator: local shape at the last contact, with what is known about it and what is not.
-
-_ROOT2 = math.sqrt(2.0)
-_TO_Q = np.array([1.0, _ROOT2, 1.0])
 _ENTRY_LIMIT = 0.02
 """Largest unobserved part of an entry of K that still has a number."""
 _DIRECTION_LIMIT = 0.05
@@ -281,22 +221,14 @@ def build_estimate(
         method=method,
         prior=prior,
         notes=notes,
-        model_root=None if solution.root is None else solution.root * _units(length),
+        model_root=None if solution.root is None else solution.root * [1.0, 1.0, 1.0 / length, *6 * [length]],
         evidence=evidence,
     )
 
 
-def _units(length: float) -> Array:
-    """(9,) dimensionless entries of S per SI ones."""
-    return np.array([1.0, 1.0, 1.0 / length] + 6 * [length])
-
-
 def _principal(K: Array) -> tuple[Array, Array]:
     """κ1 ≥ κ2 and their directions as rows (2, 2)."""
-    (a, b), (_, d) = K.tolist()
-    mean, half = 0.5 * (a + d), 0.5 * (a - d)
-    radius = math.hypot(half, b)
-    angle = 0.5 * math.atan2(b, half)
+    mean, radius, angle = principal(K)
     c, s = math.cos(angle), math.sin(angle)
     return np.array([mean + radius, mean - radius]), np.array([[c, s], [-s, c]])
 
@@ -323,25 +255,32 @@ def _partly(
     local = np.array([t, [-t[1], t[0]]])
     seen = decision.rank > 0 and outside(decision, _projector(t)) < _DIRECTION_LIMIT
     kappa = np.array([float(t @ K @ t) if seen else math.nan, math.nan])
-    hidden = [outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)]
-    K = np.where(np.array([[hidden[0], hidden[1]], [hidden[1], hidden[2]]]), math.nan, K)
-    return K, _partial_covariance(decision, hidden, length), kappa, local, np.array([seen, False])
+    hidden = np.array([outside(decision, e) >= _ENTRY_LIMIT for e in np.eye(3)])
+    K = np.where(hidden[[[0, 1], [1, 2]]], math.nan, K)
+    V, passed = decision.vectors, decision.passed
+    covariance = partial_covariance(V[:, passed], decision.information[passed], hidden) / length**2
+    return K, covariance, kappa, local, np.array([seen, False])
 
 
-def _partial_covariance(decision: Decision, hidden: list[bool], length: float) -> Array:
-    V = decision.vectors[:, decision.passed]
-    C: Array = (V / decision.information[decision.passed]) @ V.T / np.outer(_TO_Q, _TO_Q) / length**2
-    for i, is_hidden in enumerate(hidden):
-        if is_hidden:
-            C[i, :] = C[:, i] = math.nan
-            C[i, i] = math.inf
+def partial_covariance(V: Array, information: Array, hidden: Array) -> Array:
+    """Covariance (3, 3) of (K11, K12, K22), NaN and infinite in the hidden (3,) entries.
+
+    Args:
+        V: (3, k) columns: observed combinations of q, and
+        information: (k,) about each.
+        hidden: (3,) bool.
+    """
+    C: Array = (V / information) @ V.T / np.outer(TO_Q, TO_Q)
+    C[hidden] = C[:, hidden] = math.nan
+    C[hidden, hidden] = math.inf
     return C
 
 
 def _projector(t: Array) -> Array:
     """q of t tᵀ, the normal curvature along the tangent direction t (2,)."""
-    x, y = float(t[0]), float(t[1])
-    return np.array([x * x, _ROOT2 * x * y, y * y])
+    x, y = t.tolist()
+    result: Array = TO_Q * [x * x, x * y, y * y]
+    return result
 
 
 def _observed_direction(decision: Decision) -> Array:
@@ -359,6 +298,59 @@ def _observed_direction(decision: Decision) -> Array:
     order = np.argsort(np.abs(values))
     result: Array = vectors[:, order[0 if open_one else 1]]
     return result if result[np.argmax(np.abs(result))] > 0.0 else -result
+
+
+# What a source says about curvature: value and information, before any decision on what is observed.
+
+
+class CurvatureInformation(NamedTuple):
+    """What a source says about q = (K11, √2 K12, K22) in some contact frame.
+
+    Attributes:
+        q: (3,) its own value, 1/m; counts only where there is information.
+        information: (3, 3) inverse covariance, m².
+    """
+
+    q: Array
+    information: Array
+
+
+def evidence_of(c: Array, covariance: Array, spread: Array | None, length: float) -> CurvatureInformation:
+    """The evidence of a solution with all its parameters free.
+
+    Args:
+        c: (9,) parameters in the contact frame, in units of `length` (m).
+        covariance: (3, 3) of (K11, K12, K22) (`curvature_covariance`).
+        spread: (2, 2) covariance of the points in the tangent plane over the variance of their noise: what they were
+            not spread for is weighed down (`quadric.spread_share`). None where that has been seen to.
+    """
+    information = inverted(np.outer(TO_Q, TO_Q) * covariance)
+    if spread is not None:
+        share = spread_share(spread)
+        information = share @ information @ share
+    return CurvatureInformation(c[6:] / (UNIT * length), information * length**2)
+
+
+def curvature_covariance(c: Array, deviation: Array) -> Array:
+    """Covariance (3, 3) of (K11, K12, K22) by the delta method, dimensionless.
+
+    What c13, c23, c33 put K off by is proportional to K. Where the K found is its own noise so is that part, and it is
+    largest where the noise is: a region round a plane would grow with its own error and hold K = 0 always. So it
+    counts only where K = 0 is refuted, by 1 − (q/χ²)², χ² that of K = 0 with c13, c23, c33 known, q its 99 % point.
+
+    Args:
+        c: (9,) parameters in the contact frame.
+        deviation: (9, k) root of their covariance: `deviation @ deviationᵀ`.
+
+    Source: Judge and Bock, "The statistical implications of pre-test and Stein-rule estimators in econometrics", 1978.
+    """
+    D, others = curvature_jacobian(c) @ deviation, deviation[3:6]
+    cross = D @ others.T
+    by_others = cross @ solved(others @ others.T, cross.T)
+    own = D @ D.T - by_others
+    chi2 = 4.0 * float(c[6:] @ solved(own, c[6:]))
+    refuted = 1.0 - (CHI2_99 / max(chi2, CHI2_99)) ** 2
+    return np.asarray(own + refuted * by_others, dtype=np.float64)
 
 
 # From a fit in a working frame to the estimated contact frame.
@@ -382,33 +374,19 @@ class Anchor(NamedTuple):
 
 def foot(c: Array, start: Array) -> tuple[Array, Array]:
     """Foot of a nearby point (3,) on the model's surface and the inward unit normal there, dimensionless."""
-    c14, c24, c44, c13, c23, c33, c11, c12, c22 = c.tolist()
-    sx, sy, sz = x, y, z = start.tolist()
-    for last in (False, False, False, False, True):
-        gx = 2.0 * (c11 * x + c12 * y + c13 * z + c14)
-        gy = 2.0 * (c12 * x + c22 * y + c23 * z + c24)
-        gz = 2.0 * (c13 * x + c23 * y + c33 * z) - 1.0
-        square = gx * gx + gy * gy + gz * gz
-        if last:
-            break
-        f = 0.5 * (x * (gx + 2.0 * c14) + y * (gy + 2.0 * c24) + z * (gz - 1.0)) + c44
+    S = matrix_of(c)
+    B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
+    x, g = start, B @ start + h
+    for _ in range(4):
         # along the gradient to the surface, and back over the start along the tangent plane
-        ox, oy, oz = x - sx, y - sy, z - sz
-        k = (ox * gx + oy * gy + oz * gz - f) / square
-        x, y, z = sx + k * gx, sy + k * gy, sz + k * gz
-    size = -1.0 / math.sqrt(square)
-    return np.array([x, y, z]), np.array([gx * size, gy * size, gz * size])
+        f = 0.5 * float(x @ (g + h)) + float(S[3, 3])
+        x = start + g * ((float((x - start) @ g) - f) / float(g @ g))
+        g = B @ x + h
+    return x, -g / math.sqrt(float(g @ g))
 
 
 def anchor(c: Array, T_frame_work: Array, point: Array, length: float) -> Anchor:
-    """Re-express a model at the foot of a point.
-
-    Args:
-        c: (9,) in the working frame, in units of `length`.
-        T_frame_work: (4, 4), m.
-        point: (3,) in the working frame, in units of `length`.
-        length: m.
-    """
+    """A model at the foot of a point; c (9,) and the point (3,) in the working frame, in units of `length` (m)."""
     x, z = foot(c, point)
     R_work = T_frame_work[:3, :3]
     R = tangent_rotation(R_work @ z)
@@ -418,19 +396,3 @@ def anchor(c: Array, T_frame_work: Array, point: Array, length: float) -> Anchor
     origin = T_frame_work[:3, 3] + R_work @ (length * x)
     turn = math.atan2(R_work_contact[1, 0] - R_work_contact[0, 1], R_work_contact[0, 0] + R_work_contact[1, 1])
     return Anchor(c_new, M, homogeneous(R, origin), turn)
-
-
-def solution(a: Anchor, root: Array, decision: Decision, has_prior: bool) -> Solution:
-    """Covariance of K by the delta method.
-
-    Args:
-        a: where the answer is given.
-        root: (9, 9) information root in the working frame.
-        decision: rank decision there; its axes are turned into the contact frame.
-        has_prior: the root is regular whatever the data.
-    """
-    decision = decision._replace(vectors=turned(a.turn) @ decision.vectors)
-    here = solved(a.M.T, root.T).T
-    if decision.rank < 3 and not has_prior:
-        return Solution(a.c, np.full((3, 3), math.nan), decision, has_prior, here)
-    return Solution(a.c, curvature_covariance(a.c, a.M @ inverted(root)), decision, has_prior, here)

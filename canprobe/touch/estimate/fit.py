@@ -15,10 +15,15 @@ from canprobe.touch.estimate.likelihood import Touches, checked_arrays, fit_ml, 
 from canprobe.touch.estimate.noise import Correlation, Prior, make_noise
 from canprobe.touch.estimate.online import Estimator
 from canprobe.touch.estimate.recursive import RecursiveEstimator
-from canprobe.touch.estimate.window import chord_pairs, lag_pairs, solve_pairs, solve_paper, usable_lag
-from canprobe.touch.linear_algebra import Array
-
-# Estimators of local shape by name, behind one interface.
+from canprobe.touch.estimate.window import (
+    Chen1996Estimator,
+    ChordEstimator,
+    MlEstimator,
+    chord_pairs,
+    lag_pairs,
+    solve_pairs,
+    usable_lag,
+)
 
 METHODS = ("chen1996", "chord", "ml", "recursive")
 
@@ -28,7 +33,6 @@ def make_estimator(
     *,
     sigma_point: float,
     sigma_normal: float,
-    probe_radius: float,
     memory_m: float = 0.02,
     window: int = 160,
     prior: Prior | None = None,
@@ -43,20 +47,14 @@ def make_estimator(
         sigma_point: effective standard deviation of a contact point per axis, m. Along a path a real sensor's errors
             are correlated: give what independent samples at this density would have to have.
         sigma_normal: of a normal per tangent axis, rad.
-        probe_radius: R_p, m; only checked, the samples carry their geometry.
         memory_m: path that `recursive` remembers (e-folding), m.
         window: samples that the batch methods keep; for `recursive` the samples on one memory at the nominal pace.
-        prior: of `ml` and `recursive`; None for the weak default.
-        correlation: of the noise along the path, `recursive` only; the deviations are then those of one sample.
-        coupling: of the errors of point and normal, `ml` and `recursive` only: 1/R_p where both come from one centroid
-            on the probe, 1/m; 0 for independent errors.
-        lag: samples between the two of a difference, `chen1996` only.
+        prior, lag, correlation, coupling: as for `fit_surface`, the correlation for `recursive` only; the deviations
+            are then those of one sample.
 
     Raises:
         UsageError: on an unknown method or a value out of range.
     """
-    if not probe_radius > 0.0:
-        raise UsageError(f"probe_radius: expected a length above 0 m, got {probe_radius}")
     if method == "recursive":
         return RecursiveEstimator(
             sigma_point=sigma_point,
@@ -68,18 +66,12 @@ def make_estimator(
             coupling=coupling,
         )
     if method == "ml":
-        from canprobe.touch.estimate.window import MlEstimator
-
         return MlEstimator(
             sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, prior=prior, coupling=coupling
         )
     if method == "chord":
-        from canprobe.touch.estimate.window import ChordEstimator
-
         return ChordEstimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window)
     if method == "chen1996":
-        from canprobe.touch.estimate.window import Chen1996Estimator
-
         return Chen1996Estimator(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, lag=lag)
     raise unknown_method(method)
 
@@ -89,9 +81,6 @@ def unknown_method(method: str) -> UsageError:
     near = difflib.get_close_matches(str(method), METHODS, n=1)
     hint = f'; did you mean "{near[0]}"?' if near else ""
     return UsageError(f"method: expected one of {', '.join(METHODS)}, got {method!r}{hint}")
-
-
-# `fit_surface`: local shape from points and normals of one stretch of contact.
 
 
 def fit_surface(
@@ -147,11 +136,10 @@ def fit_surface(
     p, n = checked_arrays(points, normals, 3 if method == "chen1996" else 2)
     touches = make_touches(p, n, make_noise(len(p), sigma_point, sigma_normal, coupling), correlation)
     if method in ("ml", "recursive"):
+        fitted = fit_ml if method == "ml" else _run_filter
         try:
             with np.errstate(over="ignore", invalid="ignore"):  # what is not finite has no root
-                return (
-                    fit_ml(touches, prior, quadric=quadric) if method == "ml" else _run_filter(touches, prior, quadric)
-                )
+                return fitted(touches, prior, quadric)
         except np.linalg.LinAlgError as error:
             raise UsageError(
                 f"sigma_point, sigma_normal: expected those of real noise, got {sigma_point!r} and {sigma_normal!r}, "
@@ -164,36 +152,29 @@ def fit_surface(
     if method == "chen1996":
         if lag < 1 or lag != int(lag):
             raise UsageError(f"lag: expected at least 1 sample, a whole number of them, got {lag}")
-        return solve_paper(touches, lag_pairs(touches, usable_lag(len(p), int(lag))))
+        return solve_pairs(touches, lag_pairs(touches, usable_lag(len(p), int(lag))), "chen1996")
     raise unknown_method(method)
 
 
 def _run_filter(touches: Touches, prior: Prior | None, quadric: bool) -> SurfaceEstimate:
+    """The answer of `recursive` after samples of which only place and normal are known."""
     point, normal = np.sqrt(touches.noise.point_variance), np.sqrt(touches.noise.normal_variance)
-    memory = max(touches.distance, touches.extent)
     estimator = RecursiveEstimator(
         sigma_point=math.sqrt(float(np.mean(point**2))),
         sigma_normal=math.sqrt(float(np.mean(normal**2))),
-        memory_m=memory,
+        memory_m=max(touches.distance, touches.extent),
         window=len(point),
         prior=prior,
         correlation=touches.correlation,
         coupling=touches.noise.coupling,
         quadric=quadric,
     )
-    for sample in _samples(touches, point, normal):
-        estimator.add(sample)
+    nowhere = np.eye(4)
+    for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True)):
+        estimator.add(ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i])))
     answer = estimator.estimate()
     if answer is None:
         raise UsageError(
             f"points: expected a path that moves beyond its noise for 'recursive', got {touches.distance:.3g} in all"
         )
     return answer
-
-
-def _samples(touches: Touches, point: Array, normal: Array) -> list[ContactSample]:
-    nowhere = np.eye(4)
-    return [
-        ContactSample(float(i), p, n, nowhere, nowhere[:3, 2], 0.0, float(point[i]), float(normal[i]))
-        for i, (p, n) in enumerate(zip(touches.points, touches.normals, strict=True))
-    ]

@@ -15,18 +15,8 @@ import numpy as np
 
 from canprobe.touch.estimate.answer import foot
 from canprobe.touch.estimate.noise import Correlation, Noise, Prior, mixed
-from canprobe.touch.estimate.nonlinear import (
-    CHI2_999,
-    DIFFUSE,
-    averaged,
-    basis,
-    monomials,
-    scales,
-    sharpest,
-    shifted,
-    size_of,
-)
-from canprobe.touch.estimate.quadric import Design, design, sample_rows, transport
+from canprobe.touch.estimate.nonlinear import DIFFUSE, Averaged, averaged, scales
+from canprobe.touch.estimate.quadric import Design, design, linearise, sharpest, shifted, size_of, transport
 from canprobe.touch.linear_algebra import (
     Array,
     eigen,
@@ -37,8 +27,6 @@ from canprobe.touch.linear_algebra import (
     transported_rotation,
     upper_root,
 )
-
-# Whitened equations of single contacts in a filter's frame, and how well they agree with what it says.
 
 
 class Touch(NamedTuple):
@@ -54,69 +42,13 @@ class Touch(NamedTuple):
     coupling: float = 0.0
 
 
-class Equations(NamedTuple):
-    """Of n contacts in a filter's frame.
-
-    Attributes:
-        rows: (n, 3, 18) whitened: of the parameters and of the terms that a quadric leaves out.
-        residuals: (n, 3) their signs turned.
-    """
-
-    rows: Array
-    residuals: Array
-
-
-def equations(c: Array, T_base_work: Array, length: float, touches: Sequence[Touch]) -> Equations:
-    """The rows of contacts at parameters (9,).
-
-    Args:
-        c: parameters in the working frame, in units of `length`.
-        T_base_work: (4, 4), m.
-        length: m.
-        touches: the contacts.
-    """
-    points, normals = _in_frame(T_base_work, length, touches)
-    at, square = c.tolist(), 1.0 / length**2
-    found = [
-        sample_rows(at, x, n, (square * t.sigma_point**2, t.sigma_normal**2), t.coupling * length)
-        for x, n, t in zip(points.tolist(), normals.tolist(), touches, strict=True)
-    ]
-    table = np.array([[*s.weights, *s.residuals, *monomials(*s.place)] for s in found])
-    return Equations(table[:, :12].reshape(-1, 3, 4) @ basis(table[:, 15:]), table[:, 12:15])
-
-
-def squared_innovations(rows: Array, residuals: Array, inverse: Array) -> list[float]:
-    """Squared innovation of contacts with rows (n, 3, 18) and residuals (n, 3), χ² of 3.
-
-    Args:
-        rows, residuals: as of `Equations`.
-        inverse: (9, 9) of the root of the information.
-    """
-    predicted = rows[:, :, :9] @ inverse
-    variance = 1.0 + np.square(predicted).sum(axis=2)
-    found: list[float] = (np.square(residuals) / variance).sum(axis=1).tolist()
-    return found
-
-
-def weight_of(square: float) -> float:
-    """Weight of a contact with a squared innovation: 1 up to the 99.9 % point of χ², then as in `nonlinear.robust`."""
-    ratio = CHI2_999 / max(square, CHI2_999)
-    return ratio * ratio
-
-
 def batch_design(T_base_work: Array, length: float, touches: Sequence[Touch]) -> Design:
-    """The constant parts of many contacts at once (`quadric.design`)."""
-    points, normals = _in_frame(T_base_work, length, touches)
-    sigma_point = np.array([t.sigma_point for t in touches]) / length
-    sigma_normal = np.array([t.sigma_normal for t in touches])
-    return design(points, normals, Noise(sigma_point, sigma_normal, touches[0].coupling * length))
-
-
-def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tuple[Array, Array]:
-    """Places, dimensionless, and normals (n, 3) in the working frame."""
+    """Contacts (`quadric.design`) in a working frame (4, 4), in units of a length (m)."""
     R = T_base_work[:3, :3]
     points = (np.array([t.point for t in touches]) - T_base_work[:3, 3]) @ R / length
-    return points, np.array([t.normal for t in touches]) @ R
+    sigma_point = np.array([t.sigma_point for t in touches]) / length
+    noise = Noise(sigma_point, np.array([t.sigma_normal for t in touches]), touches[0].coupling * length)
+    return design(points, np.array([t.normal for t in touches]) @ R, noise)
 
 
 # What the noise of weighted and forgotten rows does to an answer: the middle of the sandwich covariance.
@@ -128,14 +60,11 @@ def _in_frame(T_base_work: Array, length: float, touches: Sequence[Touch]) -> tu
 
 
 class Score:
-    """Covariance of the score `Jᵀ W e` of a filter that forgets along the path.
+    """Covariance `matrix` (k, k) of the score `Jᵀ W e` of a filter that forgets along the path.
 
     Args:
         prior: (k, k) information of what is always known about the k parameters.
         correlation: of the rows along the path; None for independent samples.
-
-    Attributes:
-        matrix: (k, k).
     """
 
     def __init__(self, prior: Array, correlation: Correlation | None) -> None:
@@ -149,12 +78,7 @@ class Score:
         self._recent = np.zeros((3, len(self.matrix)))
 
     def start(self, J: Array, travelled: float) -> None:
-        """Take a batch solution whose rows all count in full.
-
-        Args:
-            J: (n, 3, k) its whitened rows, evenly spread over the path.
-            travelled: length of the path, m.
-        """
+        """Take a batch's whitened rows (n, 3, k), evenly spread over a path (m), which all count in full."""
         self.reset()
         k = len(self.matrix)
         rows = J.reshape(-1, k)
@@ -167,13 +91,9 @@ class Score:
         self._recent = self._correlation.shares[:, None] * (fades @ J.reshape(-1, 3 * k)).reshape(3, k)
 
     def take(self, J: Array, moved: float, kept: float, known: float) -> None:
-        """Take new whitened rows over a step of the path.
+        """Take new whitened rows (3n, k) over a step (m) of the path, which leaves `kept` of the information.
 
-        Args:
-            J: (3n, k).
-            moved: m.
-            kept: what the step leaves of the information.
-            known: what of the prior is put back into the matrix, over the whole prior.
+        `known` is what of the prior is put back into the matrix, over the whole prior.
         """
         self.matrix = kept**2 * self.matrix + known * self._prior + self._added(J, moved, kept)
 
@@ -210,13 +130,9 @@ _REGULAR = 1e-9
 
 
 class Amended(NamedTuple):
-    """An answer of a filter, averaged over what its quadric leaves out.
+    """An answer of a filter, averaged over what its quadric leaves out; misfit, trusted: as of `nonlinear.Averaged`.
 
-    Attributes:
-        c: (9,) parameters.
-        covariance: (9, 9) of what the terms add to that of the noise; symmetric, not definite by itself.
-        misfit: probability of there being one.
-        trusted: the change of K is small enough for a linear step.
+    The covariance (9, 9) is what the terms add to that of the noise; symmetric, not definite by itself.
     """
 
     c: Array
@@ -239,40 +155,29 @@ class Expected(NamedTuple):
     sigma_point: float = 0.0
 
 
-AS_STATED = Expected()
-
-
 class _Along(NamedTuple):
-    """The terms along directions in which what the samples say about them is independent.
+    """The average over the terms, in directions in which what the samples say about them is independent.
 
     Attributes:
-        information, score: (9,) as for `averaged`.
-        off: (9, 9) what a unit along each does to the parameters.
+        found: the average.
+        off: (9, 9) what a unit along each direction does to the parameters.
         terms: (9, 9) the terms of such a unit.
         shared: (18, 9) covariance of the score with that of the terms.
         weighted: (9, 9) weights of what the samples say.
-        curvature, blur: as for `averaged`.
     """
 
-    information: Array
-    score: Array
+    found: Averaged
     off: Array
     terms: Array
     shared: Array
     weighted: Array
-    curvature: float
-    blur: float
 
 
 class LeftOut:
-    """Sums over the rows of parameters and terms.
+    """Sums over the rows of parameters and terms; `score` is that of both.
 
     Args:
-        prior: (9, 9) information of what is always known about the parameters.
-        correlation: of the rows along the path; None for independent samples.
-
-    Attributes:
-        score: (`Score`) covariance of the score of parameters and terms.
+        prior, correlation: as of `Score`, for the nine parameters.
     """
 
     def __init__(self, prior: Array, correlation: Correlation | None) -> None:
@@ -312,30 +217,20 @@ class LeftOut:
         self._information = wide.T @ self._information @ wide
         self._slope = away.T @ self._slope
 
-    def amend(self, c: Array, H: Array, place: Array, expected: Expected = AS_STATED) -> Amended:
-        """Average an answer over the terms.
-
-        Args:
-            c: (9,) parameters of the filter.
-            H: (9, 9) inverse of their information.
-            place: (3,) where the answer is wanted, in the filter's frame.
-            expected: of the samples.
+    def amend(self, c: Array, H: Array, place: Array, expected: Expected) -> Amended:
+        """Average an answer at a place (3,) over the terms; c (9,) of the filter, H (9, 9) the inverse of its
+        information.
         """
-        a = self._along(c, H, expected)
-        off = a.off.copy()
-        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ a.terms
-        found = averaged(a.information, a.score, -off, a.curvature, a.blur)
-        both = H @ a.shared[:9] @ (a.weighted * found.share) @ off.T
-        return Amended(c + found.shift, found.spread + both + both.T, found.misfit, found.trusted)
+        a = self._along(c, H, expected, place)
+        both = H @ a.shared[:9] @ (a.weighted * a.found.share) @ a.off.T
+        return Amended(c + a.found.shift, a.found.spread + both + both.T, a.found.misfit, a.found.trusted)
 
-    def explanation(self, c: Array, H: Array, expected: Expected = AS_STATED) -> Array:
+    def explanation(self, c: Array, H: Array, expected: Expected) -> Array:
         """What the terms most likely are: (18,) what they add to the filter's parameters, and the terms."""
-        a = self._along(c, H, expected)
-        found = averaged(a.information, a.score, -a.off, a.curvature, a.blur)
-        return np.concatenate([found.shift, a.terms @ found.terms])
+        a = self._along(c, H, expected, np.zeros(3))
+        return np.concatenate([a.found.shift, a.terms @ a.found.terms])
 
-    def _along(self, c: Array, H: Array, expected: Expected) -> _Along:
-        """The terms along directions in which the samples know them independently."""
+    def _along(self, c: Array, H: Array, expected: Expected, place: Array) -> _Along:
         curvature = max(size_of(c), expected.curvature)
         D = scales(curvature)
         X = np.zeros((18, 9))  # what a unit of each term does to the parameters, and the term itself
@@ -350,10 +245,13 @@ class LeftOut:
         information = np.maximum(values, 0.0) / expected.noise
         s = U.T @ (weighted.T @ (D * self._slope)) / expected.noise
         blur = sharpest(c) * expected.sigma_point * math.sqrt(expected.noise)
-        return _Along(information, s, X[:9] @ U, D[:, None] * U, shared, weighted @ U, curvature, blur)
+        off, terms = X[:9] @ U, D[:, None] * U
+        off[6:] += shifted(float(place[0]), float(place[1]))[1][6:] @ terms
+        found = averaged(information, s, -off, curvature, blur)
+        return _Along(found, off, terms, shared, weighted @ U)
 
 
-# A square-root information filter for the nine-parameter model, and how it is carried from frame to frame.
+# The filter, and how it is carried from frame to frame.
 
 ANCHOR = 0.05
 """Travel between two changes of the working frame over the memory."""
@@ -384,7 +282,6 @@ class InformationFilter:
         correlation: of the rows along the path; only the covariance of the answer knows of it.
 
     Attributes:
-        length: m.
         T: (4, 4) working frame to base, m.
         c: (9,) parameters (`quadric`).
         root: (9, 9) `rootᵀ root` is their information.
@@ -411,15 +308,8 @@ class InformationFilter:
     def adopt(  # noqa: PLR0917 - what a batch solution is
         self, T: Array, c: Array, root: Array, rows: Array, residuals: Array, travelled: float
     ) -> None:
-        """Take over a batch solution.
-
-        Args:
-            T: (4, 4) its working frame.
-            c: (9,) its parameters.
-            root: (9, 9) of its information.
-            rows: (n, 3, 18) its whitened, weighted rows, evenly spread over the path.
-            residuals: (n, 3) minus theirs, at c.
-            travelled: length of that path, m.
+        """Take over a batch solution: its working frame (4, 4), parameters (9,), root (9, 9) of their information,
+        whitened and weighted rows (n, 3, 18), and minus their residuals (n, 3), evenly spread over the path (m).
         """
         self.T, self.c = T, c.copy()
         self._path = _Path(travelled, travelled)
@@ -443,6 +333,17 @@ class InformationFilter:
         step = self.inverse @ full[:9, 9]
         self.c = self.c + step
         self.left_out.take(rows, residuals, step, moved, kept, share**2 - left**2)
+
+    def equations(self, touches: Sequence[Touch]) -> tuple[Array, Array]:
+        """Whitened rows (n, 3, 18) and minus residuals (n, 3) of new contacts, as `take` wants them."""
+        at = linearise(self.c, batch_design(self.T, self.length, touches))
+        return at.jacobian(18), -at.r
+
+    def squared_innovations(self, rows: Array, residuals: Array) -> Array:
+        """(n,) squared innovations of such contacts, χ² of 3."""
+        variance = 1.0 + np.square(rows[:, :, :9] @ self.inverse).sum(axis=2)
+        result: Array = (np.square(residuals) / variance).sum(axis=1)
+        return result
 
     def place(self, point: Array) -> Array:
         """A point (3,) of base in the working frame, dimensionless."""

@@ -10,29 +10,29 @@ from numpy.typing import ArrayLike
 
 from canprobe.errors import UsageError
 from canprobe.touch.estimate.answer import (
+    Solution,
     SurfaceEstimate,
     anchor,
     build_estimate,
     curvature_covariance,
     evidence_of,
-    solution,
+    partial_covariance,
 )
-from canprobe.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed, path_extent
+from canprobe.touch.estimate.noise import Correlation, Noise, Prior, make_noise, mixed
 from canprobe.touch.estimate.nonlinear import CERTAIN, DIFFUSE, correct, fit, misfit_notes
 from canprobe.touch.estimate.quadric import (
     UNIT,
     curvature_jacobian,
     decide,
     design,
+    linearise,
     nothing_observed,
     parameters_of,
-    rows,
     spread_of,
+    turned,
 )
-from canprobe.touch.linear_algebra import Array, checked, homogeneous, solved, tangent_rotation, upper_root
+from canprobe.touch.linear_algebra import Array, checked, homogeneous, inverted, solved, tangent_rotation, upper_root
 from canprobe.touch.surface import SurfaceMatrix
-
-# Batch estimates from points and normals: the checked arrays and the `ml` method.
 
 _FLOOR = 20.0
 """Least extent in standard deviations of a point: shorter paths are noise, and no length to measure curvature by."""
@@ -46,7 +46,7 @@ class Touches(NamedTuple):
     Attributes:
         points, normals: (n, 3); the last row is now.
         noise: of the n samples.
-        extent: length of the path (`path_extent`), m.
+        extent: largest distance from the last point, never below noise, m: the unit of length.
         distance: length along the path, m.
         correlation: of the noise along the path; None for independent samples.
     """
@@ -68,10 +68,12 @@ class Touches(NamedTuple):
 def make_touches(points: Array, normals: Array, noise: Noise, correlation: Correlation | None = None) -> Touches:
     """Extent and length of arrays that are already checked."""
     floor = _FLOOR * math.sqrt(float(np.median(noise.point_variance)))
-    return Touches(points, normals, noise, path_extent(points, floor), travelled(points), correlation)
+    offset = points - points[-1]
+    extent = max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), floor)
+    return Touches(points, normals, noise, extent, _travelled(points), correlation)
 
 
-def travelled(points: Array) -> float:
+def _travelled(points: Array) -> float:
     """Length along noisy points (n, 3): of means over up to eight, or their noise alone would add up to a path."""
     each = min(_MEAN_OF, max(1, len(points) // 20))
     means = points[len(points) % each :].reshape(-1, each, 3).mean(axis=1)
@@ -81,11 +83,7 @@ def travelled(points: Array) -> float:
 
 
 def checked_arrays(points: ArrayLike, normals: ArrayLike, least: int) -> tuple[Array, Array]:
-    """Points and unit normals (n, 3), n ≥ least.
-
-    Raises:
-        UsageError: naming the field, what was expected and what was got.
-    """
+    """Points and unit normals (n, 3), n ≥ least; else a UsageError that names the field."""
     p, n = checked("points", points, (None, 3)), checked("normals", normals, (None, 3))
     if len(p) < least:
         raise UsageError(f"points: expected at least {least} samples, got {len(p)}")
@@ -105,13 +103,9 @@ def working_frame(touches: Touches) -> Array:
     return homogeneous(tangent_rotation(-touches.normals[-1]), touches.points[-1])
 
 
-def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> SurfaceEstimate:
-    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point.
-
-    Args:
-        touches: checked input.
-        prior: None for `Prior.weak` over the extent of the path.
-        quadric: the surface is one exactly; else its cubic and quartic terms are allowed for (`nonlinear`).
+def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> SurfaceEstimate:
+    """The `ml` estimate (`nonlinear`), in the estimated contact frame of the last point; prior, quadric: as for
+    `fit_surface`.
     """
     length = touches.extent
     stated = Prior.weak(length) if prior is None else prior
@@ -132,13 +126,18 @@ def fit_ml(touches: Touches, prior: Prior | None, *, quadric: bool = False) -> S
             result = result._replace(decision=nothing_observed(), free_root=DIFFUSE * np.eye(9))
     has_prior = math.isfinite(stated.sigma_curvature)
     a = anchor(result.c, T, np.zeros(3), length)
+    decision = result.decision._replace(vectors=turned(a.turn) @ result.decision.vectors)
+    if decision.rank == 3 or has_prior:
+        covariance = curvature_covariance(a.c, a.M @ inverted(result.root))
+    else:
+        covariance = np.full((3, 3), math.nan)
     free = anchor(result.free, T, np.zeros(3), length)
     spread = None if has_prior else _turned_spread(spread_of(d.X, d.point_variance), free.turn)
     deviation = solved(result.free_root.T, free.M.T).T
     if result.outliers:
         notes += (f"{result.outliers} samples with reduced weight",)
     return build_estimate(
-        solution(a, result.root, result.decision, has_prior),
+        Solution(a.c, covariance, decision, has_prior, root=solved(a.M.T, result.root.T).T),
         length=length,
         T_frame_contact=a.T_frame_contact,
         problem_root=problem_root,
@@ -158,9 +157,6 @@ def _turned_spread(spread: Array, angle: float) -> Array:
     R = np.array([[c, -s], [s, c]])
     result: Array = R.T @ spread @ R
     return result
-
-
-# The Cramér–Rao bound on local curvature.
 
 
 def cramer_rao(
@@ -183,10 +179,7 @@ def cramer_rao(
         points: (n, 3) m, on the true surface (or measured); the last row is now.
         normals: (n, 3) outward unit normals.
         S: (4, 4) the true surface in the frame of the points.
-        sigma_point, sigma_normal: noise as for `fit_surface`.
-        prior: the same prior as the estimator's; None for the same default.
-        correlation: of the noise along the path; None for independent samples.
-        coupling: of the errors of point and normal, as for `fit_surface`.
+        sigma_point, sigma_normal, prior, correlation, coupling: as for `fit_surface`; the prior that the estimator has.
 
     Returns:
         (3, 3) covariance of (K11, K12, K22), 1/m², in the contact frame of the last point,
@@ -207,7 +200,7 @@ def cramer_rao(
     in_contact[:3, :3] *= length
     c = parameters_of(in_contact)
     d = design((p - origin) @ R / length, n @ R, touches.noise.scaled(length, R))
-    J = rows(c, d).J
+    J = linearise(c, d).jacobian()
     independent = touches.whitener()
     J = (J if independent is None else mixed(independent, J)).reshape(-1, 9)
     stated = Prior.weak(length) if prior is None else prior
@@ -216,17 +209,9 @@ def cramer_rao(
     decision = decide(root[6:, 6:] * UNIT, wide, math.inf)
     known = decision.passed & (decision.information > 0.0)  # points in one place know nothing
     if not known.all():
-        return _open_covariance(decision.vectors[:, known], decision.information[known], length)
+        V = decision.vectors[:, known]
+        hidden = 1.0 - np.einsum("ij,ij->i", V, V) > 1e-9
+        return partial_covariance(V, decision.information[known], hidden) / length**2
     X = np.linalg.solve(root.T, curvature_jacobian(c).T)
     result: Array = X.T @ X / length**2
     return result
-
-
-def _open_covariance(V: Array, information: Array, length: float) -> Array:
-    """Covariance where some combinations of K are not observed at all: infinite and NaN in what they touch."""
-    to_q = np.array([1.0, math.sqrt(2.0), 1.0])
-    C: Array = (V / information) @ V.T / np.outer(to_q, to_q) / length**2
-    for i in np.flatnonzero(1.0 - np.einsum("ij,ij->i", V, V) > 1e-9):
-        C[i, :] = C[:, i] = math.nan
-        C[i, i] = math.inf
-    return C

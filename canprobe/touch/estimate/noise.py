@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, checked, positive
 
-# Standard deviations of measured points and normals: scalar, per sample, or covariances.
+CHI2_MEDIAN, CHI2_99, CHI2_999 = 2.366, 11.34, 16.27
+"""Median, 99 % and 99.9 % points of χ² with three degrees of freedom, which a sample has."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +91,7 @@ class Noise:
 
     @property
     def normal_variance(self) -> Array:
-        """(n,) variance per axis, the mean one where axes differ, rad²."""
+        """The same of the normals, rad²."""
         return _mean_variance(self.normal)
 
     def scaled(self, length: float, R: Array) -> Noise:
@@ -105,13 +106,7 @@ class Noise:
 
 
 def make_noise(n: int, sigma_point: ArrayLike, sigma_normal: ArrayLike, coupling: float = 0.0) -> Noise:
-    """Checked noise of n samples.
-
-    Args:
-        n: samples.
-        sigma_point: m; a number, (n,), or covariances (3, 3) or (n, 3, 3) in m².
-        sigma_normal: rad; in the same forms.
-        coupling: 1/m, see `Noise`.
+    """Checked noise of n samples, each sigma a number, (n,), or covariances (3, 3) or (n, 3, 3).
 
     Raises:
         UsageError: naming the field, when it has another shape, or is not finite and above 0 (definite).
@@ -207,14 +202,3 @@ class Prior:
             A[row, 3 + row] = factor * inverse
         b[3] = b[5] = self.curvature * length * inverse
         return A, b
-
-
-def path_extent(points: Array, noise_floor: float) -> float:
-    """Length of a path for scaling and for `Prior.weak`: the largest distance from its last point, never below noise.
-
-    Args:
-        points: (n, 3) m.
-        noise_floor: m, above 0: what to fall back to when nothing moved.
-    """
-    offset = points - points[-1]
-    return max(math.sqrt(float(np.einsum("ij,ij->i", offset, offset).max())), noise_floor)

@@ -1,39 +1,34 @@
-"""Batch Gauss–Newton on the nine-parameter local model, robust, and what a quadric leaves out of its residuals.
+"""Batch Gauss–Newton on the local model, robust, and what a quadric leaves out of its residuals.
 
-Source: ESTIMATION of local shape as an errors-in-variables problem; the whitening `σ_n² I + K² σ_p²` keeps it at the
-Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom samples lose
-weight (`robust`), measured against the median residual where that is larger than expected.
+The points have errors as the normals do, so that the residuals are whitened by `σ_n² I + K² σ_p²`: that keeps the fit
+at the Cramér–Rao bound also on tight curvature. Beyond the 99.9 % point of χ² with three degrees of freedom samples
+lose weight (`robust`), measured against the median residual where that is larger than expected.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from canprobe.touch.estimate.noise import mixed
+from canprobe.touch.estimate.noise import CHI2_999, CHI2_MEDIAN, mixed
 from canprobe.touch.estimate.quadric import (
+    DEGREE,
     UNIT,
     Decision,
     Design,
-    Linearised,
     decide,
-    gradient_rows,
     linear_rows,
     linearise,
-    rows,
+    sharpest,
+    size_of,
     spread_of,
-    value_rows,
 )
 from canprobe.touch.linear_algebra import Array, inverted, solved, upper_root
 
-# Batch Gauss–Newton on the nine-parameter local model, robust, with the rank decided on curvature.
-
-CHI2_999 = 16.27
 DIFFUSE = 1e-2
 """Root of the information, in units of the length, that keeps a root regular: K known to ±200/length."""
-_MEDIAN_CHI2 = 2.366
 _TOLERANCE = 3e-8
 _ITERATIONS = 40
 _START_ROUNDS = 8
@@ -71,27 +66,24 @@ class Fit(NamedTuple):
 
 
 def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None) -> Fit:
-    """Fit the model to a design.
+    """Fit the model to a design with a prior (`Prior.rows`).
 
-    Args:
-        d: constant parts (`quadric.design`).
-        prior: rows (6, 9) and right-hand side (6,) (`Prior.rows`).
-        independent: (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
+    `independent` (3, n, n) makes correlated whitened samples independent (`Correlation.whitener`); None: they are.
     """
     spread = spread_of(d.X, d.point_variance)
     c, root, decision = linear_start(d, prior, spread)
     best_cost, step, halvings, converged = np.inf, np.zeros(9), 0, False
     best = c
     for _ in range(_ITERATIONS):
-        r, J, _ = rows(c, d)
-        square = np.einsum("ij,ij->i", r, r)
+        at = linearise(c, d)
+        square = np.einsum("ij,ij->i", at.r, at.r)
         weight, cost = robust(square)
         w = np.sqrt(weight)[:, None]
-        rw, Jw = r * w, J * w[:, :, None]
+        r, J = at.r * w, at.jacobian() * w[:, :, None]
         if independent is not None:
             beyond = cost - float(weight @ square)
-            rw, Jw = mixed(independent, rw[:, :, None])[:, :, 0], mixed(independent, Jw)
-            cost = float(np.sum(rw * rw)) + beyond
+            r, J = mixed(independent, r[:, :, None])[:, :, 0], mixed(independent, J)
+            cost = float(np.sum(r * r)) + beyond
         # without the prior's part a large c33 on a short path, which flattens f/|∇f|, would look good. The noise's
         # log-determinant has no place here: with the feet as unknowns it does not belong to the likelihood, and on
         # tight curvature it draws K down by a tenth
@@ -102,13 +94,13 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             c = best + step
             continue
         best, best_cost, halvings = c, cost, 0
-        chi2, rows_of_r, rows_of_J = float(np.sum(rw * rw)), rw.reshape(-1), Jw.reshape(-1, 9)
-        b = rows_of_J @ c - rows_of_r
-        target, root, decision = solve_rows(rows_of_J, b, prior, spread, size_of(c), known=decision)
+        r, J = r.reshape(-1), J.reshape(-1, 9)
+        chi2 = float(r @ r)
+        target, root, decision = solve_rows(J, J @ c - r, prior, spread, size_of(c), known=decision)
         step = target - best
         c = target
         if np.abs(step).max() < _TOLERANCE:
-            final = solve_rows(rows_of_J, rows_of_J @ best - rows_of_r, prior, spread, size_of(c))
+            final = solve_rows(J, J @ best - r, prior, spread, size_of(c))
             if final[2].rank == decision.rank:
                 c, root, decision = final
                 converged = True
@@ -116,7 +108,7 @@ def fit(d: Design, prior: tuple[Array, Array], independent: Array | None = None)
             decision = final[2]
     c = c if converged else best
     has_prior = bool(prior[0][3:].any())
-    free, free_root = (c, root) if has_prior else _freed(best, rows_of_J, rows_of_r, root, prior)
+    free, free_root = (c, root) if has_prior else _freed(best, J, r, root, prior)
     freedom = max(3 * len(square) - 6 - decision.rank, 1)
     return Fit(c, root, decision, free, free_root, chi2 / freedom, int(np.sum(weight < 1.0)), converged)
 
@@ -131,16 +123,8 @@ def _freed(c: Array, J: Array, r: Array, root: Array, prior: tuple[Array, Array]
 def linear_start(
     d: Design, prior: tuple[Array, Array], spread: Array, weight: Array | None = None
 ) -> tuple[Array, Array, Decision]:
-    """The linear solution; where some samples are far off, again with weights that fall with the square.
-
-    Args:
-        d: constant parts.
-        prior: rows and right-hand side.
-        spread: of the points (`quadric.spread_of`).
-        weight: (n,) to begin with; None for 1.
-
-    Returns:
-        Parameters (9,), root (9, 9) and rank decision.
+    """The linear solution, as of `solve_rows`; where some samples are far off, again with weights that fall with the
+    square. `weight` (n,) is that to begin with.
     """
     A, b = linear_rows(d)
     # the points' noise in z² and its kin would draw c13, c23, c33 far off, from where there is no way back
@@ -149,7 +133,7 @@ def linear_start(
     answer = solve_rows(A * w[:, None], b * w, prior, spread, 0.0)
     for _ in range(_START_ROUNDS):
         square = np.square(A @ answer[0] - b).reshape(-1, 3).sum(axis=1)
-        scale = _median(square) / _MEDIAN_CHI2
+        scale = _median(square) / CHI2_MEDIAN
         if float(square.max()) < _GROSS * scale:
             break
         w = np.sqrt(1.0 / (1.0 + square / (9.0 * max(scale, 1e-300)))).repeat(3)
@@ -165,24 +149,19 @@ def _median(values: Array) -> float:
 def robust(square: Array) -> tuple[Array, float]:
     """Weights (n,) and robust cost of squared whitened residuals (n,); far off, a sample costs no more and pulls by
     the inverse cube of its distance: at the end of a long lever even a little would be too much."""
-    limit = CHI2_999 * max(1.0, _median(square) / _MEDIAN_CHI2)
+    limit = CHI2_999 * max(1.0, _median(square) / CHI2_MEDIAN)
     ratio = limit / np.maximum(square, limit)
     # d² inside, k (2 − k/d²) outside
     return ratio * ratio, float(np.sum(np.where(ratio < 1.0, limit * (2.0 - ratio), square)))
 
 
-def size_of(c: Array) -> float:
-    """‖K‖, Frobenius."""
-    c11, c12, c22 = c[6:].tolist()
-    return float(2.0 * np.sqrt(c11 * c11 + 2.0 * c12 * c12 + c22 * c22))
-
-
 def solve_rows(
     A: Array, b: Array, prior: tuple[Array, Array], spread: Array, size: float, *, known: Decision | None = None
 ) -> tuple[Array, Array, Decision]:
-    """Least squares by QR; combinations of K that were not observed are held at the value nearest to flat.
+    """Least squares `A c = b` by QR; combinations of K that were not observed are held at the value nearest to flat.
 
-    A decision that is `known` to have found everything observed is not taken again.
+    A `known` decision that found everything observed is not taken again; `spread`: of the points, `size`: ‖K‖. Returns
+    the parameters (9,), the root (9, 9) of their information, and the decision.
     """
     P, p = prior
     stacked = np.empty((len(A) + 6, 10))
@@ -213,83 +192,6 @@ def solve_rows(
     c[6:] = UNIT * (V @ np.linalg.lstsq(root_q @ V, z[6:], rcond=None)[0]) if decision.rank else 0.0
     c[:6] = solved(root[:6, :6], z[:6] - root[:6, 6:] @ c[6:])
     return c, root, decision
-
-
-# The terms of a surface's polynomial f: the nine of a quadric, and the cubic and quartic ones that it leaves out.
-#
-# The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane, φ all monomials of third and fourth
-# degree, each times the root of its binomial coefficient, so that independent a of one variance mean the same in all
-# directions.
-#
-# All are polynomials of the place, so values, gradients and changes of the origin are each one product of a constant
-# matrix with the place's monomials.
-
-_POWER_Y = np.array([0, 1, 2, 3, 0, 1, 2, 3, 4])
-DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
-"""(9,) degree of each term that a quadric leaves out."""
-_FACTOR = [math.sqrt(math.comb(int(n), int(k))) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
-_HIGHER = [(int(n - k), int(k), 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
-_QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
-"""Powers of x, y, z in the terms of the parameters of `quadric`, in their order."""
-_OWN = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
-_POWERS = [_QUADRIC[k] for k in (2, 0, 1)] + [(0, 0, 1), (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1)]
-_POWERS += [(0, 0, 2), *_HIGHER]
-
-
-def monomials(x: Any, y: Any, z: Any) -> list[Any]:
-    """The 19 monomials at a place, or at places given as arrays."""
-    xx, xy, yy = x * x, x * y, y * y
-    rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
-    return [1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest]
-
-
-def _basis() -> Array:
-    """(19, 72): values and derivatives by x, y, z of the 18 terms, per monomial."""
-    found = np.zeros((len(_POWERS), 4, 18))
-    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _OWN + _FACTOR, strict=True)):
-        found[_POWERS.index(powers), 0, column] = factor
-        for axis in range(3):
-            i, k, n = np.array(powers) - np.eye(3, dtype=int)[axis]
-            if powers[axis]:
-                found[_POWERS.index((i, k, n)), 1 + axis, column] = factor * powers[axis]
-    return found.reshape(len(_POWERS), -1)
-
-
-def _shift() -> Array:
-    """(19, 162): A and Q of `shifted`, per monomial of the new place."""
-    found = np.zeros((len(_POWERS), 18, 9))
-    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True))}
-    low = {powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _OWN, strict=True))}
-    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True)):
-        for a in range(i + 1):
-            for b in range(k + 1):
-                row, per = (own if a + b > 2 else low)[a, b, 0]
-                size = factor * math.comb(i, a) * math.comb(k, b) / per
-                found[_POWERS.index((i - a, k - b, 0)), row, column] = size
-    return found.reshape(len(_POWERS), -1)
-
-
-_BASIS, _SHIFT = _basis(), _shift()
-
-
-def basis(places: Array) -> Array:
-    """Values and derivatives by x, y, z (n, 4, 18) of all terms, a quadric's first, from the `monomials` (n, 19)."""
-    return (places @ _BASIS).reshape(len(places), 4, 18)
-
-
-def terms(x: Array, y: Array) -> Array:
-    """Values and derivatives by x and y (n, 3, 9) of the terms that a quadric leaves out, at places (n,), (n,)."""
-    return basis(np.array(monomials(x, y, np.zeros(len(x)))).T)[:, :3, 9:]
-
-
-def shifted(x: float, y: float) -> tuple[Array, Array]:
-    """The terms that a quadric leaves out about another place (x, y).
-
-    Returns:
-        A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the parameters of `quadric`.
-    """
-    both = (np.array(monomials(x, y, 0.0)) @ _SHIFT).reshape(18, 9)
-    return both[:9], both[9:]
 
 
 # What a quadric leaves out: the cubic and quartic terms of a surface, found in the residuals or allowed for.
@@ -342,14 +244,9 @@ _CAUTIOUS = np.repeat([0.0, (NONE + USUAL) / len(CHANGES), TAIL / len(EVIDENCE)]
 
 
 class Corrected(NamedTuple):
-    """A fit with what it leaves out.
+    """A fit with what it leaves out: parameters (9,) and the upper triangular root (9, 9) of their information.
 
-    Attributes:
-        c: (9,) parameters.
-        root: (9, 9) upper triangular information root.
-        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals cannot
-            tell.
-        trusted: the change of K is small enough for a linear step.
+    misfit, trusted: as of `Averaged`.
     """
 
     c: Array
@@ -366,7 +263,9 @@ class Averaged(NamedTuple):
         spread: (9, 9) covariance that the terms add to theirs.
         share: (9,) how much of each direction of the terms the data settle: mean variance left.
         terms: (9,) the terms in these directions.
-        misfit, trusted: as of `Corrected`.
+        misfit: probability of there being one, without the caution of `BLURRED`; `1 − NONE` where the residuals do not
+            show it.
+        trusted: the change of K is small enough for a linear step.
     """
 
     shift: Array
@@ -380,12 +279,6 @@ class Averaged(NamedTuple):
 def scales(curvature: float) -> Array:
     """(9,) usual size of each term over that of the cubic ones, at ‖K‖ · length."""
     return np.where(_CUBIC, 1.0, 0.25 * max(curvature, _NEVER_LESS))
-
-
-def sharpest(c: Array) -> float:
-    """Largest |κ| · length of parameters (9,)."""
-    c11, c12, c22 = c[6:].tolist()
-    return float(abs(c11 + c22) + math.hypot(c11 - c22, 2.0 * c12))
 
 
 def averaged(m: Array, s: Array, carried: Array, curvature: float, blur: float = 0.0) -> Averaged:
@@ -428,14 +321,7 @@ def _prior(blur: float) -> Array:
 
 
 def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corrected:
-    """Average a converged fit, everything observed, over the misfit of its quadric.
-
-    Args:
-        c: (9,) in the frame at the last sample, dimensionless.
-        root: (9, 9) of its information, prior included.
-        d: its samples.
-        independent: as for `nonlinear.fit`.
-    """
+    """Average a converged fit (c in the frame at the last sample, its root; else as `fit`) over its misfit."""
     J, E, r, slack = _rows(c, d, independent)
     inverse = inverted(root)
     H = inverse @ inverse.T
@@ -450,12 +336,6 @@ def correct(c: Array, root: Array, d: Design, independent: Array | None) -> Corr
     return Corrected(c + found.shift, upper_root(inverted(lower)), found.misfit, found.trusted)
 
 
-def term_rows(at: Linearised, d: Design) -> Array:
-    """Whitened rows (n, 3, 9) of the terms at the likely places of samples."""
-    found = terms(at.X[:, 0], at.X[:, 1])
-    return at.jacobian(found[:, 0], at.V[:, :, :2] @ found[:, 1:], d)
-
-
 def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array, Array, Array]:
     """Whitened rows of the parameters (3n, 9) and of the terms (3n, 9), residuals (3n,), what is left of Jᵀ r (9,).
 
@@ -463,8 +343,7 @@ def _rows(c: Array, d: Design, independent: Array | None) -> tuple[Array, Array,
     """
     at = linearise(c, d)
     weight = robust(np.einsum("ij,ij->i", at.r, at.r))[0][:, None, None]
-    J = at.jacobian(value_rows(at.X), gradient_rows(at.X, at.V), d)
-    joined = np.concatenate([J, term_rows(at, d), at.r[:, :, None]], axis=2)
+    joined = np.concatenate([at.jacobian(18), at.r[:, :, None]], axis=2)
     rows, fitted = joined * weight, joined[:, :, [*range(9), -1]] * np.sqrt(weight)
     if independent is not None:
         rows, fitted = mixed(independent, rows), mixed(independent, fitted)

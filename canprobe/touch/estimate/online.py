@@ -4,40 +4,32 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample, Doubt
-from canprobe.touch.estimate.answer import TO_Q, SurfaceEstimate, is_umbilic
-from canprobe.touch.estimate.likelihood import Touches, make_touches
-from canprobe.touch.estimate.noise import make_noise
-from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.answer import SurfaceEstimate, is_umbilic
+from canprobe.touch.estimate.noise import CHI2_999, CHI2_MEDIAN
+from canprobe.touch.estimate.quadric import TO_Q
 from canprobe.touch.linear_algebra import Array, positive
-
-# What an online estimator is, and the gate that every sample passes.
 
 
 @dataclass(slots=True)
 class Dropped:
-    """Samples that were not used, by reason.
-
-    Attributes:
-        not_finite: a NaN or infinite time, place or normal.
-        repeated: the time of the sample before.
-        backwards: a time before that of the sample before.
-        zero_sigma: a standard deviation of 0 or less, or not finite.
-        not_unit: a normal that is not a unit vector.
-    """
+    """Samples that were not used, by reason."""
 
     not_finite: int = 0
+    """A NaN or infinite time, place or normal."""
     repeated: int = 0
+    """The time of the sample before."""
     backwards: int = 0
+    """A time before that of the sample before."""
     zero_sigma: int = 0
+    """A standard deviation of 0 or less, or not finite."""
     not_unit: int = 0
+    """A normal that is not a unit vector."""
 
     @property
     def total(self) -> int:
@@ -48,7 +40,7 @@ class Dropped:
 WIDER = {Doubt.SATURATED: 3.0, Doubt.CUT: 3.0, Doubt.SMALL: 3.0, Doubt.DEAD: 1.5}
 """Factor of both standard deviations of a contact whose image is in doubt."""
 DOUBTS_OF = 160
-"""Last contacts whose doubts an estimate tells."""
+"""Last contacts whose doubts an estimate reports."""
 
 
 class Estimator(Protocol):
@@ -69,15 +61,7 @@ class Estimator(Protocol):
 
 
 class Gate:
-    """Lets through what an estimator can use and counts the rest.
-
-    Args:
-        sigma_point: effective standard deviation of a point per axis, m.
-        sigma_normal: of a normal per tangent axis, rad.
-
-    Raises:
-        UsageError: when either is not above 0.
-    """
+    """Lets through what an estimator can use and counts the rest; sigmas: of points (m) and normals (rad), above 0."""
 
     def __init__(self, sigma_point: float, sigma_normal: float) -> None:
         self.sigma_point = positive("sigma_point", sigma_point)
@@ -133,58 +117,6 @@ def _usable(sigma: float | None) -> bool:
     return sigma is None or (math.isfinite(sigma) and sigma > 0.0)
 
 
-class WindowEstimator:
-    """Base of the estimators that keep their last samples and solve them as a batch when asked.
-
-    Args:
-        sigma_point, sigma_normal: see `Gate`.
-        window: samples that are kept.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
-    """
-
-    least = 2
-    """Fewer samples give no answer."""
-
-    def __init__(self, *, sigma_point: float, sigma_normal: float, window: int, coupling: float = 0.0) -> None:
-        if window < self.least:
-            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
-        self.dropped = Dropped()
-        self._gate = Gate(sigma_point, sigma_normal)
-        self._coupling = coupling
-        self._samples: deque[ContactSample] = deque(maxlen=window)
-        self._answer: SurfaceEstimate | None = None
-
-    def add(self, sample: ContactSample) -> None:
-        """Take one contact."""
-        if self._gate.passes(sample, self.dropped):
-            self._samples.append(sample)
-            self._answer = None
-
-    def estimate(self) -> SurfaceEstimate | None:
-        """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
-        if self._answer is None and len(self._samples) >= self.least:
-            touches = self._touches()
-            if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
-                answer = self._solve(touches)
-                self._answer = replace(answer, notes=answer.notes + self._gate.notes())
-        return self._answer
-
-    def reset(self) -> None:
-        """Forget all samples."""
-        self._samples.clear()
-        self._gate.reset()
-        self._answer = None
-
-    def _solve(self, touches: Touches) -> SurfaceEstimate:
-        raise NotImplementedError
-
-    def _touches(self) -> Touches:
-        points: Array = np.array([s.p_base for s in self._samples])
-        normals: Array = np.array([s.n_base for s in self._samples])
-        sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
-        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling))
-
-
 # Whether the surface has changed under a filter: an innovation test that wrong single samples do not set off.
 #
 # A change of the surface makes every following sample disagree with the prediction, a wrong centroid makes one. So two
@@ -203,8 +135,6 @@ USUAL = (0.3, 2.0)
 the upper bound no innovation, capped as it is, could ever set off an alarm."""
 AGREES = 4.8
 """Squared residual over the median one up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
-_MEDIAN = 2.366
-"""Median of χ² of 3."""
 RUNNING, LONG_TERM = 0.1, 0.004
 """Weights of one sample in the running and in the long-term innovation."""
 
@@ -229,11 +159,9 @@ class ChangeTest:
         return _bounded(self._all)
 
     def take(self, square: float, caution: float = 1.0) -> bool:
-        """Take the squared innovation, χ² of 3, of a sample; whether the surface now looks changed.
+        """Take a sample's squared innovation, χ² of 3; whether the surface now looks changed.
 
-        Args:
-            square: of the sample.
-            caution: factor of both thresholds.
+        `caution` multiplies both thresholds.
         """
         now = min(square, CHI2_999) / 3.0
         self._last.append(now)
@@ -247,7 +175,7 @@ class ChangeTest:
             self._of_best += LONG_TERM * (best - self._of_best)
         return False
 
-    def usual_again(self, squares: Sequence[float]) -> bool:
+    def usual_again(self, squares: Array) -> bool:
         """Whether such squared innovations alone would set off no alarm, once something is taken into account."""
         return float(np.minimum(squares, CHI2_999).mean()) / 3.0 < ALARM * self.usual
 
@@ -263,12 +191,10 @@ def _bounded(usual: float) -> float:
 
 
 def looks_changed(squares: Array) -> bool:
-    """The same test on a batch: whether its last few samples disagree with the fit of all of them.
-
-    Args:
-        squares: (n,) squared residuals, χ² of 3, in the order of time.
+    """The same test on a batch's squared residuals (n,), in the order of time: whether the last few disagree with the
+    fit of all.
     """
-    usual = _bounded(float(np.median(squares)) / _MEDIAN)
+    usual = _bounded(float(np.median(squares)) / CHI2_MEDIAN)
     last = np.sort(np.minimum(squares[-LAST_FEW:], CHI2_999)) / 3.0
     return bool(last.mean() >= ALARM * usual and last[:BEST].mean() >= ALARM_OF_BEST * BEST_SHARE * usual)
 
@@ -346,12 +272,7 @@ class FollowingEstimator:
 
 
 def less_certain(answer: SurfaceEstimate, late: Array) -> SurfaceEstimate:
-    """An answer whose curvature is also off by a share of a tensor, of either sign, with standard deviation 1.
-
-    Args:
-        answer: everything observed.
-        late: (3, 3) of the frame of the points, 1/m.
-    """
+    """An answer, everything observed, whose curvature is also off by a tensor (3, 3, 1/m) times a normal variate."""
     P = answer.T_frame_contact[:3, :2]
     (k11, k12), (_, k22) = (P.T @ late @ P).tolist()
     entries = np.array([k11, k12, k22])

@@ -1,52 +1,138 @@
-"""The nine-parameter local model, a quadric near the origin of a working frame, with c34 = −½; and which of it was
-observed.
+"""The local model, a quadric near the origin of a working frame with c34 = −½, and which of its curvature was observed.
 
-Parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
+Nine parameters, in this order: `c14, c24, c44` (tilt and height of the working frame), `c13, c23, c33`, and
 `c11, c12, c22`, the half of K, last, so that the trailing 3x3 block of an upper triangular information root is the
-information about K with all else unknown. Lengths are in units of some length L: a dimensionless problem.
+information about K with all else unknown. Beside them stand the nine cubic and quartic terms that a quadric leaves
+out. Lengths are in units of some length L: a dimensionless problem.
 
-Residual rows of a sample (x, n): `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`, whitened by σ_p² and
+Residuals of a sample (x, n): `f/|∇f|` and the two tangential parts of `∇f/|∇f| − n`, whitened by σ_p² and
 `σ_n² I + K² σ_p²`: the point's tangential noise turns the model's normal by K times it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.touch.estimate.noise import Noise
-from canprobe.touch.linear_algebra import Array, eigen
+from canprobe.touch.linear_algebra import Array, eigen, principal
 
-# The nine-parameter local model: a quadric near the origin of a working frame, with c34 = −½.
-
-UNIT = np.array([0.5, 0.5 / np.sqrt(2.0), 0.5])
-"""c11, c12, c22 per unit of q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
+TO_Q = np.array([1.0, math.sqrt(2.0), 1.0])
+"""K11, K12, K22 to q = (K11, √2 K12, K22), in which a rotation of the frame is orthogonal."""
+UNIT = 0.5 / TO_Q
+"""c11, c12, c22 per unit of q."""
 
 _INDEX = ((0, 3), (1, 3), (3, 3), (0, 2), (1, 2), (2, 2), (0, 0), (0, 1), (1, 1))
-BASIS = np.zeros((9, 4, 4))
-"""(9, 4, 4): S = BASISᵀ c + constant."""
+_BASIS = np.zeros((9, 4, 4))
+"""S = Σ c_k _BASIS_k + _CONSTANT."""
 for _k, (_i, _j) in enumerate(_INDEX):
-    BASIS[_k, _i, _j] = BASIS[_k, _j, _i] = 1.0
-_FLAT = BASIS.reshape(9, 16)
-_PICK = np.array([4 * i + j for i, j in _INDEX])
+    _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 _CONSTANT = np.zeros((4, 4))
 _CONSTANT[2, 3] = _CONSTANT[3, 2] = -0.5
-_WIDE = np.concatenate([BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
+_WIDE = np.concatenate([_BASIS, _CONSTANT[None]]).transpose(1, 0, 2).reshape(4, 40)
 """S as the sum of ten matrices, side by side."""
 _ENTRIES = np.array([[40 * i + 4 * k + j for k in range(10)] for i, j in (*_INDEX, (2, 3))])
 """Where the parameters stand in each of them, and c34."""
 
 
-class Rows(NamedTuple):
-    """Whitened residuals (n, 3), their Jacobian (n, 3, 9) and the log-determinant of their covariances."""
+def matrix_of(c: Array) -> Array:
+    """S (4, 4) of parameters (9,)."""
+    return (c @ _BASIS.reshape(9, 16)).reshape(4, 4) + _CONSTANT
 
-    r: Array
-    J: Array
-    log_det: float
+
+def parameters_of(S: Array) -> Array:
+    """Parameters (9,) of S (4, 4), scaled to c34 = −½."""
+    result: Array = np.array([S[i, j] for i, j in _INDEX]) * (-0.5 / S[2, 3])
+    return result
+
+
+def size_of(c: Array) -> float:
+    """‖K‖ of parameters (9,), Frobenius."""
+    c11, c12, c22 = c[6:].tolist()
+    return 2.0 * math.sqrt(c11 * c11 + 2.0 * c12 * c12 + c22 * c22)
+
+
+def sharpest(c: Array) -> float:
+    """Largest |κ| of parameters (9,)."""
+    c11, c12, c22 = c[6:].tolist()
+    return float(abs(c11 + c22) + math.hypot(c11 - c22, 2.0 * c12))
+
+
+# The eighteen terms of f: nine of the quadric, and the cubic and quartic ones that it leaves out.
+#
+# The latter are terms `Σ a_j φ_j(x, y)` of the height over the tangent plane, φ all monomials of third and fourth
+# degree, each times the root of its binomial coefficient, so that independent a of one variance mean the same in all
+# directions. All terms are polynomials of the place, so values, gradients and changes of the origin are each one
+# product of a constant matrix with the place's monomials.
+
+_POWER_Y = (0, 1, 2, 3, 0, 1, 2, 3, 4)
+DEGREE = np.array([3, 3, 3, 3, 4, 4, 4, 4, 4])
+"""(9,) degree of each term that a quadric leaves out."""
+_FACTOR = [math.sqrt(math.comb(int(n), k)) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+_HIGHER = [(int(n) - k, k, 0) for n, k in zip(DEGREE, _POWER_Y, strict=True)]
+_QUADRIC = [(1, 0, 0), (0, 1, 0), (0, 0, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2), (2, 0, 0), (1, 1, 0), (0, 2, 0)]
+"""Powers of x, y, z in the terms of the nine parameters, in their order."""
+_OWN = [2.0, 2.0, 1.0, 2.0, 2.0, 1.0, 1.0, 2.0, 1.0]
+_POWERS = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (2, 0, 0), (1, 1, 0), (0, 2, 0), (1, 0, 1), (0, 1, 1), (0, 0, 2)]
+_POWERS += _HIGHER
+
+
+def _monomials(x: Any, y: Any, z: Any) -> Array:
+    """The 19 monomials of `_POWERS` at a place, (19,), or at places given as arrays, (19, n)."""
+    xx, xy, yy = x * x, x * y, y * y
+    rest = [xx * x, xx * y, x * yy, yy * y, xx * xx, xx * xy, xx * yy, xy * yy, yy * yy]
+    return np.array([1.0 + 0.0 * x, x, y, z, xx, xy, yy, x * z, y * z, z * z, *rest])
+
+
+def _derivatives() -> Array:
+    """(19, 4, 18): values and derivatives by x, y, z of the 18 terms, per monomial."""
+    found = np.zeros((len(_POWERS), 4, 18))
+    for column, (powers, factor) in enumerate(zip(_QUADRIC + _HIGHER, _OWN + _FACTOR, strict=True)):
+        found[_POWERS.index(powers), 0, column] = factor
+        for axis in range(3):
+            i, k, n = np.array(powers) - np.eye(3, dtype=int)[axis]
+            if powers[axis]:
+                found[_POWERS.index((i, k, n)), 1 + axis, column] = factor * powers[axis]
+    return found
+
+
+def _shift() -> Array:
+    """(19, 162): A and Q of `shifted`, per monomial of the new place."""
+    found = np.zeros((len(_POWERS), 18, 9))
+    own = {powers: (row, factor) for row, (powers, factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True))}
+    low = {powers: (9 + row, factor) for row, (powers, factor) in enumerate(zip(_QUADRIC, _OWN, strict=True))}
+    for column, ((i, k, _), factor) in enumerate(zip(_HIGHER, _FACTOR, strict=True)):
+        for a in range(i + 1):
+            for b in range(k + 1):
+                row, per = (own if a + b > 2 else low)[a, b, 0]
+                size = factor * math.comb(i, a) * math.comb(k, b) / per
+                found[_POWERS.index((i - a, k - b, 0)), row, column] = size
+    return found.reshape(len(_POWERS), -1)
+
+
+_SHIFT = _shift()
+_TABLE = {count: _derivatives()[:, :, :count].reshape(len(_POWERS), -1) for count in (9, 18)}
+
+
+def terms(X: Array, count: int = 18) -> Array:
+    """Values and derivatives by x, y, z (n, 4, count) of the first terms of f, the quadric's nine first, at (n, 3)."""
+    return (_monomials(*X.T).T @ _TABLE[count]).reshape(len(X), 4, count)
+
+
+def shifted(x: float, y: float) -> tuple[Array, Array]:
+    """The terms that a quadric leaves out about another place (x, y).
+
+    Returns:
+        A (9, 9) and Q (9, 9): terms a become terms `A a` there, and `Q a` more in the nine parameters.
+    """
+    both = (_monomials(x, y, 0.0) @ _SHIFT).reshape(18, 9)
+    return both[:9], both[9:]
+
+
+# Residuals of samples and their Jacobian.
 
 
 class Design(NamedTuple):
@@ -66,41 +152,9 @@ class Design(NamedTuple):
     normal_variance: Array
 
 
-def matrix_of(c: Array) -> Array:
-    """S (4, 4) of parameters (9,)."""
-    return (c @ _FLAT).reshape(4, 4) + _CONSTANT
-
-
-def parameters_of(S: Array) -> Array:
-    """Parameters (9,) of S (4, 4), scaled to c34 = −½."""
-    result: Array = S.reshape(16)[_PICK] * (-0.5 / S[2, 3])
-    return result
-
-
 def design(points: Array, normals: Array, noise: Noise) -> Design:
     """Constant parts for points and outward normals (n, 3) in the working frame."""
     return Design(points, tangents(normals), noise, noise.point_variance, noise.normal_variance)
-
-
-def value_rows(X: Array) -> Array:
-    """df/dc (n, 9) at points (n, 3)."""
-    x, y, z = X.T
-    F = np.empty((len(X), 9))
-    F[:, 0], F[:, 1], F[:, 2] = 2 * x, 2 * y, 1.0
-    F[:, 3], F[:, 4], F[:, 5] = 2 * x * z, 2 * y * z, z * z
-    F[:, 6], F[:, 7], F[:, 8] = x * x, 2 * x * y, y * y
-    return F
-
-
-def gradient_rows(X: Array, V: Array) -> Array:
-    """d(V ∇f)/dc (n, k, 9) at points (n, 3) for vectors (n, k, 3)."""
-    x, y, z = (2.0 * X.T)[:, :, None]
-    vx, vy, vz = V[:, :, 0], V[:, :, 1], V[:, :, 2]
-    G = np.empty((*vx.shape, 9))
-    G[:, :, 0], G[:, :, 1], G[:, :, 2] = 2.0 * vx, 2.0 * vy, 0.0
-    G[:, :, 3], G[:, :, 4], G[:, :, 5] = z * vx + x * vz, z * vy + y * vz, z * vz
-    G[:, :, 6], G[:, :, 7], G[:, :, 8] = x * vx, y * vx + x * vy, y * vy
-    return G
 
 
 def tangents(normals: Array) -> Array:
@@ -122,27 +176,18 @@ def linear_rows(d: Design) -> tuple[Array, Array]:
     The second multiplies the normals' noise into the regressor and shrinks K by some percent: a start, no answer.
     """
     w_p, w_n = 1.0 / np.sqrt(d.point_variance), 1.0 / np.sqrt(d.normal_variance)
-    A = np.empty((len(d.X), 3, 9))
-    A[:, 0] = value_rows(d.X) * w_p[:, None]
-    A[:, 1:] = gradient_rows(d.X, d.T) * w_n[:, None, None]
+    F = terms(d.X, 9)
+    A = np.concatenate([F[:, :1] * w_p[:, None, None], d.T @ F[:, 1:] * w_n[:, None, None]], axis=1)
     b = np.stack([d.X[:, 2] * w_p, d.T[:, 0, 2] * w_n, d.T[:, 1, 2] * w_n], axis=1)
     return A.reshape(-1, 9), b.reshape(-1)
 
 
-def rows(c: Array, d: Design) -> Rows:
-    """Whitened residuals and Jacobian at parameters (9,).
+class Linearised(NamedTuple):
+    """The model at the likely places of samples.
 
     The model's normal is compared at the foot of the measured point, and the Jacobian is taken where the sample most
     likely was (foot moved by the part of the residual that the point's tangential noise explains). At the measured
     point itself its noise would enter the regressors together with the residuals, which draws K towards 0.
-    """
-    at = linearise(c, d)
-    log_det = -2.0 * float(np.log(at.W[:, 1, 1] * at.W[:, 2, 2]).sum())
-    return Rows(at.r, at.jacobian(value_rows(at.X), gradient_rows(at.X, at.V), d), log_det)
-
-
-class Linearised(NamedTuple):
-    """The model at the likely places of the samples, from which any term of f has its Jacobian.
 
     Attributes:
         r: (n, 3) whitened residuals.
@@ -160,10 +205,17 @@ class Linearised(NamedTuple):
     inverse: Array
     W: Array
 
-    def jacobian(self, F: Array, G: Array, d: Design) -> Array:
-        """Whitened Jacobian (n, 3, k) of k terms of f, from df/dc (n, k) and d(V ∇f)/dc (n, 3, k); changes G."""
-        G[:, 1:] -= (d.T @ self.V[:, 0, :, None]) * G[:, :1]
-        G[:, 0] = F
+    @property
+    def log_det(self) -> float:
+        """Log-determinant of the covariances of the residuals."""
+        return -2.0 * float(np.log(self.W[:, 1, 1] * self.W[:, 2, 2]).sum())
+
+    def jacobian(self, count: int = 9) -> Array:
+        """Whitened Jacobian (n, 3, count): 9 of the parameters, 18 with the terms that a quadric leaves out."""
+        F = terms(self.X, count)
+        G = self.V @ F[:, 1:]
+        G[:, 1:] -= (self.V[:, 1:] @ self.V[:, 0, :, None]) * G[:, :1]  # ∇f/|∇f| is blind to what is along it
+        G[:, 0] = F[:, 0]
         G *= self.inverse[:, None, None]
         G[:, 1:] -= self.bend[:, 0, :, None] * G[:, :1]  # the foot moves with the model
         result: Array = self.W @ G
@@ -171,7 +223,7 @@ class Linearised(NamedTuple):
 
 
 def linearise(c: Array, d: Design) -> Linearised:
-    """The model at parameters (9,), as for `rows`."""
+    """The model at parameters (9,) with samples."""
     S = matrix_of(c)
     B, h = 2.0 * S[:3, :3], 2.0 * S[:3, 3]
     g = d.X @ B + h
@@ -226,14 +278,9 @@ def _likely_places(d: Design, foot: Array, score: Array, K: Array, ghat: Array) 
 
 
 def transport(c: Array, T: Array) -> tuple[Array, Array]:
-    """The same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc.
+    """c' (9,) of the same surface in new coordinates, `S' = Tᵀ S T` scaled to c34 = −½, and dc'/dc (9, 9).
 
-    Args:
-        c: (9,).
-        T: (4, 4) takes new coordinates to old, lengths in the problem's unit.
-
-    Returns:
-        c' (9,) and M (9, 9).
+    T (4, 4) takes new coordinates to old, lengths in the problem's unit.
     """
     moved = ((T.T @ _WIDE).reshape(40, 4) @ T).reshape(-1).take(_ENTRIES)
     entries = moved[:, :9] @ c + moved[:, 9]
@@ -259,98 +306,6 @@ def curvature_jacobian(c: Array) -> Array:
     return D
 
 
-# What `quadric.rows` makes of one sample, in plain floats: a twentieth of the time at this size.
-
-
-class SampleRows(NamedTuple):
-    """Whitened rows of one sample.
-
-    Attributes:
-        weights: (12,) of three rows, one after the other: of f, f_x, f_y, f_z in the row of any term of f.
-        residuals: three, their signs turned.
-        place: x, y, z at which the sample most likely was: where the terms are to be taken.
-    """
-
-    weights: tuple[float, ...]
-    residuals: tuple[float, float, float]
-    place: tuple[float, float, float]
-
-
-def sample_rows(
-    c: Sequence[float], x: Sequence[float], n: Sequence[float], variances: tuple[float, float], coupling: float = 0.0
-) -> SampleRows:
-    """The rows of one sample with isotropic noise.
-
-    Args:
-        c: nine parameters in the order of `quadric`.
-        x, n: point and outward normal in the working frame, dimensionless.
-        variances: of point and normal per axis, dimensionless.
-        coupling: `Noise.coupling`, dimensionless.
-    """
-    point_variance, normal_variance = variances
-    c14, c24, c44, c13, c23, c33, c11, c12, c22 = c
-    px, py, pz = x
-    # value and gradient at the measured point, then at its foot
-    gx = 2.0 * (c11 * px + c12 * py + c13 * pz + c14)
-    gy = 2.0 * (c12 * px + c22 * py + c23 * pz + c24)
-    gz = 2.0 * (c13 * px + c23 * py + c33 * pz) - 1.0
-    square = gx * gx + gy * gy + gz * gz
-    f = 0.5 * (px * (gx + 2.0 * c14) + py * (gy + 2.0 * c24) + pz * (gz - 1.0)) + c44
-    k = f / square
-    r0 = f / math.sqrt(square)
-    px, py, pz = px - k * gx, py - k * gy, pz - k * gz
-    hx, hy, hz, inverse = _unit_gradient(c, px, py, pz)
-    # tangent axes of the measured normal
-    nx, ny, nz = n
-    size = math.sqrt(nz * nz + nx * nx)
-    ax, az = nz / size, -nx / size
-    bx, by, bz = -ny * nx / size, size, -ny * nz / size
-    ra, rb = ax * hx + az * hz, bx * hx + by * hy + bz * hz
-    # 2 S3 along the axes, and on them the shape operator with the coupling
-    ux, uy, uz = 2 * (c11 * ax + c13 * az), 2 * (c12 * ax + c23 * az), 2 * (c13 * ax + c33 * az)
-    wx = 2 * (c11 * bx + c12 * by + c13 * bz)
-    wy = 2 * (c12 * bx + c22 * by + c23 * bz)
-    wz = 2 * (c13 * bx + c23 * by + c33 * bz)
-    k11 = (ax * ux + az * uz) * inverse + coupling
-    k12 = (bx * ux + by * uy + bz * uz) * inverse
-    k22 = (bx * wx + by * wy + bz * wz) * inverse + coupling
-    bend_a = (hx * ux + hy * uy + hz * uz) * inverse
-    bend_b = (hx * wx + hy * wy + hz * wz) * inverse
-    # whitening: Cholesky of σ_n² I + K² σ_p²
-    l11 = math.sqrt(normal_variance + point_variance * (k11 * k11 + k12 * k12))
-    l21 = point_variance * k12 * (k11 + k22) / l11
-    l22 = math.sqrt(normal_variance + point_variance * (k12 * k12 + k22 * k22) - l21 * l21)
-    w0 = 1.0 / math.sqrt(point_variance)
-    ra /= l11
-    rb = (rb - l21 * ra) / l22
-    # where the sample most likely was
-    sb = rb / l22
-    sa = (ra - l21 * sb) / l11
-    ea, eb = point_variance * (k11 * sa + k12 * sb), point_variance * (k12 * sa + k22 * sb)
-    px, py, pz = px - ea * ax - eb * bx, py - eb * by, pz - ea * az - eb * bz
-    hx, hy, hz, inverse = _unit_gradient(c, px, py, pz)
-    # Jacobian there; the tangent axes lose their part along the model's normal
-    t = ax * hx + az * hz
-    ax, ay, az = ax - t * hx, -t * hy, az - t * hz
-    t = bx * hx + by * hy + bz * hz
-    bx, by, bz = bx - t * hx, by - t * hy, bz - t * hz
-    s0, sa, sb, m = w0 * inverse, inverse / l11, inverse / l22, l21 / l22
-    a0, a1, a2, a3 = -sa * bend_a, sa * ax, sa * ay, sa * az
-    b0, b1, b2, b3 = -sb * bend_b - m * a0, sb * bx - m * a1, sb * by - m * a2, sb * bz - m * a3
-    weights = s0, 0.0, 0.0, 0.0, a0, a1, a2, a3, b0, b1, b2, b3
-    return SampleRows(weights, (-w0 * r0, -ra, -rb), (px, py, pz))
-
-
-def _unit_gradient(c: Sequence[float], px: float, py: float, pz: float) -> tuple[float, float, float, float]:
-    """∇f/|∇f| and 1/|∇f|."""
-    c14, c24, _, c13, c23, c33, c11, c12, c22 = c
-    gx = 2.0 * (c11 * px + c12 * py + c13 * pz + c14)
-    gy = 2.0 * (c12 * px + c22 * py + c23 * pz + c24)
-    gz = 2.0 * (c13 * px + c23 * py + c33 * pz) - 1.0
-    inverse = 1.0 / math.sqrt(gx * gx + gy * gy + gz * gz)
-    return gx * inverse, gy * inverse, gz * inverse, inverse
-
-
 # Which combinations of curvature the data observed.
 #
 # The decision is made on K alone, in q = (K11, √2 K12, K22), where a turn of the frame is orthogonal, so that it does
@@ -369,8 +324,6 @@ def _unit_gradient(c: Sequence[float], px: float, py: float, pz: float) -> tuple
 SPREAD = 10.0
 SIGMA_LIMIT = 0.3
 NUMERIC = 1e-12
-
-_ROOT2 = math.sqrt(2.0)
 
 
 class Decision(NamedTuple):
@@ -406,9 +359,6 @@ def decide(root_q: Array, spread: Array, curvature: float) -> Decision:
         curvature: ‖K‖, dimensionless.
     """
     small, large, axes = _axes(spread)
-    if small >= SPREAD:  # spread for everything, the usual case
-        values, vectors = eigen(root_q.T @ root_q)
-        return Decision(np.maximum(values, 0.0), vectors, values >= _least(curvature, float(values[-1])))
     wide = np.array([large, 0.5 * (small + large), small]) >= SPREAD
     seen = axes[:, wide]
     root = root_q @ seen
@@ -428,10 +378,7 @@ def _least(curvature: float, largest: float) -> float:
 
 def _axes(spread: Array) -> tuple[float, float, Array]:
     """Eigenvalues of the spread and, as columns in q, the curvature along its main axis, the twist, and across."""
-    (a, b), (_, d) = spread.tolist()
-    mean, half = 0.5 * (a + d), 0.5 * (a - d)
-    radius = math.hypot(half, b)
-    angle = 0.5 * math.atan2(b, half)
+    mean, radius, angle = principal(spread)
     return mean - radius, mean + radius, turned(angle).T
 
 
@@ -440,13 +387,7 @@ def spread_share(spread: Array) -> Array:
 
     The noise of the points spreads them as well, and what it says about curvature is false. Where a share s of the
     spread is noise the information counts (1 − s)²: nothing at s = 1, 0.81 at the threshold of the rank decision. A
-    fusion needs that without a jump.
-
-    Args:
-        spread: as for `decide`.
-
-    Returns:
-        (3, 3) symmetric F; information I becomes F I F.
+    fusion needs that without a jump. The result is a symmetric F (3, 3): information I becomes F I F.
     """
     small, large, axes = _axes(spread)
     true = [max(0.0, 1.0 - 1.0 / max(s, 1e-300)) for s in (large, 0.5 * (small + large), small)]
@@ -457,7 +398,7 @@ def spread_share(spread: Array) -> Array:
 def turned(angle: float) -> Array:
     """The (3, 3) orthogonal matrix that takes q = (K11, √2 K12, K22) to axes turned by an angle in rad."""
     c, s = math.cos(angle), math.sin(angle)
-    cs = _ROOT2 * c * s
+    cs = math.sqrt(2.0) * c * s
     return np.array([[c * c, cs, s * s], [-cs, c * c - s * s, cs], [s * s, -cs, c * c]])
 
 
@@ -477,5 +418,5 @@ def outside(decision: Decision, q: Array) -> float:
 
 def tensor(q: Array) -> Array:
     """The symmetric (2, 2) matrix of q."""
-    off = q[1] / _ROOT2
-    return np.array([[q[0], off], [off, q[2]]])
+    k11, k12, k22 = q / TO_Q
+    return np.array([[k11, k12], [k12, k22]])

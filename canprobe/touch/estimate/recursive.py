@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +17,6 @@ import numpy as np
 from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import (
-    Anchor,
     Solution,
     SurfaceEstimate,
     anchor,
@@ -26,19 +24,11 @@ from canprobe.touch.estimate.answer import (
     curvature_covariance,
     evidence_of,
 )
-from canprobe.touch.estimate.information import (
-    Equations,
-    Expected,
-    InformationFilter,
-    Touch,
-    equations,
-    squared_innovations,
-    weight_of,
-)
-from canprobe.touch.estimate.noise import Correlation, Prior
-from canprobe.touch.estimate.nonlinear import DIFFUSE, misfit_notes, size_of
+from canprobe.touch.estimate.information import Expected, InformationFilter, Touch
+from canprobe.touch.estimate.noise import CHI2_99, CHI2_999, Correlation, Prior
+from canprobe.touch.estimate.nonlinear import DIFFUSE, misfit_notes
 from canprobe.touch.estimate.online import ChangeTest, Dropped, Gate
-from canprobe.touch.estimate.quadric import UNIT, Decision, decide, nothing_observed
+from canprobe.touch.estimate.quadric import UNIT, decide, nothing_observed, size_of
 from canprobe.touch.estimate.start import Start
 from canprobe.touch.linear_algebra import (
     Array,
@@ -51,7 +41,7 @@ from canprobe.touch.linear_algebra import (
     upper_root,
 )
 
-# How far a contact has moved, told apart from its noise, and how its places spread.
+# How far a contact has moved, beyond its noise, and how its places spread.
 
 _MEDIAN_OF, _MEAN_OF = 5, 8
 _FAR2, _SLOWLY = 16.0, 0.05
@@ -148,94 +138,6 @@ class Spread:
         self._moments += (X.T * weights) @ X
 
 
-# From the state of the online filter to an estimate at a contact.
-
-
-class _Answer(NamedTuple):
-    """Where an answer is given and how sure it is.
-
-    Attributes:
-        anchor: at the contact.
-        decision: on the data.
-        spread: (2, 2) of the points in the tangent plane over the variance of their noise.
-        deviation: (9, 9) root of the covariance of the filter's parameters.
-        notes: what a reader should know.
-    """
-
-    anchor: Anchor
-    decision: Decision
-    spread: Array
-    deviation: Array
-    notes: tuple[str, ...]
-
-
-def filter_answer(
-    state: InformationFilter,
-    point: Array,
-    spread: Array,
-    *,
-    innovation: float,
-    distance: float,
-    samples: float,
-    prior: str,
-    notes: tuple[str, ...],
-    expected: Expected | None,
-) -> SurfaceEstimate:
-    """The answer at the foot of a point.
-
-    Args:
-        state: of the filter.
-        point: (3,) in base, m.
-        spread: (3, 3) covariance of the points that the filter rests on over the variance of their noise.
-        innovation, distance, samples, prior, notes: see `SurfaceEstimate`.
-        expected: of the samples, to allow for what a quadric leaves out (`LeftOut`); None: the surface is one exactly.
-    """
-    found = _answered(state, point, spread, expected)
-    a, decision = found.anchor, found.decision
-    deviation = a.M @ found.deviation
-    covariance = curvature_covariance(a.c, deviation)
-    evidence = evidence_of(a.c, covariance, found.spread, state.length)
-    if decision.rank < 3:
-        known = decision.vectors[:, decision.passed]
-        a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
-        covariance = np.full((3, 3), math.nan)
-    return build_estimate(
-        Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
-        length=state.length,
-        T_frame_contact=a.T_frame_contact,
-        problem_root=state.root,
-        innovation=innovation,
-        distance=distance,
-        samples=samples,
-        method="recursive",
-        prior=prior,
-        notes=notes + found.notes,
-        evidence=evidence,
-    )
-
-
-def _answered(state: InformationFilter, point: Array, spread: Array, expected: Expected | None) -> _Answer:
-    """With the sandwich covariance, amended where all is observed."""
-    place = state.place(point)
-    a = anchor(state.c, state.T, place, state.length)
-    tangent = a.T_frame_contact[:3, :2]
-    flat = tangent.T @ spread @ tangent
-    q = a.M[6:] @ state.inverse / UNIT[:, None]
-    decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
-    noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
-    notes: tuple[str, ...] = ()
-    if decision.rank == 3 and expected is not None:
-        amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, expected)
-        notes = misfit_notes(amended.misfit, trusted=amended.trusted)
-        if not amended.trusted:
-            return _Answer(a, nothing_observed(), flat, np.eye(9) / DIFFUSE, notes)
-        a = anchor(amended.c, state.T, place, state.length)
-        noise += state.root @ amended.covariance @ state.root.T
-    return _Answer(a, decision, flat, state.inverse @ lower_root(noise), notes)
-
-
-# `recursive`: the nine-parameter model as a square-root information filter; what runs in the 200 Hz loop.
-
 STEP = 0.025
 """Travel between two updates over the memory."""
 CROWD = 2.0
@@ -246,8 +148,6 @@ STARTING = 1.6
 """How much higher the alarm's thresholds are during a start: the first answers are soon put right by themselves."""
 GENEROUS = 0.5
 """Usual innovation below which the stated noise is not believed where a misfit is looked for."""
-AGREEING = 11.34
-"""Squared innovation, over the usual, up to which a sample may lie on the surface before a change: 99 % of χ² of 3."""
 
 
 class _Pending(NamedTuple):
@@ -258,11 +158,12 @@ class _Pending(NamedTuple):
 
 
 class _Compared(NamedTuple):
-    """Contacts against what the filter says: their equations, squared innovations and weights."""
+    """Contacts against what the filter says: their equations, squared innovations (n,) and weights (n,)."""
 
-    equations: Equations
-    squares: list[float]
-    weights: list[float]
+    rows: Array
+    residuals: Array
+    squares: Array
+    weights: Array
 
 
 class RecursiveEstimator:
@@ -329,21 +230,49 @@ class RecursiveEstimator:
             self._pending.clear()
 
     def estimate(self) -> SurfaceEstimate | None:
-        """The answer at the last contact that is no outlier; None before the contact has moved."""
+        """The answer at the foot of the last contact that is no outlier; None before the contact has moved."""
         if self._last is None or self._spread.weight == 0.0:
             return None
+        state, notes = self._filter, self._notes()
+        place = state.place(self._last.point)
+        a = anchor(state.c, state.T, place, state.length)
         # what has not settled is not called observed
         certain = float(self._settled) / self._gate.sigma_point**2
-        return filter_answer(
-            self._filter,
-            self._last.point,
-            self._spread.covariance * certain,
+        P = a.T_frame_contact[:3, :2]
+        flat = P.T @ (self._spread.covariance * certain) @ P
+        q = a.M[6:] @ state.inverse / UNIT[:, None]
+        decision = decide(inverted_upper(upper_root(q.T)).T, flat, size_of(a.c))
+        # the sandwich: A⁻¹ = inverse inverseᵀ, the score between
+        noise = state.inverse.T @ state.left_out.score.matrix[:9, :9] @ state.inverse
+        believed = True
+        if decision.rank == 3 and not self._quadric:
+            amended = state.left_out.amend(state.c, state.inverse @ state.inverse.T, place, self._expected())
+            notes += misfit_notes(amended.misfit, trusted=amended.trusted)
+            believed = amended.trusted
+            if believed:
+                a = anchor(amended.c, state.T, place, state.length)
+                noise += state.root @ amended.covariance @ state.root.T
+            else:
+                decision = nothing_observed()
+        deviation = a.M @ (state.inverse @ lower_root(noise) if believed else np.eye(9) / DIFFUSE)
+        covariance = curvature_covariance(a.c, deviation)
+        evidence = evidence_of(a.c, covariance, flat, state.length)
+        if decision.rank < 3:
+            known = decision.vectors[:, decision.passed]
+            a.c[6:] = UNIT * (known @ (known.T @ (a.c[6:] / UNIT)))
+            covariance = np.full((3, 3), math.nan)
+        return build_estimate(
+            Solution(a.c, covariance, decision, has_prior=False, root=inverted(deviation)),
+            length=state.length,
+            T_frame_contact=a.T_frame_contact,
+            problem_root=state.root,
             innovation=self._change.innovation,
             distance=min(self._travel.total, self._memory),
             samples=self._spread.weight,
+            method="recursive",
             prior=self._prior.name,
-            notes=self._notes(),
-            expected=None if self._quadric else self._expected(),
+            notes=notes,
+            evidence=evidence,
         )
 
     def _expected(self) -> Expected:
@@ -362,8 +291,8 @@ class RecursiveEstimator:
         """Take what is pending into the filter or its start; after a change of the surface into a new start."""
         compared = self._compared() if self._settled else None
         caution = 1.0 if self._start is None else STARTING
-        if compared and any([self._change.take(square, caution) for square in compared.squares]):
-            explained = self._explained(compared.equations)
+        if compared and any([self._change.take(square, caution) for square in compared.squares.tolist()]):
+            explained = self._explained(compared)
             if explained is None:
                 self._change.alarm()
                 self._drop_agreeing(compared.squares)
@@ -379,28 +308,28 @@ class RecursiveEstimator:
                 self._filter.follow(self._last.point)
 
     def _compared(self) -> _Compared:
-        found = equations(self._filter.c, self._filter.T, self._memory, [p.touch for p in self._pending])
-        return self._judged(found, found.residuals)
+        rows, residuals = self._filter.equations([p.touch for p in self._pending])
+        return self._judged(rows, residuals, residuals)
 
-    def _explained(self, found: Equations) -> _Compared | None:
+    def _explained(self, found: _Compared) -> _Compared | None:
         """As `_compared`, where the contacts are as the terms that a quadric leaves out had them expected."""
         if self._quadric:
             return None
         f = self._filter
         terms = f.left_out.explanation(f.c, f.inverse @ f.inverse.T, self._expected())
-        left = self._judged(found, found.residuals - found.rows @ terms)
+        left = self._judged(found.rows, found.residuals, found.residuals - found.rows @ terms)
         return left if self._change.usual_again(left.squares) else None
 
-    def _judged(self, found: Equations, residuals: Array) -> _Compared:
-        squares = squared_innovations(found.rows, residuals, self._filter.inverse)
-        return _Compared(found, squares, [p.weight * weight_of(s) for p, s in zip(self._pending, squares, strict=True)])
+    def _judged(self, rows: Array, residuals: Array, unexplained: Array) -> _Compared:
+        """Weighted by their places, and from the 99.9 % point of χ² on by the square of `CHI2_999 / d²`."""
+        squares = self._filter.squared_innovations(rows, unexplained)
+        weights = np.array([p.weight for p in self._pending]) * np.square(CHI2_999 / np.maximum(squares, CHI2_999))
+        return _Compared(rows, residuals, squares, weights)
 
     def _absorb(self, compared: _Compared, moved: float) -> None:
         """Take a step (m) into the filter."""
-        weight = np.array(compared.weights)
-        root = np.sqrt(self._weigh(moved, weight) * weight)[:, None]
-        rows, residuals = compared.equations
-        self._filter.take(rows * root[:, :, None], residuals * root, moved)
+        root = np.sqrt(self._weigh(moved, compared.weights) * compared.weights)[:, None]
+        self._filter.take(compared.rows * root[:, :, None], compared.residuals * root, moved)
 
     def _beginning(self, start: Start, moved: float) -> None:
         """Take a step (m) into the solution of the first stretch; the filter is given what that is by now."""
@@ -416,7 +345,7 @@ class RecursiveEstimator:
             self._filter.begin(homogeneous(tangent_rotation(-touches[-1].normal), touches[-1].point))
             return
         c = found.target if start.settled else found.c
-        self._filter.adopt(start.T, c, found.root, start.rows, found.residuals_at(c), start.travelled)
+        self._filter.adopt(start.T, c, found.root, found.rows, found.residuals_at(c), start.travelled)
         self._doubtful = float(np.count_nonzero(found.weight < 1.0))
         if start.over:
             self._start, self._settled = None, True
@@ -430,9 +359,8 @@ class RecursiveEstimator:
         self._spread.add(np.array([p.touch.point for p in self._pending]), crowd * weight)
         return crowd
 
-    def _drop_agreeing(self, squares: Sequence[float]) -> None:
+    def _drop_agreeing(self, squares: Array) -> None:
         """Forget the pending samples up to the last that still agrees with the surface before a change."""
-        limit = AGREEING * self._change.usual
-        agree = [i for i, square in enumerate(squares[:-1]) if square <= limit]
-        for _ in range(agree[-1] + 1 if agree else 0):
+        agree = np.flatnonzero(squares[:-1] <= CHI2_99 * self._change.usual)
+        for _ in range(int(agree[-1]) + 1 if len(agree) else 0):
             self._pending.popleft()

@@ -18,11 +18,11 @@ import numpy as np
 
 from canprobe.touch.estimate.information import Touch, batch_design
 from canprobe.touch.estimate.noise import Prior
-from canprobe.touch.estimate.nonlinear import linear_start, robust, size_of, solve_rows, term_rows
-from canprobe.touch.estimate.quadric import SPREAD, Decision, Design, linearise, rows, spread_of
+from canprobe.touch.estimate.nonlinear import linear_start, robust, solve_rows
+from canprobe.touch.estimate.quadric import SPREAD, Decision, Design, linearise, size_of, spread_of
 from canprobe.touch.linear_algebra import Array, homogeneous, tangent_rotation
 
-# One Gauss–Newton step of the robust nine-parameter fit: what `nonlinear.fit` iterates, for those who cannot wait.
+# One Gauss–Newton step of the robust fit: what `nonlinear.fit` iterates, for those who cannot wait.
 
 _SHORTER = (1.0, 0.25)
 """Shares of a step that are tried."""
@@ -30,13 +30,13 @@ SETTLED = 0.1
 """Squared length of a step, in standard deviations, below which an answer has settled."""
 
 
-class Linearised(NamedTuple):
-    """A fit at some parameters, and where it points to.
+class Solved(NamedTuple):
+    """The problem at some parameters, solved once.
 
     Attributes:
         c: (9,) parameters.
         cost: robust, with the prior's part and the log-determinant of the noise.
-        J: (n, 3, 9) whitened, weighted rows.
+        rows: (n, 3, 18) whitened, weighted: of the parameters and of the terms that a quadric leaves out.
         r: (n, 3) their residuals.
         weight: (n,) of the samples.
         target: (9,) solution of the linearised problem.
@@ -46,7 +46,7 @@ class Linearised(NamedTuple):
 
     c: Array
     cost: float
-    J: Array
+    rows: Array
     r: Array
     weight: Array
     target: Array
@@ -61,30 +61,24 @@ class Linearised(NamedTuple):
 
     def residuals_at(self, c: Array) -> Array:
         """Minus the residuals (n, 3) at other parameters (9,) nearby."""
-        result: Array = -self.r - self.J @ (c - self.c)
+        result: Array = -self.r - self.rows[:, :, :9] @ (c - self.c)
         return result
 
 
-def linearised(c: Array, d: Design, prior: tuple[Array, Array]) -> Linearised:
-    """The problem at parameters (9,), solved once.
-
-    Args:
-        c: parameters.
-        d: constant parts.
-        prior: rows (6, 9) and right-hand side (6,).
-    """
-    r, J, log_det = rows(c, d)
-    weight, cost = robust(np.einsum("ij,ij->i", r, r))
+def solved_once(c: Array, d: Design, prior: tuple[Array, Array]) -> Solved:
+    """The problem at parameters (9,); prior: rows (6, 9) and right-hand side (6,)."""
+    at = linearise(c, d)
+    weight, cost = robust(np.einsum("ij,ij->i", at.r, at.r))
     assumed = prior[0] @ c - prior[1]
-    cost += log_det + float(assumed @ assumed)
+    cost += at.log_det + float(assumed @ assumed)
     w = np.sqrt(weight)[:, None]
-    r, J = r * w, J * w[:, :, None]
-    A = J.reshape(-1, 9)
+    r, rows = at.r * w, at.jacobian(18) * w[:, :, None]
+    A = rows[:, :, :9].reshape(-1, 9)
     target, root, decision = solve_rows(A, A @ c - r.reshape(-1), prior, spread_of(d.X, d.point_variance), size_of(c))
-    return Linearised(c, cost, J, r, weight, target, root, decision)
+    return Solved(c, cost, rows, r, weight, target, root, decision)
 
 
-def gauss_newton(now: Linearised, d: Design, prior: tuple[Array, Array]) -> Linearised:
+def gauss_newton(now: Solved, d: Design, prior: tuple[Array, Array]) -> Solved:
     """The next one at the target, or nearer where the step from there is longer; `now` where that is no better either.
 
     The length of the next step says whether a step was good, not the cost: the whitening changes with K, so the place
@@ -93,21 +87,13 @@ def gauss_newton(now: Linearised, d: Design, prior: tuple[Array, Array]) -> Line
     Source: Deuflhard, "Newton methods for nonlinear problems", 2004 (the natural monotonicity test).
     """
     for share in _SHORTER:
-        there = linearised(now.c + share * (now.target - now.c), d, prior)
+        there = solved_once(now.c + share * (now.target - now.c), d, prior)
         if there.step <= max(now.step, SETTLED):
             return there
     return now
 
 
-def with_terms(now: Linearised, d: Design) -> Array:
-    """Rows (n, 3, 18) of the parameters and of the terms that a quadric leaves out (`nonlinear.terms`), weighted
-    alike.
-    """
-    E = term_rows(linearise(now.c, d), d) * np.sqrt(now.weight)[:, None, None]
-    return np.concatenate([now.J, E], axis=2)
-
-
-# The first stretch of a filter: all its contacts at once, by one Gauss–Newton step whenever some more have come.
+# The stretch.
 
 FIRST = 0.1
 """Travel over the memory at the first solution."""
@@ -122,24 +108,18 @@ _FRAME_OF = 5
 
 
 class Start:
-    """Contacts of the first stretch and their solution so far.
-
-    Args:
-        length: the memory of the filter, m.
-        prior: on the parameters.
+    """Contacts of the first stretch and their solution so far, for a filter with a memory of `length` (m).
 
     Attributes:
         T: (4, 4) working frame of the solution to base, m.
         solution: None before there is one.
-        rows: (n, 3, 18) of its parameters and of what a quadric leaves out.
         settled: the solution is one: its last step was small, and all of K was observed or the stretch is over.
         travelled: path so far, m.
     """
 
     def __init__(self, length: float, prior: Prior) -> None:
         self.T = np.eye(4)
-        self.solution: Linearised | None = None
-        self.rows = np.zeros((0, 3, 18))
+        self.solution: Solved | None = None
         self.settled = False
         self.travelled = 0.0
         self._length = length
@@ -170,19 +150,16 @@ class Start:
 
     def _improve(self, d: Design, stretch_over: bool) -> None:
         """From the better of the last solution and, until that has settled, a linear one."""
-        now = None if self.solution is None else linearised(self.solution.target, d, self._prior)
+        now = None if self.solution is None else solved_once(self.solution.target, d, self._prior)
         if now is None or not self.settled:
-            plain = self._linear(d)
-            fresh = linearised(plain, d, self._prior)
+            spread = spread_of(d.X, d.point_variance)
+            plain = linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
+            fresh = solved_once(plain, d, self._prior)
             now = fresh if now is None or fresh.cost < now.cost else now
         better = gauss_newton(now, d, self._prior)
-        self.solution, self.rows = better, with_terms(better, d)
+        self.solution = better
         known = self.settled or better.decision.rank == 3 or stretch_over
         self.settled = known and better.step < SETTLED
-
-    def _linear(self, d: Design) -> Array:
-        spread = spread_of(d.X, d.point_variance)
-        return linear_start(d, self._prior, spread, isolation(d.X, d.point_variance))[0]
 
 
 def isolation(points: Array, variance: Array) -> Array:

@@ -1,13 +1,14 @@
-"""Estimators over a window of the last samples: `ml`, `chord` and `chen1996`.
+"""Estimators over a window of the last samples: `ml`, and the linear ones from differences, `chord` and `chen1996`.
 
-Both rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the surface: plane, sphere,
-circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on both sides of the
-equation, draws them towards 0. They are here as baselines and are reported as they are.
+The linear ones rest on `n_a − n_b = 2 S₃ (p_a − p_b)`, exact only where |∇f| is constant along the surface: plane,
+sphere, circular cylinder. Elsewhere they keep a bias without any noise, and noise in the points, on both sides of the
+equation, draws them towards 0. They are baselines and are reported as they are.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,21 +18,20 @@ from numpy.typing import NDArray
 from canprobe.errors import UsageError
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.estimate.answer import Solution, SurfaceEstimate, build_estimate
-from canprobe.touch.estimate.likelihood import Touches, fit_ml, working_frame
-from canprobe.touch.estimate.noise import Prior
-from canprobe.touch.estimate.online import AGREES, LAST_FEW, WindowEstimator, looks_changed
-from canprobe.touch.estimate.quadric import decide
+from canprobe.touch.estimate.likelihood import Touches, fit_ml, make_touches, working_frame
+from canprobe.touch.estimate.noise import Prior, make_noise
+from canprobe.touch.estimate.online import AGREES, LAST_FEW, Dropped, Gate, looks_changed
+from canprobe.touch.estimate.quadric import TO_Q, decide, size_of
 from canprobe.touch.linear_algebra import Array, cross, rotation_vector, upper_root
 
-# Six-unknown linear estimates from differences of points and normals: `chord` and the core of `chen1996`.
+# Six-unknown linear estimates from differences of points and normals.
 
 NO_PRIOR = "none (the method takes none)"
 _COLUMNS = ((0, 1, 2), (1, 3, 4), (2, 4, 5))
 """Columns of c11 c12 c13 c22 c23 c33 in the rows of S₃ y."""
-_FROM_SIX = (2, 4, 5, 0, 1, 3)
+_FROM_SIX = [2, 4, 5, 0, 1, 3]
 """c13 c23 c33 c11 c12 c22 of the nine-parameter order, as places among the six."""
 _NUMERIC = 1e-10
-_K_TO_Q = np.outer([1.0, math.sqrt(2.0), 1.0], [1.0, math.sqrt(2.0), 1.0])
 
 
 class Pairs(NamedTuple):
@@ -52,21 +52,24 @@ class Pairs(NamedTuple):
 def chord_pairs(touches: Touches) -> Pairs:
     """Every sample against the last."""
     n = len(touches.points)
-    older = np.arange(n - 1)
-    return pairs(touches, np.full(n - 1, n - 1), older)
+    return _pairs(touches, np.full(n - 1, n - 1), np.arange(n - 1))
 
 
 def lag_pairs(touches: Touches, lag: int) -> Pairs:
     """Every sample against the one `lag` before it."""
     newer = np.arange(lag, len(touches.points))
-    return pairs(touches, newer, newer - lag)
+    return _pairs(touches, newer, newer - lag)
 
 
-def pairs(touches: Touches, newer: NDArray[np.intp], older: NDArray[np.intp]) -> Pairs:
-    """Differences of given samples."""
+def _pairs(touches: Touches, newer: NDArray[np.intp], older: NDArray[np.intp]) -> Pairs:
     R = working_frame(touches)[:3, :3]
     p, n = touches.points, touches.normals
     return Pairs(newer, older, (p[newer] - p[older]) @ R / touches.extent, (n[newer] - n[older]) @ R)
+
+
+def usable_lag(n: int, lag: int) -> int:
+    """The lag that n samples allow: at most half of them."""
+    return max(1, min(lag, (n - 1) // 2))
 
 
 def three_rows(y: Array) -> Array:
@@ -78,36 +81,25 @@ def three_rows(y: Array) -> Array:
 
 
 def solve_pairs(touches: Touches, data: Pairs, method: str) -> SurfaceEstimate:
-    """Least squares by SVD for 2 S₃, in the contact frame of the last *measured* point and normal."""
-    return estimate_from(touches, data, pseudo_inverse(three_rows(data.points)), method)
+    """Least squares for 2 S₃, in the contact frame of the last *measured* point and normal.
 
-
-def pseudo_inverse(A: Array) -> Array:
-    """A⁺ by SVD; singular values below 1e-10 of the largest are left out."""
-    U, s, Vt = np.linalg.svd(A, full_matrices=False)
-    kept = s > _NUMERIC * max(float(s[0]), 1e-300)
-    result: Array = (Vt[kept].T / s[kept]) @ U[:, kept].T
-    return result
-
-
-def estimate_from(touches: Touches, data: Pairs, inverse: Array, method: str) -> SurfaceEstimate:
-    """An estimate from the (6, 3m) matrix that solves for 2 (c11, c12, c13, c22, c23, c33).
-
-    The covariance is propagated from the samples' noise; it does not know the method's bias.
+    By SVD; singular values below 1e-10 of the largest are left out. The covariance is propagated from the samples'
+    noise; it does not know the method's bias.
     """
     length = touches.extent
-    b = data.normals.reshape(-1)
+    A, b = three_rows(data.points), data.normals.reshape(-1)
+    U, s, Vt = np.linalg.svd(A, full_matrices=False)
+    kept = s > _NUMERIC * max(float(s[0]), 1e-300)
+    inverse = (Vt[kept].T / s[kept]) @ U[:, kept].T
     double = inverse @ b
-    A = three_rows(data.points)
     residual = b - A @ double
-    c = np.zeros(9)
-    c[3:] = 0.5 * double[list(_FROM_SIX)]
-    size = 2.0 * math.sqrt(c[6] ** 2 + 2.0 * c[7] ** 2 + c[8] ** 2)
+    c = np.concatenate([np.zeros(3), 0.5 * double[_FROM_SIX]])
+    size = size_of(c)
     vp = float(touches.noise.point_variance.mean()) / length**2
     variance = float(touches.noise.normal_variance.mean()) + size**2 * vp
     k = variance * _propagated(data, inverse)[np.ix_([0, 1, 3], [0, 1, 3])]  # of 2 c11, 2 c12, 2 c22: of K itself
     flat = data.points[:, :2]
-    decision = decide(_root_of(k * _K_TO_Q), flat.T @ flat / (len(flat) * 2.0 * vp), size)
+    decision = decide(_root_of(k * np.outer(TO_Q, TO_Q)), flat.T @ flat / (len(flat) * 2.0 * vp), size)
     return build_estimate(
         Solution(c, k, decision, has_prior=False),
         length=length,
@@ -139,67 +131,21 @@ def _root_of(covariance: Array) -> Array:
     return result
 
 
-# The scheme of Chen, Rink and Zhang (1996), (24)–(35), as printed.
-#
-# From a stretch of contact, in the contact frame of its last sample: `x_i = −S y_i` (27) with `x_i = ω × n_f + S_f v_f`
-# (28), `y_i = V + v` (29), assembled to `A c = b` (30)–(34) with the boundary row. What is not in print, and had to be
-# settled:
-#
-# - S in (27)–(28) means 2S (of both bodies): as printed, (28) drops the factor 2 on S' and κ would be wrong by it.
-# - All y_i4 are 0, so the columns of c14, c24, c34, c44 vanish: A has rank 7 at most, (35) is singular for every
-#   motion.
-#   Solved by SVD (least norm), then put into the gauge c14 = c24 = c44 = 0, c34 = −½.
-# - Rates are differences of samples `lag` apart.
-#
-# Known faults, reproduced: a bias of some percent where |∇f| is not constant, and noise in y that draws κ towards 0.
-#
-# Source: Chen, Rink and Zhang, "Local object shape from tactile sensing", section 4.1.2.
-
-_SIX = (0, 1, 2, 4, 5, 7)
-"""Places of c11 c12 c13 c22 c23 c33 in the ten of (31)."""
+# The estimators.
 
 
-def paper_system(x: Array, y: Array) -> tuple[Array, Array]:
-    """A ((3N+1), 10) and b ((3N+1),) of (30)–(34).
+class WindowEstimator:
+    """Base of the estimators that keep their last samples and solve them as a batch when asked.
 
     Args:
-        x, y: (N, 3) rows of (28) and (29); their fourth components are 0.
+        sigma_point, sigma_normal: effective noise, m and rad; with differences they only enter covariance and flags.
+        window: samples that are kept.
+        prior: of `ml`; None for `Prior.weak` over the extent of the window.
+        coupling: of the errors of point and normal (`Noise`), 1/m; of `ml`.
     """
-    A = np.zeros((3 * len(y) + 1, 10))
-    A[:-1, list(_SIX)] = three_rows(y)
-    A[-1, 9] = 1.0  # the boundary condition f = 0 at the origin
-    return A, np.append(-x.reshape(-1), 0.0)
 
-
-def solve_paper(touches: Touches, data: Pairs) -> SurfaceEstimate:
-    """The scheme's estimate from y = `data.points` and −x = `data.normals`."""
-    A, _ = paper_system(-data.normals, data.points)
-    return estimate_from(touches, data, pseudo_inverse(A)[list(_SIX), :-1], "chen1996")
-
-
-def usable_lag(n: int, lag: int) -> int:
-    """The lag that n samples allow: at most half of them."""
-    return max(1, min(lag, (n - 1) // 2))
-
-
-# `ml`: the batch maximum-likelihood fit over the last samples, as far back as one surface reaches.
-
-LEAST = 3 * LAST_FEW
-"""Samples in a window from which on its last few are held against the others."""
-
-
-class MlEstimator(WindowEstimator):
-    """Nine-parameter Gauss–Newton over a window (`nonlinear`): the reference, some milliseconds an answer.
-
-    A window over a change of the surface has no quadric, and its last samples would be taken for wrong ones. So they
-    are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
-
-    Args:
-        sigma_point, sigma_normal: effective noise, m and rad.
-        window: samples kept.
-        prior: None for `Prior.weak` over the extent of the window.
-        coupling: of the errors of point and normal (`Noise`), 1/m.
-    """
+    least = 2
+    """Fewer samples give no answer."""
 
     def __init__(
         self,
@@ -210,13 +156,56 @@ class MlEstimator(WindowEstimator):
         prior: Prior | None = None,
         coupling: float = 0.0,
     ) -> None:
-        super().__init__(sigma_point=sigma_point, sigma_normal=sigma_normal, window=window, coupling=coupling)
-        self._prior = prior
+        if window < self.least:
+            raise UsageError(f"window: expected at least {self.least} samples, got {window}")
+        self.dropped = Dropped()
+        self._gate = Gate(sigma_point, sigma_normal)
+        self._prior, self._coupling = prior, coupling
+        self._samples: deque[ContactSample] = deque(maxlen=window)
+        self._answer: SurfaceEstimate | None = None
+
+    def add(self, sample: ContactSample) -> None:
+        """Take one contact."""
+        if self._gate.passes(sample, self.dropped):
+            self._samples.append(sample)
+            self._answer = None
+
+    def estimate(self) -> SurfaceEstimate | None:
+        """The answer over the samples kept; None from fewer than `least`, or where they face more than 90° apart."""
+        if self._answer is None and len(self._samples) >= self.least:
+            touches = self._touches()
+            if float((touches.normals @ touches.normals[-1]).min()) > 0.0:
+                answer = self._solve(touches)
+                self._answer = replace(answer, notes=answer.notes + self._gate.notes())
+        return self._answer
+
+    def reset(self) -> None:
+        """Forget all samples."""
+        self._samples.clear()
+        self._gate.reset()
+        self._answer = None
+
+    def _solve(self, touches: Touches) -> SurfaceEstimate:
+        raise NotImplementedError
+
+    def _touches(self) -> Touches:
+        points: Array = np.array([s.p_base for s in self._samples])
+        normals: Array = np.array([s.n_base for s in self._samples])
+        sigmas = np.array([self._gate.sigmas(s) for s in self._samples])
+        return make_touches(points, normals, make_noise(len(points), sigmas[:, 0], sigmas[:, 1], self._coupling))
+
+
+class MlEstimator(WindowEstimator):
+    """Nine-parameter Gauss–Newton over a window (`nonlinear`): the reference, some milliseconds an answer.
+
+    A window over a change of the surface has no quadric, and its last samples would be taken for wrong ones. So they
+    are held against the fit first; where they disagree as a changed surface does, what was before is forgotten.
+    """
 
     def _solve(self, touches: Touches) -> SurfaceEstimate:
         answer = fit_ml(touches, self._prior)
-        squares = squared_residuals(answer, touches)
-        if len(squares) < LEAST or answer.rank < 3 or not looks_changed(squares):
+        squares = _squared_residuals(answer, touches)
+        if len(squares) < 3 * LAST_FEW or answer.rank < 3 or not looks_changed(squares):
             return answer
         agree = np.flatnonzero(squares <= AGREES * float(np.median(squares)))
         for _ in range(min(int(agree[-1]) + 1, len(squares) - LAST_FEW)):
@@ -225,40 +214,48 @@ class MlEstimator(WindowEstimator):
         return replace(answer, notes=(*answer.notes, "the surface changed: memory shortened"))
 
 
-def squared_residuals(answer: SurfaceEstimate, touches: Touches) -> Array:
+def _squared_residuals(answer: SurfaceEstimate, touches: Touches) -> Array:
     """(n,) squared distance of contacts from an answer's surface, χ² of 3 where the noise is as stated."""
-    R, origin = answer.T_frame_contact[:3, :3], answer.T_frame_contact[:3, 3]
-    places = (touches.points - origin) @ R
-    gradient = 2.0 * (places @ answer.S[:3, :3] + answer.S[:3, 3])
+    places = (touches.points - answer.point) @ answer.T_frame_contact[:3, :3]
+    gradient = answer.surface.gradient(places)
     size = np.sqrt(np.einsum("ij,ij->i", gradient, gradient))
-    value = np.einsum("ij,ij->i", places, 0.5 * gradient + answer.S[:3, 3]) + answer.S[3, 3]
-    tilt = gradient / size[:, None] - touches.normals @ R
+    tilt = gradient / size[:, None] - touches.normals @ answer.T_frame_contact[:3, :3]
     point = touches.noise.point_variance
     felt = np.abs(answer.kappa).max() + touches.noise.coupling
     normal = touches.noise.normal_variance + felt**2 * point
-    result: Array = (value / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
+    result: Array = (answer.surface.value(places) / size) ** 2 / point + np.einsum("ij,ij->i", tilt, tilt) / normal
     return result
 
 
-# `chord`: differences from the last sample, linear, cheap; exact for constant |∇f| only.
-
-
 class ChordEstimator(WindowEstimator):
-    """`n_i − n_0 = 2 S₃ (p_i − p_0)` over a window, p_0 the last sample (`three_rows`)."""
+    """`n_i − n_0 = 2 S₃ (p_i − p_0)` over a window, p_0 the last sample."""
 
     def _solve(self, touches: Touches) -> SurfaceEstimate:
         return solve_pairs(touches, chord_pairs(touches), "chord")
 
 
-# `chen1996`: the paper's own scheme, with the rates of a robot and its pad.
+# The scheme of Chen, Rink and Zhang (1996), (24)–(35), over a window.
+#
+# From a stretch of contact, in the contact frame of its last sample: `x_i = −S y_i` (27) with `x_i = ω × n_f + S_f v_f`
+# (28), `y_i = V + v` (29), assembled to `A c = b` (30)–(34) with the boundary row. What is not in print, and had to be
+# settled:
+#
+# - S in (27)–(28) means 2S (of both bodies): as printed, (28) drops the factor 2 on S' and κ would be wrong by it.
+# - All y_i4 are 0, so the columns of c14, c24, c34, c44 vanish: A has rank 7 at most, (35) is singular for every
+#   motion. Its solution of least norm is that of the six unknowns that are left (`solve_pairs`), in the gauge
+#   c14 = c24 = c44 = 0, c34 = −½.
+# - Rates are differences of samples `lag` apart.
+#
+# Known faults, reproduced: a bias of some percent where |∇f| is not constant, and noise in y that draws κ towards 0.
+#
+# Source: Chen, Rink and Zhang, "Local object shape from tactile sensing", section 4.1.2.
 
 
 class Chen1996Estimator(WindowEstimator):
-    """(24)–(35) over a window, from W = ω × n, V and v as differences of samples `lag` apart (`paper_system`).
+    """The paper's own scheme, with the rates of a robot and its pad.
 
     Args:
-        sigma_point, sigma_normal: effective noise, m and rad; they only enter covariance and flags.
-        window: samples kept.
+        sigma_point, sigma_normal, window: as of `WindowEstimator`.
         lag: samples between the two of a difference. 1 is the paper's; noise of the points then swamps the motion.
     """
 
@@ -274,10 +271,9 @@ class Chen1996Estimator(WindowEstimator):
         samples = list(self._samples)
         lag = usable_lag(len(samples), self._lag)
         newer = np.arange(lag, len(samples))
-        rates = [paper_rates(samples[i - lag], samples[i]) for i in newer]
-        R = working_frame(touches)[:3, :3]
-        x, y = np.array([r[0] for r in rates]) @ R, np.array([r[1] for r in rates]) @ R
-        return solve_paper(touches, Pairs(newer, newer - lag, y / touches.extent, -x))
+        rates = np.array([paper_rates(samples[i - lag], samples[i]) for i in newer])
+        x, y = rates.transpose(1, 0, 2) @ working_frame(touches)[:3, :3]
+        return solve_pairs(touches, Pairs(newer, newer - lag, y / touches.extent, -x), "chen1996")
 
 
 def paper_rates(older: ContactSample, newer: ContactSample) -> tuple[Array, Array]:

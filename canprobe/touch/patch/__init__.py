@@ -9,7 +9,7 @@ estimators, a `Patch` (force in N, centroid in m on the pad, what makes it doubt
 - `curvature` inverts it over several images into a likelihood of K, and fuses that with what the motion has shown: a
   straight path leaves the curvature across it open, and one touch with its image closes it.
 - `array_model` has the calibrated numbers of the emulated array's make, found by
-  `canprobe.studies.array_calibration`.
+  `tests/support/array_calibration.py`.
 
 The emulated array (`canprobe.emulator.plant.taxels`) shares no formula with this room: the model that makes the data
 is finer than the one that reads them.

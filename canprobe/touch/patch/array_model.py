@@ -1,4 +1,4 @@
-"""The calibrations of the emulated array's make, as `canprobe.studies.array_calibration` found them."""
+"""The calibrations of the emulated array's make, as `tests/support/array_calibration.py` found them."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ import math
 
 from canprobe.touch.patch.image import PatchCalibration
 from canprobe.touch.patch.moments import Lag, MomentFit, MomentImage, MomentModel
-
-# The calibration of the emulated array's make, as `canprobe.studies.array_calibration` found it.
 
 FORCE_GAINS = {100e3: (0.905, 0.0714), 300e3: (0.835, 0.2444)}
 """Force gain and edge gain (√N) by full scale (Pa): six arrays, four shapes, 0.5–3 N, after 9 s of rolling contact.
@@ -27,9 +25,6 @@ def array_calibration(full_scale_pa: float, radius_m: float = 0.040) -> PatchCal
     nearest = min(FORCE_GAINS, key=lambda pressed: abs(math.log(pressed / full_scale_pa)))
     force_gain, edge_gain = FORCE_GAINS[nearest]
     return PatchCalibration(full_scale_pa=full_scale_pa, radius_m=radius_m, force_gain=force_gain, edge_gain=edge_gain)
-
-
-# What `canprobe.studies.array_calibration` found for the emulated array's make, and the model that it makes.
 
 
 def _floor(moment: float, both: float, shear: float, with_force: float, force: float) -> tuple[tuple[float, ...], ...]:

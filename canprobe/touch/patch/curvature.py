@@ -10,9 +10,7 @@ do: outside the calibrated range it counts less and less, and so it does the fur
 knows, by the weight of an outlier.
 
 Where the surface bends along the path a mean over some millimetres is that of an earlier place. A second, shorter mean
-tells: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
-
-The layer's model is stated in `moments`.
+shows it: how far the two are apart, carried on to now, is an error of the longer one, and counts as such.
 """
 
 from __future__ import annotations
@@ -23,11 +21,21 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.touch.contact import ContactSample, direction_to_pad
-from canprobe.touch.estimate.answer import TO_Q, CurvatureInformation, Solution, SurfaceEstimate, build_estimate
-from canprobe.touch.estimate.nonlinear import CHI2_999
+from canprobe.touch.estimate.answer import CurvatureInformation, Solution, SurfaceEstimate, build_estimate
+from canprobe.touch.estimate.noise import CHI2_999
 from canprobe.touch.estimate.online import Dropped, Estimator
-from canprobe.touch.estimate.quadric import SIGMA_LIMIT, UNIT, Decision, parameters_of, turned
-from canprobe.touch.linear_algebra import Array, eigen, homogeneous, inverted, positive, solved, tangent_rotation
+from canprobe.touch.estimate.quadric import SIGMA_LIMIT, TO_Q, UNIT, Decision, matrix_of, parameters_of, turned
+from canprobe.touch.linear_algebra import (
+    Array,
+    eigen,
+    homogeneous,
+    inverted,
+    positive,
+    principal,
+    solved,
+    tangent_rotation,
+    transported_rotation,
+)
 from canprobe.touch.patch.moments import MomentModel, Moments, PadMemory
 
 LEAST_FRAMES = 8
@@ -46,7 +54,6 @@ MOST_ROUNDS = 6
 """Gauss–Newton steps; from the last answer one or two do."""
 SETTLED, UNSETTLED = 0.002, 0.05
 """Step, in units of the probe's curvature, that ends the iteration, and the largest that a last step may have."""
-_ROOT2 = math.sqrt(2.0)
 
 
 class Fused(NamedTuple):
@@ -71,41 +78,32 @@ class _Seen(NamedTuple):
 
 
 class _Mean:
-    """Running mean of moments over so many frames at most, and how old it is; `gross`: as `GROSS`."""
+    """Running mean of moments over so many frames at most, for how many it stands, and its age; `gross`: as `GROSS`."""
 
     def __init__(self, most: int, gross: float) -> None:
         self.moments: Moments = (0.0, 0.0, 0.0)
         self.age = 0.0
         self._most, self._gross = most, gross
-        self._frames = 0
+        self.frames = 0
         self._apart = 0
-
-    @property
-    def frames(self) -> int:
-        """How many the mean stands for."""
-        return self._frames
 
     def add(self, xx: float, xy: float, yy: float) -> float:
         """Take the moments of a frame; its share in the mean, small where it is far from it."""
-        self._frames = min(self._frames + 1, self._most)
-        share = 1.0 / self._frames
+        self.frames = min(self.frames + 1, self._most)
+        share = 1.0 / self.frames
         mxx, mxy, myy = self.moments
         dxx, dxy, dyy = xx - mxx, xy - mxy, yy - myy
-        if self._frames >= LEAST_FRAMES:
+        if self.frames >= LEAST_FRAMES:
             nearness = self._gross * (mxx + myy) / max(abs(dxx) + 2.0 * abs(dxy) + abs(dyy), 1e-300)
             self._apart = self._apart + 1 if nearness < 1.0 else 0
             if self._apart == LEAST_FRAMES:
-                return self._restart(xx, xy, yy)
+                # so many in a row are no outliers: what was before them is not what is felt now
+                self.moments, self.age, self.frames, self._apart = (xx, xy, yy), 0.0, 1, 0
+                return 1.0
             share *= min(1.0, nearness)
         self.moments = mxx + share * dxx, mxy + share * dxy, myy + share * dyy
         self.age = (1.0 - share) * (self.age + 1.0)
         return share
-
-    def _restart(self, *moments: float) -> float:
-        """So many in a row are no outliers: what was before them is not what is felt now."""
-        xx, xy, yy = moments
-        self.moments, self.age, self._frames, self._apart = (xx, xy, yy), 0.0, 1, 0
-        return 1.0
 
     def drift_from(self, younger: _Mean) -> Moments:
         """How far this is off by what changed since, if it went on as a younger mean says."""
@@ -140,7 +138,7 @@ class PatchCurvature:
         self.frames = 0
         self.force = 0.0
         self._memory = PadMemory()
-        self._x, self._y = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
+        self._axes = np.eye(3)
         self._last: tuple[float, float, float] | None = None
         self._mean, self._recent = _Mean(MOST_FRAMES, GROSS), _Mean(FEW_FRAMES, FINE)
 
@@ -153,7 +151,8 @@ class PatchCurvature:
         if sample.moments is None:
             self.refused += 1
             return
-        self._carry(*(-sample.n_base).tolist())
+        inward = -sample.n_base
+        self._axes = transported_rotation(self._axes, inward) if self.frames else tangent_rotation(inward)
         (uu, uv, vv), memory = sample.moments, self.model.fit.memory
         uu, uv, vv = uu - memory * was[0], uv - memory * was[1], vv - memory * was[2]
         xx, xy, yy = _turned(uu, uv, vv, *self._pad_axis(direction, sample.T_base_probe))
@@ -162,52 +161,26 @@ class PatchCurvature:
         self.frames = self._mean.frames
         self.force += share * (sample.force_n - self.force)
 
-    def _carry(self, zx: float, zy: float, zz: float) -> None:
-        """Turn the axes the shortest way so that z is the inward normal."""
-        if not self.frames:
-            self._x, self._y, _ = tangent_rotation(np.array([zx, zy, zz])).T.tolist()
-            return
-        x, y, z = self._x
-        along = x * zx + y * zy + z * zz
-        x, y, z = x - along * zx, y - along * zy, z - along * zz
-        size = 1.0 / math.sqrt(x * x + y * y + z * z)
-        x, y, z = size * x, size * y, size * z
-        self._x, self._y = [x, y, z], [zy * z - zz * y, zz * x - zx * z, zx * y - zy * x]
-
     def _pad_axis(self, direction: Moments, T_base_probe: Array) -> tuple[float, float]:
         """Cosine and sine of the angle from x of the carried axes to u of the pad, both about the inward normal."""
         x, y, z = direction
         bend = x / (1.0 + z)  # the pad's u axis, turned from the pole to the contact the shortest way
-        ux, uy, uz = 1.0 - bend * x, -bend * y, -x
-        (a, b, c, _), (d, e, f, _), (g, h, i, _), _ = T_base_probe.tolist()
-        return self._in_axes(
-            [a * ux + b * uy + c * uz, d * ux + e * uy + f * uz, g * ux + h * uy + i * uz],
-        )
+        return self._in_axes(T_base_probe[:3, :3] @ [1.0 - bend * x, -bend * y, -x])
 
-    def _in_axes(self, u: list[float]) -> tuple[float, float]:
+    def _in_axes(self, u: Array) -> tuple[float, float]:
         """Direction of a vector (3,) of base in the carried tangent plane: cosine, sine."""
-        (x0, x1, x2), (y0, y1, y2), (u0, u1, u2) = self._x, self._y, u
-        cx, cy = x0 * u0 + x1 * u1 + x2 * u2, y0 * u0 + y1 * u1 + y2 * u2
-        size = 1.0 / math.hypot(cx, cy)
-        return cx * size, cy * size
+        x, y, _ = (u @ self._axes).tolist()
+        size = 1.0 / math.hypot(x, y)
+        return x * size, y * size
 
     def fuse(self, T_base_contact: Array, motion: CurvatureInformation | None = None) -> Fused | None:
-        """Patch and motion together in a contact frame.
-
-        Args:
-            T_base_contact: (4, 4) contact frame, z inward.
-            motion: what else is known about q there.
-
-        Returns:
-            None from too few frames, and where the patch has nothing to say.
-        """
+        """The patch, with what the motion knows about q, in a contact frame (4, 4); None where it knows nothing."""
         if self.frames < LEAST_FRAMES:
             return None
-        c, s = self._in_axes(T_base_contact[:3, 0].tolist())
+        c, s = self._in_axes(T_base_contact[:3, 0])
         xx, xy, yy = _turned(*self._mean.moments, c, -s)
-        angle = 0.5 * math.atan2(2.0 * xy, xx - yy)
+        mean, half, angle = principal(np.array([[xx, xy], [xy, yy]]))
         drift = _turned(*_turned(*self._mean.drift_from(self._recent), c, -s), math.cos(angle), -math.sin(angle))
-        mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         turn = turned(angle)  # q in the contact frame to q in the patch's principal axes
         known = CurvatureInformation(np.zeros(3), np.zeros((3, 3))) if motion is None else motion
         known = CurvatureInformation(turn @ known.q, turn @ known.information @ turn.T)
@@ -249,7 +222,7 @@ class PatchCurvature:
                 pull = motion.information @ off
                 way = solved(patch + motion.information, JW @ r + pull)
                 cost = float(r @ W @ r + off @ pull)
-                k = _entries(q + way)
+                k = tuple(((q + way) / TO_Q).tolist())
                 step = max(map(abs, way.tolist()))
                 if step < SETTLED / self.model.radius:
                     break
@@ -276,11 +249,6 @@ def _turned(xx: float, xy: float, yy: float, c: float, s: float) -> tuple[float,
     return cc * xx - 2.0 * cs * xy + ss * yy, cs * (xx - yy) + (cc - ss) * xy, ss * xx + 2.0 * cs * xy + cc * yy
 
 
-def _entries(q: Array) -> tuple[float, float, float]:
-    q1, q2, q3 = q.tolist()
-    return q1, q2 / _ROOT2, q3
-
-
 # The answer of patch and motion together, and of the patch alone.
 
 NAMED = 0.1
@@ -291,17 +259,10 @@ _TO_K = 1.0 / np.outer(TO_Q, TO_Q)
 
 
 def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceEstimate:
-    """A motion estimate with what was found with the patch.
+    """A motion estimate with its `evidence`, and what was found of that and the patch.
 
-    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them.
-
-    Args:
-        motion: with its `evidence`.
-        found: of the patch and that evidence.
-        length: m, `quadric` takes curvatures below 1/length for flat; the memory of the estimator.
-
-    Returns:
-        The estimate; its `method` ends in "+patch" where the patch gave at least `NAMED`, and a note says how much.
+    Place, normal and c13, c23, c33 stay the motion's; the patch says nothing about them. Curvatures below 1/length (the
+    memory, m) count as flat. The `method` ends in "+patch" where the patch gave at least `NAMED`; a note says how much.
     """
     assert motion.evidence is not None
     has_prior = motion.rank < 3 and bool(np.isfinite(motion.covariance).all())
@@ -326,21 +287,13 @@ def with_patch(motion: SurfaceEstimate, found: Fused, length: float) -> SurfaceE
 
 
 def patch_estimate(contact: ContactSample, patch: PatchCurvature, length: float) -> SurfaceEstimate | None:
-    """Shape from the patch alone, as of a touch that stands still; None where it says nothing.
-
-    Args:
-        contact: the last one; place and normal are its.
-        patch: the images.
-        length: m, see `with_patch`.
-    """
+    """Shape from the patch alone, at the last contact, as of a touch that stands still; None where it knows nothing."""
     T = homogeneous(tangent_rotation(-contact.n_base), contact.p_base)
     found = patch.fuse(T)
     if found is None:
         return None
-    plane = np.zeros((4, 4))
-    plane[2, 3] = plane[3, 2] = -0.5
     return build_estimate(
-        _solution(plane, found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
+        _solution(matrix_of(np.zeros(9)), found.q, inverted(found.patch), _decide(found.patch, found.q, length)),
         length=1.0,
         T_frame_contact=T,
         problem_root=_root(found.patch),

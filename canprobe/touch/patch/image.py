@@ -1,4 +1,4 @@
-"""The contact patch in a tactile image: force, centroid and second moments, with what makes them doubtful.
+"""The contact patch in a tactile image: force and centroid, with what makes them doubtful.
 
 Row i of an image lies at v = (i − 7.5)·pitch, column j at u = (j − 7.5)·pitch; (u, v) are azimuthal-equidistant on the
 sphere, so a taxel's true area is `pitch² · sin(ρ)/ρ` with ρ = √(u² + v²)/R_p.
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -39,11 +39,7 @@ Image = NDArray[np.uint8]
 def mended(taxels: Image) -> tuple[Image, int]:
     """The image with its dead taxels bridged, and how many there were.
 
-    Args:
-        taxels: (16, 16) counts.
-
-    Returns:
-        The same array where none is dead; else a copy in which each has the mean of its four neighbours.
+    The same array (16, 16) where none is dead; else a copy in which each has the mean of its four neighbours.
     """
     if _GAP not in taxels.tobytes().translate(_LEVELS):  # the usual case, in a fraction of the whole search
         return taxels, 0
@@ -125,13 +121,12 @@ class Continuation:
         return whole
 
 
-# The contact patch in a tactile image: force, centroid and second moments, with what makes them doubtful.
+# The patch.
 
 SIDE = 16
 """Rows and columns of the array."""
-
-Window = tuple[int, int, int, int]
-"""First row, first column, rows, columns."""
+COUNTS_MAX = 255
+"""Largest count of a taxel."""
 
 OFF_PAD = 0.95
 """Pressure at the pad's edge over the highest from which the contact runs off: a paraboloid has lost a sixth."""
@@ -139,7 +134,6 @@ OFF_PAD_SIGMAS, OFF_PAD_TAXELS = 1.55, 1.0
 """The same where only moments are known: from the centroid to the edge, a taxel's own width included in σ. A paraboloid
 has lost a fourth by then, and one of which only a rim is left lies in the last row of taxels."""
 _TOO_FEW = 4
-_FULL: Window = (0, 0, SIDE, SIDE)
 
 
 class FeaturesLike(Protocol):
@@ -154,8 +148,6 @@ class FeaturesLike(Protocol):
     @property
     def var_rr(self) -> float: ...
     @property
-    def var_rc(self) -> float: ...
-    @property
     def var_cc(self) -> float: ...
     @property
     def peak(self) -> float: ...
@@ -167,12 +159,11 @@ class Patch(NamedTuple):
     Attributes:
         force: N, corrected by the calibration.
         u, v: centroid of pressure on the pad, m; NaN without contact.
-        var_uu, var_uv, var_vv: second central moments, m², blur and taxel size taken off; NaN without contact.
         n_active: taxels at or above the threshold; −1 where only features were sent.
         peak_pa: highest taxel pressure, Pa.
         saturated: a taxel is at its largest count.
         cut_by_window: the patch reaches an edge of the window inside the pad; what is beyond it is carried on
-            (`Continuation`) in force, centroid and moments.
+            (`Continuation`) in force and centroid.
         cut_by_pad: the patch reaches the pad's edge.
         too_few: fewer than four active taxels: no moments to speak of.
         dead: taxels in the midst of the patch that read nothing, bridged by their neighbours (`mended`).
@@ -183,9 +174,6 @@ class Patch(NamedTuple):
     force: float
     u: float
     v: float
-    var_uu: float
-    var_uv: float
-    var_vv: float
     n_active: int
     peak_pa: float
     saturated: bool
@@ -216,46 +204,40 @@ class Patch(NamedTuple):
 class PatchCalibration:
     """From counts to pascals and from the pressure sum to force.
 
-    Pressure of a taxel is `full_scale_pa · (counts/counts_max) ** exponent`; force is
-    `force_gain · S + edge_gain · √(S · 1 N)` with S the sum of pressure times area: the second term stands for what
-    the patch loses at its rim under the threshold, `calibrate_force` fits both.
+    Pressure of a taxel is `full_scale_pa · counts / 255`; force is `force_gain · S + edge_gain · √(S · 1 N)` with
+    S the sum of pressure times area: the second term stands for what the patch loses at its rim under the threshold,
+    `calibrate_force` fits both.
 
     Attributes:
         full_scale_pa: pressure at the largest count.
-        exponent: of the taxel's characteristic; 1 is linear.
         threshold_counts: smaller counts are taken as 0.
-        counts_max: largest count.
         pitch_m: distance of taxels.
         radius_m: R_p of the probe that the array is wrapped on.
         force_gain, edge_gain: see above; edge_gain in √N.
-        blur_var_m2: variance of the cover's blur per axis, m², taken off the moments together with pitch²/12.
         bias: residual standard deviation of the force fit, N; 0 when it was never fitted.
     """
 
     full_scale_pa: float = 100e3
-    exponent: float = 1.0
     threshold_counts: int = 5
-    counts_max: int = 255
     pitch_m: float = 1.5875e-3
     radius_m: float = 0.040
     force_gain: float = 1.0
     edge_gain: float = 0.0
-    blur_var_m2: float = 0.0
     bias: float = 0.0
     pascals: Array = field(init=False, repr=False)
     weights: Array = field(init=False, repr=False)
     continuation: Continuation = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        for name in ("full_scale_pa", "exponent", "counts_max", "pitch_m", "radius_m", "force_gain"):
+        for name in ("full_scale_pa", "pitch_m", "radius_m", "force_gain"):
             positive(name, getattr(self, name))
         counts = np.arange(256.0)
-        pascals = self.full_scale_pa * (counts / self.counts_max) ** self.exponent
+        pascals = self.full_scale_pa * (counts / COUNTS_MAX)
         pascals[counts < self.threshold_counts] = 0.0
         object.__setattr__(self, "pascals", read_only(pascals))
         weights = read_only(_moment_weights(self.pitch_m, self.radius_m))
         object.__setattr__(self, "weights", weights)
-        object.__setattr__(self, "continuation", Continuation(weights, float(pascals[self.counts_max])))
+        object.__setattr__(self, "continuation", Continuation(weights, float(pascals[COUNTS_MAX])))
 
 
 def _moment_weights(pitch: float, radius: float) -> Array:
@@ -270,15 +252,12 @@ def _moment_weights(pitch: float, radius: float) -> Array:
 def compute_patch(
     taxels: NDArray[np.uint8], calibration: PatchCalibration, window: Sequence[int] | None = None
 ) -> Patch:
-    """Patch of an image.
+    """Patch of an image; without an active taxel its force is 0 and its centroid NaN.
 
     Args:
         taxels: (16, 16) uint8 counts in pad coordinates, zeros outside the window.
         calibration: of the array.
         window: first row, first column, rows, columns that were sent; None for the whole pad.
-
-    Returns:
-        The patch; without an active taxel force 0 and NaN moments.
 
     Raises:
         UsageError: when the image is not (16, 16) uint8.
@@ -294,55 +273,30 @@ def compute_patch(
     shows_shape = peak > LEAST_PEAK * calibration.threshold_counts
     if window is not None and at_window > WORTH_COMPLETING * peak_pa and shows_shape:
         pressure = calibration.continuation.completed(pressure, window, peak_pa)
-    moments = (pressure.reshape(-1) @ calibration.weights).tolist()
-    return _patch(
-        moments,
-        calibration,
+    total, u, v, *_ = (pressure.reshape(-1) @ calibration.weights).tolist()
+    if total <= 0.0:
+        return _nothing(peak_pa)._replace(dead=dead)
+    return Patch(
+        *_force_and_centroid(total, u / total, v / total, calibration),
         n_active=n_active,
         peak_pa=peak_pa,
-        saturated=peak >= calibration.counts_max,
+        saturated=peak >= COUNTS_MAX,
         cut_by_window=at_window > 0.0,
         cut_by_pad=at_pad > 0.0,
+        too_few=n_active < _TOO_FEW,
         dead=dead,
         off_pad=at_pad >= OFF_PAD * peak_pa,
     )
 
 
-def _patch(
-    moments: list[float],
-    calibration: PatchCalibration,
-    *,
-    n_active: int,
-    peak_pa: float,
-    saturated: bool,
-    cut_by_window: bool,
-    cut_by_pad: bool,
-    dead: int = 0,
-    off_pad: bool = False,
-) -> Patch:
-    total = moments[0]
-    if n_active == 0 or total <= 0.0:
-        nan = math.nan
-        return Patch(0.0, nan, nan, nan, nan, nan, n_active, peak_pa, False, False, False, True, dead)
-    pitch = calibration.pitch_m
-    u, v = moments[1] / total, moments[2] / total
-    square, off = pitch * pitch, pitch * pitch / 12.0 + calibration.blur_var_m2
-    return Patch(
-        force=calibration.force_gain * total + calibration.edge_gain * math.sqrt(total),
-        u=u * pitch,
-        v=v * pitch,
-        var_uu=(moments[3] / total - u * u) * square - off,
-        var_uv=(moments[4] / total - u * v) * square,
-        var_vv=(moments[5] / total - v * v) * square - off,
-        n_active=n_active,
-        peak_pa=peak_pa,
-        saturated=saturated,
-        cut_by_window=cut_by_window,
-        cut_by_pad=cut_by_pad,
-        too_few=n_active < _TOO_FEW,
-        dead=dead,
-        off_pad=off_pad,
-    )
+def _nothing(peak_pa: float) -> Patch:
+    return Patch(0.0, math.nan, math.nan, 0, peak_pa, False, False, False, True)
+
+
+def _force_and_centroid(total: float, u: float, v: float, calibration: PatchCalibration) -> tuple[float, float, float]:
+    """Force (N) of a sum of pressure times area (N), and the centroid (m) of one in pitches."""
+    force = calibration.force_gain * total + calibration.edge_gain * math.sqrt(total)
+    return force, u * calibration.pitch_m, v * calibration.pitch_m
 
 
 def _edges(counts: bytes, window: Sequence[int] | None) -> tuple[int, int]:
@@ -375,18 +329,20 @@ def patch_from_features(features: FeaturesLike, calibration: PatchCalibration) -
     cut_by_pad = any(c + 2.0 * math.sqrt(max(var, 0.0)) > reach for c, var in axes)
     reached = max(c + OFF_PAD_SIGMAS * math.sqrt(max(var, 0.0) + 1.0 / 12.0) for c, var in axes)
     at_edge = max(abs(row), abs(col)) > reach - OFF_PAD_TAXELS
-    moments = [1.0, col, row, features.var_cc + col * col, features.var_rc + row * col, features.var_rr + row * row]
-    peak = min(max(int(features.peak), 0), 255)
-    return _patch(
-        [total * m for m in moments],
-        calibration,
-        n_active=-1 if total > 0.0 else 0,
-        peak_pa=float(calibration.pascals[peak]),
-        saturated=peak >= calibration.counts_max,
+    peak = min(max(int(features.peak), 0), COUNTS_MAX)
+    peak_pa = float(calibration.pascals[peak])
+    if total <= 0.0:
+        return _nothing(peak_pa)
+    return Patch(
+        *_force_and_centroid(total, col, row, calibration),
+        n_active=-1,
+        peak_pa=peak_pa,
+        saturated=peak >= COUNTS_MAX,
         cut_by_window=False,
         cut_by_pad=cut_by_pad,
+        too_few=False,
         off_pad=reached > reach or at_edge,
-    )._replace(too_few=total <= 0.0)
+    )
 
 
 def calibrate_force(
@@ -410,16 +366,6 @@ def calibrate_force(
         raise UsageError(f"sums, forces: expected at least 3 pairs above 0, got {len(s)} and {len(f)}")
     basis = np.stack([s, np.sqrt(s)], axis=1)
     gains, *_ = np.linalg.lstsq(basis / f[:, None], np.ones_like(f), rcond=None)
-    base = calibration if calibration is not None else PatchCalibration()
-    return PatchCalibration(
-        full_scale_pa=base.full_scale_pa,
-        exponent=base.exponent,
-        threshold_counts=base.threshold_counts,
-        counts_max=base.counts_max,
-        pitch_m=base.pitch_m,
-        radius_m=base.radius_m,
-        force_gain=float(gains[0]),
-        edge_gain=float(gains[1]),
-        blur_var_m2=base.blur_var_m2,
-        bias=float(np.sqrt(np.mean((basis @ gains - f) ** 2))),
-    )
+    base = PatchCalibration() if calibration is None else calibration
+    bias = float(np.sqrt(np.mean((basis @ gains - f) ** 2)))
+    return replace(base, force_gain=float(gains[0]), edge_gain=float(gains[1]), bias=bias)

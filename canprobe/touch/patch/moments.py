@@ -21,8 +21,6 @@ from canprobe.errors import UsageError
 from canprobe.touch.linear_algebra import Array, positive, read_only, solved
 from canprobe.touch.patch.image import PatchCalibration
 
-# Second moments of a tactile image that do not jump where a taxel falls under the threshold.
-
 LEVEL_COUNTS = 6
 """Taken off every taxel: the first count above the sensor's threshold of 2 %."""
 
@@ -37,9 +35,6 @@ class MomentImage:
     the moments depend on where a resting patch lies on the grid: 2.5–4 % of the moment across a cylinder of 36 mm at
     2 N. With the level taken off it fades; there 0.6 % are left.
 
-    Args:
-        calibration: of the array.
-        level_counts: the level.
     """
 
     def __init__(self, calibration: PatchCalibration, level_counts: int = LEVEL_COUNTS) -> None:
@@ -63,9 +58,8 @@ class MomentImage:
         return (uu, uv, vv) if uu > 0.0 and uu * vv > uv * uv else None
 
 
-# From the curvature under the probe to the second moments of its image: a calibrated forward model of the sensor.
+# A calibrated forward model: from the curvature under the probe to the second moments of its image.
 
-_ROOT2 = math.sqrt(2.0)
 TAPER = 0.1
 """How far beyond the calibrated range a patch still counts, as a share of the range's end."""
 _APART = 1e-4
@@ -88,7 +82,7 @@ def terms(a: Any, b: Any, t: Any) -> tuple[Any, ...]:
 
 @dataclass(frozen=True, slots=True)
 class MomentFit:
-    """What a calibration found, free of units: `canprobe.studies.array_calibration` makes it.
+    """What a calibration found, free of units: `tests/support/array_calibration.py` makes it.
 
     With i, j the principal axes of the patch, m the ideal moments over the squared pitch and t the level over
     the peak pressure, the image's moment V_i over the squared pitch is the sum of the coefficients times `terms`.
@@ -127,14 +121,9 @@ class MomentFit:
 
 @dataclass(frozen=True, slots=True)
 class MomentModel:
-    """A fit on a certain probe.
+    """A fit of the array's make on a probe of radius R_p (m); stiffness: K/h of the layer (N/m³); pitch: m.
 
-    Attributes:
-        fit: of the array's make.
-        radius: R_p, m.
-        stiffness: k = K/h of the layer, N/m³.
-        level_pa: taken off the image's pressure (`MomentImage`).
-        pitch: m.
+    `level_pa` is taken off the image's pressure (`MomentImage`).
     """
 
     fit: MomentFit
@@ -148,11 +137,8 @@ class MomentModel:
             positive(name, getattr(self, name))
 
     def ideal(self, k: Moments, force: float) -> tuple[Moments, float]:
-        """Ideal moments over the squared pitch, and the level over the peak pressure.
-
-        Args:
-            k: K11, K12, K22, 1/m.
-            force: N.
+        """Ideal moments over the squared pitch, and the level over the peak pressure, for K11, K12, K22 (1/m) and a
+        force (N).
 
         Raises:
             ValueError: where the surface is as hollow as the probe.
@@ -180,11 +166,7 @@ class MomentModel:
         return math.fsum(map(mul, self.fit.coefficients, terms(a, b, t)))
 
     def trust(self, k: Moments, force: float) -> float:
-        """1 where the calibration pressed such patches (K in 1/m, measured force in N), falling to 0 beyond.
-
-        Raises:
-            ValueError: where the surface is as hollow as the probe.
-        """
+        """1 where the calibration pressed such patches (K in 1/m, measured force in N), falling to 0 beyond."""
         (xx, xy, yy), t = self.ideal(k, force / self.fit.force_ratio)
         mean, half = 0.5 * (xx + yy), math.hypot(0.5 * (xx - yy), xy)
         (m0, m1), (t0, t1) = self.fit.m_range, self.fit.t_range
@@ -231,7 +213,7 @@ class MomentModel:
         J = np.array(
             [
                 slope(self.moments((k11 + h, k12, k22), f), h),
-                slope(self.moments((k11, k12 + h, k22), f), _ROOT2 * h),
+                slope(self.moments((k11, k12 + h, k22), f), math.sqrt(2.0) * h),
                 slope(self.moments((k11, k12, k22 + h), f), h),
             ]
         ).T
@@ -283,8 +265,7 @@ class PadMemory:
     def add(self, t_s: float, u: float, v: float) -> Moments:
         """Take the centroid (m) of an image at a time (s).
 
-        Returns:
-            uu, uv, vv of the way from here to where the patch was, mean over what each memory holds, added up, m².
+        Returns uu, uv, vv of the way from here to where the patch was, mean over what each memory holds, added up, m².
         """
         dt = 0.0 if self._t_s is None else max(t_s - self._t_s, 0.0)
         self._t_s = t_s

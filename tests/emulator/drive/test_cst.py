@@ -9,7 +9,7 @@ import pytest
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
-from canprobe.emulator.drive.reference import TorqueRun
+from canprobe.emulator.drive.reference import torque_run
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.ideal_arm import MotorDynamics
 from canprobe.emulator.plant.plant import Plant
@@ -172,7 +172,7 @@ def test_cia402_cst_the_ideal_arm_needs_the_torque_that_it_is_given(drive, axis)
 @pytest.mark.parametrize("velocity", [0.0, 2000.0, -2000.0])
 @pytest.mark.parametrize("limit", [math.inf, 2500.0, 500.0])
 def test_torque_run_is_continuous_and_its_velocity_is_the_slope(torque, velocity, limit):
-    run = TorqueRun(10.0, velocity, torque, MotorDynamics(GAIN, COULOMB, DAMPING), limit)
+    run = torque_run(10.0, velocity, torque, MotorDynamics(GAIN, COULOMB, DAMPING), limit)
     times = [k * 1e-3 for k in range(700)]
     samples = [run.at(t) for t in times]
     assert samples[0] == pytest.approx((10.0, min(max(velocity, -limit), limit)))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from canprobe.emulator.drive.reference import braking, trapezoid
+from canprobe.emulator.drive.reference import Rates, braking, trapezoid
 
 CYCLE = 2_500_000
 NEW, NEW_NOW, NEW_RELATIVE, NEW_NOW_RELATIVE, HALT = 0x1F, 0x3F, 0x5F, 0x7F, 0x10F
@@ -302,7 +302,7 @@ RATES = st.floats(1e3, 1e7)
 @given(st.tuples(PLACES, SPEEDS, PLACES, st.floats(1.0, 5e4), RATES, RATES))
 def test_a_profile_is_continuous_and_keeps_the_limits(numbers):
     position, velocity, target, speed, up, down = numbers
-    profile = trapezoid(position, velocity, target, speed=speed, acceleration=up, deceleration=down)
+    profile = trapezoid(position, velocity, target, Rates(speed, up, down))
     assert profile.at(0.0) == pytest.approx((position, velocity), abs=1e-6)
     assert profile.at(profile.duration_s) == (target, 0.0)
     step = profile.duration_s / 500
@@ -318,7 +318,7 @@ def test_a_profile_is_continuous_and_keeps_the_limits(numbers):
 @given(SPEEDS, st.floats(1.0, 1e5), RATES, RATES)
 def test_a_way_too_short_for_the_speed_has_the_peak_of_the_textbook(velocity, way, up, down):
     velocity = min(abs(velocity), math.sqrt(2 * down * way))  # it can still stop in time
-    profile = trapezoid(0.0, velocity, way, speed=1e9, acceleration=up, deceleration=down)
+    profile = trapezoid(0.0, velocity, way, Rates(1e9, up, down))
     peak = math.sqrt((2 * up * down * way + down * velocity**2) / (up + down))
     assert profile.duration_s == pytest.approx((peak - velocity) / up + peak / down, abs=1e-6)
     assert profile.at((peak - velocity) / up)[1] == pytest.approx(peak, rel=1e-6)

@@ -202,7 +202,7 @@ def test_cia402_6007_heartbeat_loss(drive, option, goal):
     drive.write(0x1029, 1, 1, 1)
     drive.write(0x1016, 1, 127 << 16 | 250, 4)
     bring(drive, S.OPERATION_ENABLED)
-    drive.node.application._supervision.stop()  # the SYNC watch would be quicker
+    drive.node.application.parts.supervision.stop()  # the SYNC watch would be quicker
     drive.send(0x77F, "05", 0)
     assert drive.advance(250 * MS)[0] == (0x81, "3081117f00000000")
     assert drive.node.application.state is goal

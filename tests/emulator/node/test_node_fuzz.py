@@ -85,7 +85,7 @@ class Watched:
         node = self.node
         kept = [*node.dictionary.values.values(), *node.store.saved.values()]
         texts = sum(len(value) for value in kept if isinstance(value, bytes))
-        return len(kept), len(node.core.timers._heap), len(node.emcy._waiting), len(node.emcy._history), texts
+        return len(kept), len(node.core.timers.armed), len(node.emcy._waiting), len(node.emcy._history), texts
 
     def check_end(self):
         """It still serves: reset, boot-up, an SDO answered at once."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -10,7 +12,7 @@ from canprobe.emulator.node.core import Timers
 
 def test_fires_once_at_its_time():
     fired: list[int] = []
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
     timers.new(fired.append).arm(50)
     timers.run(49)
     assert (fired, timers.next_ns) == ([], 50)
@@ -20,7 +22,7 @@ def test_fires_once_at_its_time():
 
 def test_rearmed_later_and_earlier():
     fired: list[int] = []
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
     timer = timers.new(fired.append)
     timer.arm(50)
     timer.arm(80)
@@ -32,7 +34,7 @@ def test_rearmed_later_and_earlier():
 
 
 def test_cancelled_is_silent():
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
     timer = timers.new(lambda _: 1 / 0)
     timer.arm(5)
     timer.cancel()
@@ -42,7 +44,7 @@ def test_cancelled_is_silent():
 
 def test_missed_periods_are_skipped_and_the_phase_kept():
     fired: list[int] = []
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
 
     def again(due: int) -> None:
         fired.append(due)
@@ -55,10 +57,10 @@ def test_missed_periods_are_skipped_and_the_phase_kept():
     assert (fired, timers.next_ns) == ([100, 200], 1300)
 
 
-def test_the_heap_does_not_grow_by_deadlines_that_come_and_go():
+def test_nothing_is_kept_of_deadlines_that_come_and_go():
     """A far deadline, then a near one that fires, again and again: as when 1017h is written long, short, long."""
     fired: list[int] = []
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
     timer = timers.new(fired.append)
     for t_ns in range(10_000):
         timer.arm(t_ns + 10**9)
@@ -68,12 +70,12 @@ def test_the_heap_does_not_grow_by_deadlines_that_come_and_go():
         timer.arm(t_ns + 1)
         timers.run(t_ns + 1)
     assert fired == list(range(1, 10_001))
-    assert len(timers._heap) < 200
+    assert not timers.armed
 
 
 @given(st.lists(st.tuples(st.integers(0, 3), st.one_of(st.none(), st.integers(0, 40))), max_size=30))
 def test_next_is_the_minimum_of_what_is_armed(orders):
-    timers = Timers()
+    timers = Timers(SimpleNamespace())
     made = [timers.new(lambda _: None) for _ in range(4)]
     for which, due in orders:
         if due is None:

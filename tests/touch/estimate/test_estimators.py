@@ -13,8 +13,6 @@ from canprobe.touch.estimate import quadric
 from canprobe.touch.estimate.fit import METHODS, make_estimator
 from canprobe.touch.estimate.likelihood import cramer_rao
 from canprobe.touch.estimate.noise import Prior, make_noise
-from canprobe.touch.estimate.nonlinear import basis, monomials
-from canprobe.touch.estimate.quadric import sample_rows
 from canprobe.touch.estimate.recursive import Spread, Travel
 
 NOISE = {"sigma_point": 2e-5, "sigma_normal": 1e-3}
@@ -22,7 +20,7 @@ WEIGHT = np.array([1.0, 2.0, 1.0])
 
 
 def make(method="recursive", **kw):
-    return make_estimator(method, **{**NOISE, "probe_radius": 0.04, **kw})
+    return make_estimator(method, **{**NOISE, **kw})
 
 
 def fed(estimator, samples):
@@ -70,31 +68,14 @@ def test_every_method_finds_a_cylinder(method, truth):
     assert e.condition_number > 1
 
 
-@pytest.mark.parametrize("coupling", [0.0, 0.5])
-def test_one_row_is_the_row_of_the_batch(truth, coupling):
-    rng = np.random.default_rng(1)
-    path = truth.path("ellipsoid")
-    p, n = path.noisy(5e-5, 3e-3, 1)
-    S = path.surface.S.copy()
-    S[:3, :3] *= 0.02
-    c = 1.1 * quadric.parameters_of(S)
-    c[:3] = [0.01, -0.02, 0.001]
-    batch = quadric.rows(c, quadric.design(p / 0.02, n, make_noise(160, 1e-2, 3e-3, coupling)))
-    for i in rng.choice(160, 20):
-        one = sample_rows(c.tolist(), (p[i] / 0.02).tolist(), n[i].tolist(), (1e-4, 9e-6), coupling)
-        J = np.reshape(one.weights, (3, 4)) @ basis(np.array([monomials(*one.place)]))[0, :, :9]
-        assert np.allclose(one.residuals, -batch.r[i], rtol=1e-9, atol=1e-9)
-        assert np.allclose(J, batch.J[i], rtol=1e-9, atol=1e-6)
-
-
 def test_rows_are_the_derivative_of_residuals(truth):
     path = truth.path("ellipsoid")
     S = path.surface.S.copy()
     S[:3, :3] *= 0.02
     c = quadric.parameters_of(S)
     d = quadric.design(path.points / 0.02, path.normals, make_noise(160, 1e-9, 1.0))
-    J, h = quadric.rows(c, d).J, 1e-6
-    numeric = [(quadric.rows(c + h * e, d).r - quadric.rows(c - h * e, d).r) / (2 * h) for e in np.eye(9)]
+    J, h = quadric.linearise(c, d).jacobian(), 1e-6
+    numeric = [(quadric.linearise(c + h * e, d).r - quadric.linearise(c - h * e, d).r) / (2 * h) for e in np.eye(9)]
     assert np.allclose(J[:, 1:], np.moveaxis(numeric, 0, 2)[:, 1:], atol=1e-8)
     assert np.allclose(J[:, 0] * 1e-9, np.moveaxis(numeric, 0, 2)[:, 0] * 1e-9, atol=1e-8)
 
@@ -251,7 +232,6 @@ def test_reset_forgets(method, truth):
         ({"method": "kalman"}, "method"),
         ({"sigma_point": 0.0}, "sigma_point"),
         ({"sigma_normal": math.nan}, "sigma_normal"),
-        ({"probe_radius": -0.04}, "probe_radius"),
         ({"memory_m": 0.0}, "memory_m"),
         ({"prior": Prior.flat(0.02, 30.0)}, "prior"),
         ({"method": "ml", "window": 1}, "window"),

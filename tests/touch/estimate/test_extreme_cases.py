@@ -24,7 +24,7 @@ MUST = ("ml", "recursive")
 
 
 def make(method, sigma=SIGMA, **kw):
-    return make_estimator(method, sigma_point=sigma[0], sigma_normal=sigma[1], probe_radius=0.04, **kw)
+    return make_estimator(method, sigma_point=sigma[0], sigma_normal=sigma[1], **kw)
 
 
 def fed(estimator, samples):
@@ -176,9 +176,7 @@ class TestSize:
         answers = []
         for u in (1.0, unit):
             fit = fit_surface(u * p, n, sigma_point=u * SIGMA[0], sigma_normal=SIGMA[1], method=method)
-            estimator = make_estimator(
-                method, sigma_point=u * SIGMA[0], sigma_normal=SIGMA[1], probe_radius=0.04 * u, memory_m=0.02 * u
-            )
+            estimator = make_estimator(method, sigma_point=u * SIGMA[0], sigma_normal=SIGMA[1], memory_m=0.02 * u)
             for s in truth.samples(p, n):
                 T = s.T_base_probe.copy()
                 T[:3, 3] *= u

@@ -1,5 +1,7 @@
 """The filter's prior counts against faded samples by as much as makes the best of both."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -7,9 +9,9 @@ from canprobe.touch.estimate.answer import curvature_covariance
 from canprobe.touch.estimate.fit import fit_surface
 from canprobe.touch.estimate.information import Expected, InformationFilter, LeftOut, Score
 from canprobe.touch.estimate.noise import Correlation, Noise, Prior
-from canprobe.touch.estimate.nonlinear import DIFFUSE, shifted, terms
-from canprobe.touch.estimate.quadric import curvature_jacobian, design
-from canprobe.touch.estimate.start import linearised, with_terms
+from canprobe.touch.estimate.nonlinear import DIFFUSE
+from canprobe.touch.estimate.quadric import curvature_jacobian, design, shifted, terms
+from canprobe.touch.estimate.start import solved_once
 
 MEMORY = 0.02
 STEP = 0.5e-3
@@ -79,11 +81,17 @@ def low(x, y):
     return np.array([2 * x, 2 * y, 1.0, 0.0, 0.0, 0.0, x * x, 2 * x * y, y * y])
 
 
+def higher(x, y):
+    """The terms that a quadric leaves out."""
+    return terms(np.array([[x, y, 0.0]]))[0, 0, 9:]
+
+
 def test_terms_have_their_derivatives():
-    x, y, h = RNG(0).uniform(-1, 1, 20), RNG(1).uniform(-1, 1, 20), 1e-6
-    at = terms(x, y)
-    assert np.allclose(at[:, 1], (terms(x + h, y) - terms(x - h, y))[:, 0] / (2 * h), atol=1e-8)
-    assert np.allclose(at[:, 2], (terms(x, y + h) - terms(x, y - h))[:, 0] / (2 * h), atol=1e-8)
+    X, h = RNG(0).uniform(-1, 1, (20, 3)), 1e-6
+    at = terms(X)
+    assert np.allclose(at[:, :, :9], terms(X, 9))
+    for k, e in enumerate(h * np.eye(3)):
+        assert np.allclose(at[:, 1 + k], (terms(X + e) - terms(X - e))[:, 0] / (2 * h), atol=1e-8)
 
 
 def test_terms_about_another_place_are_the_same_surface():
@@ -91,13 +99,13 @@ def test_terms_about_another_place_are_the_same_surface():
     a, (x0, y0) = rng.normal(size=9), rng.normal(size=2)
     A, Q = shifted(x0, y0)
     for x, y in rng.normal(size=(20, 2)):
-        there = terms(np.array([x]), np.array([y]))[0, 0] @ (A @ a) + low(x, y) @ (Q @ a)
-        assert there == pytest.approx(terms(np.array([x0 + x]), np.array([y0 + y]))[0, 0] @ a, rel=1e-12)
+        there = higher(x, y) @ (A @ a) + low(x, y) @ (Q @ a)
+        assert there == pytest.approx(higher(x0 + x, y0 + y) @ a, rel=1e-12)
 
 
 def test_a_variance_of_terms_is_alike_in_all_directions():
     angle = np.linspace(0.0, 2.0 * np.pi, 7)
-    values = terms(np.cos(angle), np.sin(angle))[:, 0]
+    values = np.array([higher(math.cos(a), math.sin(a)) for a in angle])
     for which in (slice(0, 4), slice(4, 9)):
         assert np.allclose(np.square(values[:, which]).sum(axis=1), 1.0)
 
@@ -118,22 +126,21 @@ def test_sums_are_carried_along_as_if_they_were_taken_in_the_last_frame():
     def at(T, part, c):
         R, n = T[:3, :3], len(points[part])
         d = design((points[part] - T[:3, 3]) @ R / L, normals[part] @ R, Noise(np.full(n, 2e-5 / L), np.full(n, 1e-3)))
-        now = linearised(c, d, prior.rows(L))
-        return now, with_terms(now, d)
+        return solved_once(c, d, prior.rows(L))
 
     state = InformationFilter(L, prior, None)
     T = np.eye(4)
-    now, rows = at(T, slice(40), np.zeros(9))
+    now = at(T, slice(40), np.zeros(9))
     for _ in range(6):
-        now, rows = at(T, slice(40), now.target)
-    state.adopt(T, now.c, now.root, rows, -now.r, 0.008)
+        now = at(T, slice(40), now.target)
+    state.adopt(T, now.c, now.root, now.rows, -now.r, 0.008)
     for k in range(40, 120, 4):
-        step, rows = at(state.T, slice(k, k + 4), state.c)
-        state.take(rows, -step.r, 0.0)  # over no path nothing is forgotten
+        step = at(state.T, slice(k, k + 4), state.c)
+        state.take(step.rows, -step.r, 0.0)  # over no path nothing is forgotten
         state.follow(points[k + 3])
     assert np.linalg.norm(state.T[:3, 3] - points[-1]) < 1.5e-3  # the frame has come along
-    whole, rows = at(state.T, slice(None), state.c)
-    flat = rows.reshape(-1, 18)
+    whole = at(state.T, slice(None), state.c)
+    flat = whole.rows.reshape(-1, 18)
     wanted, found = flat.T @ flat, state.left_out._information
     size = np.sqrt(np.diag(wanted))
     # what tilts is taken for level: over 0.22 rad here, cos⁴ of which is 0.91
@@ -158,11 +165,11 @@ def test_without_forgetting_an_answer_is_that_of_a_batch():
     residuals = flat[:, 9:] @ a + e.reshape(-1)
     residuals -= flat[:, :9] @ (H @ (flat[:, :9].T @ residuals))  # at the quadric that fits best
     sums.start(rows, residuals.reshape(-1, 3), 0.01)
-    found = sums.amend(c, H, np.zeros(3))
+    found = sums.amend(c, H, np.zeros(3), Expected())
     both = np.linalg.lstsq(flat, residuals, rcond=None)[0]  # terms that show: those that fit best
     assert found.misfit > 0.999
     assert np.allclose(found.c - c, both[:9], atol=0.02)
-    assert np.allclose(sums.explanation(c, H), both, atol=0.02)
+    assert np.allclose(sums.explanation(c, H, Expected()), both, atol=0.02)
     wide = np.linalg.inv(flat.T @ flat)[:9, :9]
     spread = np.diag(H + found.covariance) / np.diag(wide)
     assert np.all(spread[:6] > 0.9)

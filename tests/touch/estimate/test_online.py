@@ -83,7 +83,7 @@ def test_all_that_is_known_agrees_after_an_error_is_added():
 def test_ml_forgets_what_was_before_an_edge():
     """From a plane into an arc of 30 mm: soon after the edge the window holds only the arc."""
     rng = np.random.default_rng(3)
-    estimator = make_estimator("ml", probe_radius=0.04, memory_m=MEMORY, window=160, **SIGMAS)
+    estimator = make_estimator("ml", memory_m=MEMORY, window=160, **SIGMAS)
     s = np.arange(260) * 0.125e-3
     x, y = s - 0.022, 0.003 * np.sin(s / 0.6e-3 * 0.5)
     angle = np.maximum(x, 0.0) / 0.03

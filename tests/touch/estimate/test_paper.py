@@ -11,9 +11,19 @@ from canprobe.touch.estimate import quadric
 from canprobe.touch.estimate.fit import fit_surface, make_estimator
 from canprobe.touch.estimate.likelihood import fit_ml, make_touches, working_frame
 from canprobe.touch.estimate.noise import make_noise
-from canprobe.touch.estimate.window import paper_rates, paper_system, three_rows
+from canprobe.touch.estimate.window import paper_rates, three_rows
 
 R = 0.036
+SIX = [0, 1, 2, 4, 5, 7]
+"""Places of c11 c12 c13 c22 c23 c33 in the ten of (31)."""
+
+
+def paper_system(x, y):
+    """A ((3N+1), 10) and b ((3N+1),) of (30)–(34); the fourth components of x and y (N, 3) are 0."""
+    A = np.zeros((3 * len(y) + 1, 10))
+    A[:-1, SIX] = three_rows(y)
+    A[-1, 9] = 1.0  # the boundary condition f = 0 at the origin
+    return A, np.append(-x.reshape(-1), 0.0)
 
 
 def test_a_is_never_of_rank_ten():
@@ -24,6 +34,9 @@ def test_a_is_never_of_rank_ten():
     assert np.linalg.matrix_rank(A) == 7  # six, and the boundary row
     assert not A[:-1, [3, 6, 8, 9]].any()
     assert np.linalg.matrix_rank(A.T @ A) < 10  # (35)
+    # of least norm is the solution of the six that are left
+    six = np.linalg.lstsq(A[:-1, SIX], b[:-1], rcond=None)[0]
+    assert np.allclose(np.linalg.pinv(A) @ b, np.insert(six, [3, 5, 6, 6], 0.0), atol=1e-12)
 
 
 @pytest.mark.parametrize(("angle", "zeros"), [(0.0, 1), (0.5 * math.pi, 3)])
@@ -73,7 +86,7 @@ def test_noise_on_both_sides(noise, lag, percent, within, truth):
     path = truth.placed(truth.surface("cylinder"), R * np.sin(s / R), np.zeros(160))
     kappa = []
     for seed in range(16):
-        estimator = make_estimator("chen1996", sigma_point=noise, sigma_normal=1e-3, probe_radius=0.04, lag=lag)
+        estimator = make_estimator("chen1996", sigma_point=noise, sigma_normal=1e-3, lag=lag)
         for sample in truth.felt(path, noise, seed):
             estimator.add(sample)
         kappa.append(2 * estimator.estimate().S[0, 0])

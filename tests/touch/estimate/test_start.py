@@ -78,13 +78,13 @@ class TestWork:
     @pytest.fixture
     def evaluations(self, monkeypatch):
         sizes = []
-        rows = one_step.rows
+        linearise = one_step.linearise
 
         def counted(c, d):
             sizes.append(len(d.X))
-            return rows(c, d)
+            return linearise(c, d)
 
-        monkeypatch.setattr(one_step, "rows", counted)
+        monkeypatch.setattr(one_step, "linearise", counted)
         return sizes
 
     @pytest.mark.parametrize("pace", [0.125e-3, 0.02e-3], ids=["nominal", "slow"])
@@ -98,7 +98,7 @@ class TestWork:
         rng = np.random.default_rng(2)
         wrong = rng.random(len(p)) < share
         p[wrong] += 5e-3 * rng.normal(size=(int(wrong.sum()), 3))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1], probe_radius=0.04)
+        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
         most, total = 0, 0
         for i, (point, normal) in enumerate(zip(p, n, strict=True)):
             estimator.add(ContactSample(0.005 * i, point, normal, np.eye(4), np.array([0.0, 0.0, 0.04]), 1.0))
@@ -111,7 +111,7 @@ class TestWork:
     def test_once_the_filter_has_taken_over_there_is_no_batch_any_more(self, truth, evaluations):
         path = truth.path("ellipsoid")
         samples = list(truth.samples(*path.noisy(*SIGMA, 0)))
-        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1], probe_radius=0.04)
+        estimator = make_estimator("recursive", sigma_point=SIGMA[0], sigma_normal=SIGMA[1])
         for sample in samples[:100]:
             estimator.add(sample)
         assert evaluations
@@ -130,7 +130,7 @@ def test_the_first_step_of_a_path_at_pace_is_not_crowded_that_of_a_contact_at_re
         rest = np.zeros(waits, dtype=int)
         order = np.concatenate([rest, np.arange(len(path.points))])
         settings = {"sigma_point": 1e-6, "sigma_normal": 1e-3, "memory_m": MEMORY, "window": 160}
-        estimator = make_estimator("recursive", probe_radius=0.04, **settings)
+        estimator = make_estimator("recursive", **settings)
         for i, sample in enumerate(truth.samples(path.points[order], path.normals[order])):
             estimator.add(sample)
             if (found := estimator.estimate()) is not None:

@@ -8,7 +8,7 @@ import pytest
 from canprobe.emulator.array import follow, middle
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.planning.choices import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
+from canprobe.planning.window import CARRIED_ERROR, CARRIED_SHARE, CARRIED_SIDE, measured_share
 from canprobe.scene.setup import Probe
 from canprobe.touch.patch.image import SIDE, Continuation, PatchCalibration, compute_patch
 

@@ -347,7 +347,7 @@ def cylinder_touch(x, y, t, moments):
 
 
 def estimator(method="recursive"):
-    motion = make_estimator(method, sigma_point=3e-5, sigma_normal=2e-3, probe_radius=RADIUS, memory_m=0.02)
+    motion = make_estimator(method, sigma_point=3e-5, sigma_normal=2e-3, memory_m=0.02)
     return PatchedEstimator(motion, PatchCurvature(model()), 0.02)
 
 
@@ -563,9 +563,7 @@ def test_a_sample_that_the_motion_drops_is_not_taken_from_the_patch_either():
 
 
 def test_a_prior_on_curvature_counts_once_and_the_patch_still_observes():
-    motion = make_estimator(
-        "ml", sigma_point=3e-5, sigma_normal=2e-3, probe_radius=RADIUS, prior=Prior.flat(0.02, 10.0)
-    )
+    motion = make_estimator("ml", sigma_point=3e-5, sigma_normal=2e-3, prior=Prior.flat(0.02, 10.0))
     one = PatchedEstimator(motion, PatchCurvature(model()), 0.02)
     for i, (x, y) in enumerate(AXIAL[:160]):
         one.add(cylinder_touch(x, y, i * 5e-3, True))

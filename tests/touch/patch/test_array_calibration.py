@@ -4,10 +4,10 @@ import math
 
 import numpy as np
 import pytest
+from array_calibration import calibrate, fit_moments, pressed_sums, random_presses
 
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
-from canprobe.studies.array_calibration import calibrate, fit_moments, pressed_sums, random_presses
 from canprobe.touch.contact import ContactSample
 from canprobe.touch.patch.array_model import FORCE_GAINS, MOMENT_FITS, array_calibration, moment_model
 from canprobe.touch.patch.curvature import PatchCurvature, patch_estimate

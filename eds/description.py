@@ -1,0 +1,182 @@
+"""What an EDS file states of a device, typed: one `Entry` per (index, subindex), and the features of [DeviceInfo].
+
+`load_eds` gives the dictionary, `Description(od)` reads it; an object or sub-index that the file does not describe is
+None. Source: CiA 306-1, "Object description", "Dummy usage", "Device information"; CiA 402-2, 6502h.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+from canopen.objectdictionary import ObjectDictionary, ODArray, ODVariable, datatypes
+
+from canprobe.eds.variables import OCTETS, SIGNED, TEXTS, UNSIGNED, Value
+
+LAST_DUMMY = 0x0007
+"""Indices up to here are data types: DummyUsage says which of them an RPDO may map to fill room."""
+_MODES = 0x6502
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """One value of the object dictionary, as the file describes it for one node.
+
+    Attributes:
+        index, subindex: where it is; an index up to `LAST_DUMMY` is a dummy type.
+        name: ParameterName.
+        data_type: of CiA 301, such as 7 for UNSIGNED32.
+        bits: length of a value; 0 for texts, octets and domains, which have none.
+        signed: an integer in two's complement.
+        access: AccessType: ro, wo, rw, rwr, rww or const.
+        mappable: PDOMapping.
+        low, high: LowLimit and HighLimit; None: not stated.
+        default: DefaultValue with $NODEID put in; None: not stated.
+        configured: ParameterValue of a DCF; None: not stated.
+    """
+
+    index: int
+    subindex: int
+    name: str
+    data_type: int
+    bits: int
+    signed: bool
+    access: str
+    mappable: bool
+    low: int | float | None
+    high: int | float | None
+    default: Value | None
+    configured: Value | None
+
+    @property
+    def initial(self) -> Value | None:
+        """The value at boot: ParameterValue, or else DefaultValue."""
+        return self.default if self.configured is None else self.configured
+
+    @property
+    def readable(self) -> bool:
+        """Whether SDO may read it."""
+        return self.access != "wo"
+
+    @property
+    def writable(self) -> bool:
+        """Whether SDO may write it."""
+        return self.access not in {"ro", "const"}
+
+    @property
+    def in_tpdo(self) -> bool:
+        """Whether a TPDO may map it."""
+        return self.mappable and self.access not in {"wo", "rww"}
+
+    @property
+    def in_rpdo(self) -> bool:
+        """Whether an RPDO may map it: what can be written and mapped, and a dummy."""
+        return self.index <= LAST_DUMMY or (self.mappable and self.access in {"wo", "rw", "rww"})
+
+    def allows(self, value: float) -> bool:
+        """Whether a number lies within LowLimit and HighLimit, and within the range of an integer type."""
+        low, high = self.low, self.high
+        if self.data_type in SIGNED or self.data_type in UNSIGNED:
+            least = -(1 << self.bits - 1) if self.signed else 0
+            most = least + (1 << self.bits) - 1
+            low, high = least if low is None else max(low, least), most if high is None else min(high, most)
+        return (low is None or value >= low) and (high is None or value <= high)
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """A device as its EDS file describes it.
+
+    Attributes:
+        od: from `load_eds`.
+    """
+
+    od: ObjectDictionary
+
+    def entry(self, index: int, subindex: int = 0) -> Entry | None:
+        """What is described there; None where the object or the sub-index is missing."""
+        found = variable_at(self.od, index, subindex)
+        if found is not None:
+            return _entry(found)
+        array = self.od.indices.get(index)
+        if not isinstance(array, ODArray) or not 0 < subindex <= _array_length(array):
+            return None
+        first = _entry(array.subindices[1])  # the first member is described and stands for all
+        return replace(first, subindex=subindex, name=f"{first.name}_{subindex:x}")
+
+    def entries(self) -> Iterator[Entry]:
+        """Everything that is described, the dummy types included."""
+        for found in self.od.indices.values():
+            for variable in (found,) if isinstance(found, ODVariable) else found.subindices.values():
+                yield _entry(variable)
+
+    @property
+    def dummies(self) -> frozenset[int]:
+        """Data types that DummyUsage allows in an RPDO."""
+        return frozenset(index for index in self.od.indices if index <= LAST_DUMMY)
+
+    @property
+    def rpdos(self) -> tuple[int, ...]:
+        """Numbers of the RPDOs, 1 for 1400h."""
+        return tuple(sorted(index - 0x13FF for index in self.od.indices if 0x1400 <= index < 0x1600))
+
+    @property
+    def tpdos(self) -> tuple[int, ...]:
+        """Numbers of the TPDOs, 1 for 1800h."""
+        return tuple(sorted(index - 0x17FF for index in self.od.indices if 0x1800 <= index < 0x1A00))
+
+    @property
+    def modes(self) -> frozenset[int] | None:
+        """Modes of operation that the default of 6502h lists, as 6060h numbers them; None where it is not stated."""
+        entry = self.entry(_MODES)
+        if entry is None or not isinstance(entry.initial, int):
+            return None
+        return frozenset(bit + 1 for bit in range(32) if entry.initial >> bit & 1)
+
+    @property
+    def bitrates(self) -> tuple[int, ...]:
+        """Bit rates, bit/s; empty where the file lists none."""
+        return tuple(sorted(self.od.device_information.allowed_baudrates))
+
+    @property
+    def simple_boot_up_master(self) -> bool:
+        """Whether the device can boot up others."""
+        return bool(self.od.device_information.simple_boot_up_master)
+
+    @property
+    def simple_boot_up_slave(self) -> bool:
+        """Whether NMT commands take the device through the boot-up."""
+        return bool(self.od.device_information.simple_boot_up_slave)
+
+
+def variable_at(od: ObjectDictionary, index: int, subindex: int) -> ODVariable | None:
+    """What the dictionary has there itself; canopen makes up members of an array."""
+    found = od.indices.get(index)
+    if isinstance(found, ODVariable):
+        return found if subindex == 0 else None
+    variable: ODVariable | None = found.subindices.get(subindex) if found is not None else None
+    return variable
+
+
+def _array_length(array: ODArray) -> int:
+    """Highest sub-index by the default of sub-index 0."""
+    count = array.subindices[0].default if 0 in array.subindices and 1 in array.subindices else 0
+    return min(count, 254) if isinstance(count, int) else 0
+
+
+def _entry(variable: ODVariable) -> Entry:
+    data_type = variable.data_type or int(datatypes.DOMAIN)
+    return Entry(
+        index=variable.index,
+        subindex=variable.subindex,
+        name=variable.name,
+        data_type=data_type,
+        bits=0 if data_type in TEXTS | OCTETS else len(variable),
+        signed=data_type in SIGNED,
+        access=variable.access_type,
+        mappable=variable.pdo_mappable,
+        low=variable.min,
+        high=variable.max,
+        default=variable.default,
+        configured=variable.value,
+    )
