@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
+from canprobe.scene.arms import Bodies, arm_model, start_posture, swing
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (
-    ArmSettings,
     BridgeSettings,
+    Cell,
+    EmulateSettings,
     LimitSettings,
     PlantSettings,
     ProbeSettings,
@@ -59,7 +61,7 @@ def resolve(scene: Scene) -> Setup:
         PlanError: the scene describes an object without a surface.
     """
     need_scene(scene)
-    arm = _arm(scene.arm) if scene.arm is not None else None
+    arm = _arm(scene)
     array = _array(scene.sensor) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()
     probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
@@ -85,16 +87,21 @@ def resolve(scene: Scene) -> Setup:
     )
 
 
-def _arm(settings: ArmSettings) -> Arm:
-    serials = settings.serial_numbers or (None,) * len(settings.node_ids)
-    nodes = zip(settings.node_ids, serials, strict=True)
-    return Arm(
-        model=MODELS[settings.model],
-        drives=tuple(Drive(node_id, settings.eds, settings.emulated, serial) for node_id, serial in nodes),
-        q_start=np.radians(settings.start_deg),
-        missed_syncs=settings.missed_syncs,
-        grouped=settings.grouped_rpdo,
-    )
+def _arm(scene: Scene) -> Arm | None:
+    if scene.arm is None:
+        return None
+    settings, joints = scene.arm, scene.joints
+    model, _ = arm_model(scene.cell.name, settings, joints)
+    drives = [
+        Drive(
+            node_id=node_id,
+            eds=joint.eds or settings.eds,
+            emulated=emulated,
+            serial=joint.serial_number,
+        )
+        for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
+    ]
+    return Arm(model, tuple(drives), start_posture(joints), settings.missed_syncs, settings.grouped_rpdo)
 
 
 def _array(settings: SensorSettings) -> Array:
@@ -129,7 +136,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     settings = scene.task
     if settings.kind == "free":
         assert arm is not None
-        return Free(arm, np.radians(settings.swing_deg), settings.swing_period_s, settings.duration_s)
+        return Free(arm, swing(scene.joints), settings.swing_period_s, settings.duration_s)
     assert array is not None
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
