@@ -15,7 +15,6 @@ from canprobe.bridge.sample import (
     BASE,
     CONTACT,
     FLANGE,
-    JOINT_NAMES,
     PROBE,
     CanFrame,
     ContactFrame,
@@ -29,7 +28,7 @@ from canprobe.bridge.sample import (
     quaternion_of,
 )
 from canprobe.planning.model import Plan
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.puma import MODELS
 from canprobe.scene.geometry import T_flange_probe
 
 # The one encoder of all sinks: ROS 2 messages → CDR, their definitions, and their RIHS01 hashes, by `rosbags`.
@@ -171,7 +170,7 @@ class Messages:
         self.epoch_ns = 0
         self._types: Any = encoder.store.types
         arm, probe = plan.scene.arm, plan.scene.probe
-        self._model = MODELS[arm.model] if arm is not None else None
+        self._chain = MODELS[arm.model].chain if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
         self._wanted = wanted
         self._static_every_ns = static_every_ns
@@ -212,10 +211,10 @@ class Messages:
         """What there is in a sample: topic, time, and how to make the message."""
         t_ns, joints, patch = sample.t_ns, sample.joints, sample.patch
         taxels, wrench, contact = sample.taxels, sample.wrench, sample.contact
-        if self._model is not None and t_ns >= self._static_due_ns:
+        if self._chain is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
             yield TF_STATIC, t_ns, lambda: self._static(t_ns)
-        if joints is not None and self._model is not None:
+        if joints is not None and self._chain is not None:
             yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, joints)
             yield TF, t_ns, lambda: self._links(t_ns, joints)
         if taxels is not None:
@@ -233,22 +232,24 @@ class Messages:
     # one function a message
 
     def _joint_state(self, t_ns: int, joints: Joints) -> Any:
+        assert self._chain is not None
         nothing = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
         return self._make(
             "sensor_msgs/msg/JointState",
             header=self._header(t_ns, BASE),
-            name=list(JOINT_NAMES),
+            name=list(self._chain.joints),
             position=np.asarray(joints.position, np.float64),
             velocity=nothing,
             effort=nothing,
         )
 
     def _links(self, t_ns: int, joints: Joints) -> Any:
-        assert self._model is not None
-        return self._tf(t_ns, link_transforms(self._model, joints.position))
+        assert self._chain is not None
+        return self._tf(t_ns, link_transforms(self._chain, joints.position))
 
     def _static(self, t_ns: int) -> Any:
-        fixed = [flange_transform()]
+        assert self._chain is not None
+        fixed = [flange_transform(self._chain)]
         if self._T_flange_probe is not None:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
         return self._tf(t_ns, fixed)

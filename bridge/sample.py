@@ -2,7 +2,7 @@
 bridge offers.
 
 A sample belongs to one cycle and holds what was new in it; a part that was not is None. Nothing in it knows a tool, a
-message type or a bus. Frames are named as in `FRAME_NAMES`; z of the contact frame is the inward normal.
+message type or a bus. Frames are named as in `link_transforms`; z of the contact frame is the inward normal.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.planning.model import Plan
-from canprobe.robot.kinematics import PumaModel
+from canprobe.robot import chain as serial
+from canprobe.robot.chain import Chain
 from canprobe.scene.model import BridgeSettings
 
 # What every bridge is fed: one neutral sample of the cell, in SI units, with its time in nanoseconds.
@@ -25,8 +26,7 @@ from canprobe.scene.model import BridgeSettings
 Array = NDArray[np.float64]
 
 BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
-FRAME_NAMES = (BASE, "link_1", "link_2", "link_3", "link_4", "link_5", "link_6", FLANGE, PROBE, CONTACT)
-JOINT_NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
+"""Names of frames; between base and flange stand link_1, link_2, …, the frame that each joint moves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -239,40 +239,25 @@ class Sample:
 
 # The tree of frames, base to contact, as every viewer with tf wants it.
 
-LINKS = FRAME_NAMES[:7]
-"""base_link, then the frame that each joint turns."""
 
-
-def link_transforms(model: PumaModel, q: Array) -> list[tuple[str, str, Array]]:
+def link_transforms(chain: Chain, q: Array) -> list[tuple[str, str, Array]]:
     """Frame of every link in that of the one before.
 
     Args:
-        model: the arm.
-        q: (6,) joint angles, rad.
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
 
     Returns:
-        (parent, child, (4, 4) T_parent_child) of the six links, m; `link_6` and the flange are the same.
-
-    Source: standard Denavit-Hartenberg transform.
+        (parent, child, (4, 4) T_parent_child) of the n links, m, base_link first; the last link and the flange are the
+        same.
     """
-    return [(LINKS[i], LINKS[i + 1], _dh(float(q[i]), *model.dh[i].tolist())) for i in range(6)]
+    names = [BASE, *(f"link_{i}" for i in range(1, chain.n + 1))]
+    return [(names[i], names[i + 1], T) for i, T in enumerate(serial.link_transforms(chain, q))]
 
 
-def flange_transform() -> tuple[str, str, Array]:
+def flange_transform(chain: Chain) -> tuple[str, str, Array]:
     """The flange lies in the last link's frame."""
-    return (LINKS[6], FLANGE, np.eye(4))
-
-
-def _dh(theta: float, a: float, alpha: float, d: float) -> Array:
-    ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-    return np.array(
-        [
-            [ct, -st * ca, st * sa, a * ct],
-            [st, ct * ca, -ct * sa, a * st],
-            [0.0, sa, ca, d],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    return (f"link_{chain.n}", FLANGE, np.eye(4))
 
 
 def quaternion_of(R: Array) -> tuple[float, float, float, float]:

@@ -46,7 +46,7 @@ from canprobe.planning.make import make_plan
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, MASTER_NODE_ID, Plan, PlannedNode
 from canprobe.protocol.cia402 import DriveState, known_state
 from canprobe.protocol.frames import EFF_FLAG, NO_ERROR, RTR_FLAG, NmtState, describe
-from canprobe.robot.kinematics import forward
+from canprobe.robot.chain import forward
 from canprobe.scene.load import parse_scene
 from canprobe.scene.model import BridgeSettings
 from canprobe.scene.resolve import resolve
@@ -190,7 +190,7 @@ class SampleSource:
         if m.q is None or self._model is None:
             return None
         tool = self._T_flange_probe
-        T = forward(self._model, m.q) @ tool if tool is not None else None
+        T = forward(self._model.chain, m.q) @ tool if tool is not None else None
         return Joints(m.q, T, m.q_age, m.torque_permille, m.statuswords)
 
     def _patch(self, received: Received) -> SurfacePatch | None:

@@ -32,7 +32,7 @@ from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
 from canprobe.bridge.view.path import ErrorScale
 from canprobe.errors import InterfaceError, UsageError
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.puma import MODELS
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
 
@@ -64,7 +64,7 @@ class Stage:
         if self._shape is not None:
             self._add_object()
         if self._model is not None:
-            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
+            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
             for part in arm_parts(self._model):
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
         if scene.probe is not None:
@@ -167,11 +167,11 @@ class Stage:
 
     def _move_arm(self, q: Array) -> None:
         assert self._model is not None
-        frames = link_frames(self._model, q)
+        frames = link_frames(self._model.chain, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
-            _place(self._probe, frames[6] @ self._tool)
+            _place(self._probe, frames[-1] @ self._tool)
 
     def _show_contact(self, moment: Moment) -> None:
         contact = moment.contact

@@ -19,7 +19,8 @@ from canprobe.cell.drives import DriveAxis, DriveGroup, TactileReceiver
 from canprobe.cell.supervision import Limits, Vector
 from canprobe.planning.model import HEARTBEAT_CONSUMED_MS, HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.protocol.tactile import FrameAssembler, TactileMode
-from canprobe.robot.kinematics import PumaModel, forward
+from canprobe.robot.chain import forward
+from canprobe.robot.model import ArmModel
 from canprobe.scene.setup import Arm, BringUp, Probe, Setup, Touch
 from canprobe.touch.patch.image import Patch, PatchCalibration, compute_patch, patch_from_features
 
@@ -54,23 +55,25 @@ def limits_of(plan: Plan) -> Limits:
 
 
 def _of_arm(limits: Limits, setup: Setup, arm: Arm) -> Limits:
-    model, margin = arm.model, setup.limits.joint_margin - _ROUNDING
+    model = arm.model
+    margin = (setup.limits.joint_margin - _ROUNDING) * model.radian
     return replace(
         limits,
         missed_cycles=arm.missed_syncs,
+        joints=model.joints,
         joint_low=model.q_min + margin,
         joint_high=model.q_max - margin,
         joint_speed=model.qd_max * setup.limits.speed_share,
-        count=np.abs(model.joints_per_count).sum(axis=1),
+        count=np.abs(model.q_per_unit).sum(axis=1),
         workspace=setup.limits.workspace,
         T_base_tip_of=_T_base_tip_of(model, setup.probe),
     )
 
 
-def _T_base_tip_of(model: PumaModel, probe: Probe) -> Callable[[Vector], Vector]:
+def _T_base_tip_of(model: ArmModel, probe: Probe) -> Callable[[Vector], Vector]:
     T_flange_tip = probe.T_flange_probe.copy()
     T_flange_tip[:3, 3] += probe.radius * T_flange_tip[:3, 2]
-    return lambda q: forward(model, q) @ T_flange_tip
+    return lambda q: forward(model.chain, q) @ T_flange_tip
 
 
 def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:

@@ -23,6 +23,7 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, InterfaceError, NodeError, ResultsError, SafetyStop
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import NmtState
+from canprobe.robot.model import Joint
 
 # What can go wrong in a running cell: one row a condition, with its check, its time, its reaction and the way back.
 
@@ -61,12 +62,13 @@ class Limits:
         preload_max: force before a run, N, above which it does not begin; infinite where the array is not tared.
         late_share: of the last second's cycles that may be overruns.
         hold_ns: longest hold.
-        joint_low, joint_high: range of the joint targets (6,), rad; None without an arm.
-        joint_speed: speed limits (6,), rad/s.
-        count: joint angle of one encoder count (6,), rad.
+        joints: of the arm; none without one.
+        joint_low, joint_high: range of the joint targets (n,), rad or m; None without an arm.
+        joint_speed: speed limits (n,), rad/s or m/s.
+        count: joint motion of one drive unit (n,), rad or m.
         workspace: lowest and highest position (2, 3) of the probe's tip, m, base frame; None without one.
         T_base_tip_of: transform (4, 4) from the probe's tip (z = pole, towards the object) to base, of joint angles
-            (6,), rad; None without an arm.
+            (n,), rad or m; None without an arm.
     """
 
     period_ns: int
@@ -83,6 +85,7 @@ class Limits:
     preload_max: float = math.inf
     late_share: float = 0.1
     hold_ns: int = 1_000_000_000
+    joints: tuple[Joint, ...] = ()
     joint_low: Vector | None = None
     joint_high: Vector | None = None
     joint_speed: Vector | None = None

@@ -17,8 +17,9 @@ from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.drives import DriveGroup
 from canprobe.cell.supervision import TOUCH_FORCE, Condition, Contact, Limits, Reaction, Seen
 from canprobe.errors import CanprobeError
+from canprobe.robot.chain import forward_jacobian
 from canprobe.robot.inverse import lifting_step
-from canprobe.robot.kinematics import PumaModel, forward_jacobian
+from canprobe.robot.model import ArmModel, units_to_joints
 
 if TYPE_CHECKING:
     from canprobe.touch.patch.image import Patch
@@ -69,7 +70,7 @@ _NUMBERS = "fiu"
 
 @dataclass(frozen=True, slots=True)
 class GuardedTarget:
-    """A joint target as it may be sent (6,), rad; or why it may not."""
+    """A joint target as it may be sent (n,), rad or m; or why it may not."""
 
     q: Vector | None
     limit: str | None = None
@@ -121,11 +122,11 @@ class JointGuard:
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
-        degrees = math.degrees(moved[joint])
-        return f"joint {joint + 1} reports a motion of {degrees:.1f} deg in one cycle, more than it can make"
+        way = self._limits.joints[joint].text(moved[joint])
+        return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
     def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
-        """The target that may be sent for ``q_target`` (6,), rad."""
+        """The target that may be sent for ``q_target`` (n,), rad or m."""
         limits = self._limits
         if not self._range or not self._speed:
             return GuardedTarget(q_target)
@@ -134,15 +135,20 @@ class JointGuard:
         except (TypeError, ValueError):
             given = np.array(None)
         if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
-            return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected 6 angles, rad")
+            return GuardedTarget(
+                None, f"the controller's joint target is {q_target!r}: expected {len(self._range)} angles, rad"
+            )
         target = np.asarray(given, dtype=np.float64)
         wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
         if not all(map(math.isfinite, wanted)):
-            return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")
+            return GuardedTarget(
+                None, f"the controller's joint target is {target}: expected {len(self._range)} finite angles, rad"
+            )
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
         if not all(inside):
             joint = inside.index(False)
-            return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
+            at = self._limits.joints[joint].text(wanted[joint])
+            return GuardedTarget(None, f"joint {joint + 1} at {at}, its stop")
         if limits.workspace is not None and limits.T_base_tip_of is not None:
             left = outside_workspace(limits.T_base_tip_of(target)[:3, 3], limits.workspace)
             if left is not None:
@@ -166,7 +172,7 @@ class JointGuard:
 
 
 def _numbers(values: Vector | None) -> list[float]:
-    """As plain floats: six of them are done with before numpy has begun."""
+    """As plain floats: a handful is done with before numpy has begun."""
     return [] if values is None else [float(v) for v in values]
 
 
@@ -402,18 +408,18 @@ ARRIVE_S = 0.02
 
 
 class WayBack:
-    """The way of the tool's point off the object, cycle by cycle: what the motors are told, of what the joints are.
+    """The way of the tool's point off the object, cycle by cycle: what the drives are told, of what the joints are.
 
     Args:
-        model: the arm's geometry.
+        model: the arm.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
         period_s: of the cycle.
-        free: motors (6,) that may turn.
-        targets: where the motors were sent last (6,), counts.
+        free: drives (n,) that may turn.
+        targets: where the drives were sent last (n,), drive units.
     """
 
     def __init__(
-        self, model: PumaModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+        self, model: ArmModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
     ) -> None:
         self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
         self._free, self._targets = free, targets
@@ -421,12 +427,12 @@ class WayBack:
         self._t = 0.0
 
     def step(self, measured: Vector) -> Vector | None:
-        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on.
+        """Joint targets (n,), rad or m, of this cycle; None at the end of the way, or where it cannot go on.
 
         Args:
-            measured: joint angles (6,), rad.
+            measured: joint positions (n,), rad or m.
         """
-        T, J = forward_jacobian(self._model, measured, self._flange_probe)
+        T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
         if self._away is None:
             self._away = -T[:3, 2]
         before, self._t = self._gone(self._t), self._t + self._period_s
@@ -434,12 +440,11 @@ class WayBack:
             return None
         move = self._away * (self._gone(self._t) - before)
         if move.any():
-            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
-            if counts is None:
+            units = lifting_step(self._model, J[:3], move, self._free)
+            if units is None:
                 return None
-            self._targets = self._targets + counts
-        q: Vector = self._model.joints_per_count @ self._targets
-        return q
+            self._targets = self._targets + units
+        return units_to_joints(self._model, self._targets)
 
     @staticmethod
     def cycles(period_s: float) -> int:
@@ -457,7 +462,7 @@ class LiftOff:
 
     Args:
         drives: the arm; those that do not obey are told to stop from now on.
-        model: the arm's geometry.
+        model: the arm.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
         period_s: of the cycle.
         obeys: whether the node of a drive does what it is told, as far as NMT and EMCY tell.
@@ -466,7 +471,7 @@ class LiftOff:
     def __init__(
         self,
         drives: DriveGroup,
-        model: PumaModel,
+        model: ArmModel,
         flange_probe: Vector,
         period_s: float,
         obeys: Callable[[int], bool],
@@ -478,7 +483,7 @@ class LiftOff:
         self._highest = 0.0
 
     def _obeying(self) -> NDArray[np.bool_]:
-        """Drives (6,) that are heard, enabled, and not the ones that something is wrong with."""
+        """Drives (n,) that are heard, enabled, and not the ones that something is wrong with."""
         drives = self._drives
         heard = zip(drives.axes, drives.ages(), drives.enabled_ones(), strict=True)
         return np.array([age == 0 and enabled and self._obeys(axis.node_id) for axis, age, enabled in heard])
@@ -494,7 +499,7 @@ class LiftOff:
         self._drives.stopped = frozenset(axis.node_id for axis, free in axes if not free)
 
     def step(self, measurement: Measurement) -> Vector | None:
-        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on."""
+        """Joint targets (n,), rad or m, of this cycle; None at the end of the way, or where it cannot go on."""
         if measurement.q is None or self._drives.disbelieved or not self._still_obeyed():
             return None
         return self._way.step(measurement.q)

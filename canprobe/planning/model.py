@@ -235,7 +235,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion that the task asks for, (6,) each, deg/s."""
+    """Fastest joint motion that the task asks for, (n,) each, deg/s; of a prismatic joint mm/s."""
 
     needed_deg_s: tuple[float, ...]
     limit_deg_s: tuple[float, ...]

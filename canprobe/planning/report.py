@@ -216,6 +216,9 @@ def _lines(plan: Plan) -> Iterator[str]:
         rows = [["joint", "needed deg/s", "allowed deg/s"]]
         speeds = zip(plan.joint_speeds.needed_deg_s, plan.joint_speeds.limit_deg_s, strict=True)
         rows += [[str(i), f"{needed:.1f}", f"{limit:g}"] for i, (needed, limit) in enumerate(speeds, start=1)]
+        arm = plan.setup.arm
+        for row, joint in zip(rows[1:], arm.model.joints if arm is not None else (), strict=True):
+            row[0] += " (mm/s)" if joint.prismatic else ""
         yield from _titled("joint speeds", rows)
     yield from _titled("uses", list(_use_rows(plan)))
     yield from _titled("leaves out", [list(row) for row in plan.left_out])

@@ -22,7 +22,7 @@ from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.recorded.recording import STAMP_JITTER_NS, Recording, find_deadlines
-from canprobe.robot.kinematics import PumaModel, joints_to_counts
+from canprobe.robot.model import ArmModel, joints_to_units
 from canprobe.scene.setup import Touch
 from canprobe.tasks.from_plan import make_sensing, make_shape_tracker, make_task
 from canprobe.tasks.shape import ShapeTracker
@@ -228,7 +228,7 @@ class LoggedWayBack:
         plan: of the cell.
 
     Attributes:
-        steps: its cycles with the joint targets (6,), rad, that belong to them; empty where there was none.
+        steps: its cycles with the joint targets (n,), rad or m, that belong to them; empty where there was none.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -279,9 +279,9 @@ class LoggedWayBack:
         return steps
 
 
-def worst_count(model: PumaModel, q: Vector, targets: tuple[int, ...]) -> int:
-    """By how much joint angles (6,), rad, and recorded motor targets differ, counts."""
-    return int(np.abs(np.round(joints_to_counts(model, q)) - targets).max())
+def worst_count(model: ArmModel, q: Vector, targets: tuple[int, ...]) -> int:
+    """By how much joint angles (n,), rad or m, and recorded motor targets differ, counts."""
+    return int(np.abs(np.round(joints_to_units(model, q)) - targets).max())
 
 
 # A recorded log → the contacts and estimates of the run: by the scene's own task, or from the contacts alone.
@@ -370,7 +370,7 @@ class _Comparison:
         self._away = 0
 
     def add(self, cycle: LogCycle, q: Vector | None) -> None:
-        """One cycle, and the joint angles (6,), rad, that its drives should have been told."""
+        """One cycle, and the joint angles (n,), rad or m, that its drives should have been told."""
         if cycle.targets is None or q is None:
             return
         self._differences.append(worst_count(self._model, q, cycle.targets))

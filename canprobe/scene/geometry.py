@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import SceneError
-from canprobe.robot.kinematics import tool_z_offset
+from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.checks import MismatchError, convert
 from canprobe.scene.load import toml_value

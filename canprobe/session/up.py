@@ -6,8 +6,6 @@ import contextlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from canprobe.cell.controller import Measurement
 from canprobe.errors import NodeError, UsageError
 from canprobe.planning.make import make_plan
@@ -16,7 +14,7 @@ from canprobe.scene.resolve import resolve
 from canprobe.session.session import Say, Session, quiet, resolve_scene
 
 if TYPE_CHECKING:
-    from canprobe.robot.kinematics import PumaModel
+    from canprobe.robot.model import ArmModel
     from canprobe.tasks.untouched import JointFinding, Operator, Vector
 
 
@@ -54,7 +52,7 @@ def check_joints(
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
     from canprobe.cell.assembly import limits_of
-    from canprobe.robot.kinematics import MODELS
+    from canprobe.robot.puma import MODELS
     from canprobe.tasks.untouched import JointCheck
 
     plan = make_plan(
@@ -79,12 +77,12 @@ def check_joints(
     return check.findings
 
 
-def _zero_pose(model: PumaModel, start: Vector) -> str:
+def _zero_pose(model: ArmModel, start: Vector) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
-    from canprobe.robot.kinematics import forward
+    from canprobe.robot.chain import forward
 
-    angles = ", ".join(f"{angle:.2f}" for angle in np.degrees(start))
-    x, y, z = forward(model, start)[:3, 3] * 1e3
+    angles = ", ".join(f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True))
+    x, y, z = forward(model.chain, start)[:3, 3] * 1e3
     return (
         f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
         " that with its marks; where it differs, a zero is wrong"

@@ -15,7 +15,7 @@ from canprobe.cell.supervisor import HiddenForce, JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import HEARTBEAT_BASE, NmtState
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.puma import MODELS
 
 LIMITS = Limits(
     period_ns=2_500_000,
