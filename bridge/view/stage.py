@@ -34,7 +34,8 @@ from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
 from canprobe.bridge.view.path import ErrorScale
 from canprobe.errors import InterfaceError
-from canprobe.robot.kinematics import MODELS, PumaModel
+from canprobe.robot.model import ArmModel
+from canprobe.robot.puma import MODELS
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
 from canprobe.touch.shapes import PlacedShape
@@ -67,7 +68,7 @@ class Stage:
         if self._shape is not None:
             self._add_object(self._shape)
         if self._model is not None:
-            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
+            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
             for part in arm_parts(self._model):
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
         if scene.probe is not None:
@@ -167,12 +168,12 @@ class Stage:
         self._show_contact(moment)
         self._show_patch(moment)
 
-    def _move_arm(self, model: PumaModel, q: Array) -> None:
-        frames = link_frames(model, q)
+    def _move_arm(self, model: ArmModel, q: Array) -> None:
+        frames = link_frames(model.chain, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
-            _place(self._probe, frames[6] @ self._tool)
+            _place(self._probe, frames[-1] @ self._tool)
 
     def _show_contact(self, moment: Moment) -> None:
         contact = moment.contact

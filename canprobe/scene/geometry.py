@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import SceneError
-from canprobe.robot.kinematics import tool_z_offset
+from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.load import Reader, read_toml
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.puma import MODELS
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (

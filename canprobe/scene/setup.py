@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.robot.kinematics import PumaModel
+from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import BallApproach
 from canprobe.scene.model import (
     Auto,
@@ -76,7 +76,7 @@ class Arm:
         grouped: two targets share an RPDO through dummy mapping.
     """
 
-    model: PumaModel
+    model: ArmModel
     drives: tuple[Drive, ...]
     q_start: Floats
     missed_syncs: int
@@ -328,7 +328,7 @@ class Truth:
     """
 
     object: PlacedShape | None
-    model: PumaModel | None
+    model: ArmModel | None
     T_flange_probe: Floats
     stiffness: float
     damping: float

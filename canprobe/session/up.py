@@ -6,8 +6,6 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from canprobe.cell.controller import Measurement
 from canprobe.errors import NodeError, UsageError
 from canprobe.planning.make import make_plan
@@ -19,7 +17,7 @@ from canprobe.session.target import need_real_bus
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
-    from canprobe.robot.kinematics import PumaModel
+    from canprobe.robot.model import ArmModel
     from canprobe.tasks.untouched import JointFinding, Operator, Vector
 
 ROWS_OF_UP = 4000
@@ -93,7 +91,7 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.robot.kinematics import MODELS
+    from canprobe.robot.puma import MODELS
     from canprobe.tasks.untouched import JointCheck
 
     plan = make_plan(resolve(scene))
@@ -114,12 +112,12 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     return check.findings
 
 
-def _zero_pose(model: PumaModel, start: Vector) -> str:
+def _zero_pose(model: ArmModel, start: Vector) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
-    from canprobe.robot.kinematics import forward
+    from canprobe.robot.chain import forward
 
-    angles = ", ".join(f"{angle:.2f}" for angle in np.degrees(start))
-    x, y, z = forward(model, start)[:3, 3] * 1e3
+    angles = ", ".join(f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True))
+    x, y, z = forward(model.chain, start)[:3, 3] * 1e3
     return (
         f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
         " that with its marks; where it differs, a zero is wrong"

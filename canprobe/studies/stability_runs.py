@@ -22,8 +22,9 @@ from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.errors import PlanError, SafetyStop
 from canprobe.protocol.frames import Frame
+from canprobe.robot.chain import forward
 from canprobe.robot.inverse import inverse_near
-from canprobe.robot.kinematics import MODELS, forward
+from canprobe.robot.puma import MODELS
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
@@ -265,16 +266,16 @@ def touch_in_posture(
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Where it is, mm; the outward normal there; joint angles (6,) so far above it, deg.
+        Where it is, mm; the outward normal there; joint angles (n,) so far above it, deg.
     """
     model, probe = MODELS["upenn"], ProbeSettings()
     q = np.radians(posture_deg)
     T_flange_centre = T_flange_probe(probe)
-    T = forward(model, q) @ T_flange_centre
+    T = forward(model.chain, q) @ T_flange_centre
     pole = T[:3, 2]
     above = T.copy()
     above[:3, 3] -= above_mm * 1e-3 * pole
-    away = np.degrees(inverse_near(model, above @ np.linalg.inv(T_flange_centre), q))
+    away = np.degrees(inverse_near(model, above, T_flange_centre, q))
     at = 1e3 * T[:3, 3] + probe.radius_mm * pole
     x, y, z = (float(value) for value in at)
     nx, ny, nz = (-float(value) for value in pole)
