@@ -19,7 +19,6 @@ from canprobe.bridge.sample import (
     BASE,
     CONTACT,
     FLANGE,
-    JOINT_NAMES,
     PROBE,
     Sample,
     SurfacePatch,
@@ -32,7 +31,7 @@ from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
 from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.protocol.frames import EFF_FLAG, RTR_FLAG
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.chain import Chain
 from canprobe.scene.geometry import T_flange_probe
 
 CAN_FRAME = "can_msgs/msg/Frame"
@@ -172,8 +171,8 @@ class Messages:
         self.encoder = encoder
         self.epoch_ns = 0
         self._types: Any = encoder.store.types
-        arm, probe = plan.scene.arm, plan.scene.probe
-        self._model = MODELS[arm.model] if arm is not None else None
+        arm, probe = plan.setup.arm, plan.scene.probe
+        self._chain = arm.model.chain if arm is not None else None
         self._T_flange_probe = T_flange_probe(probe) if arm is not None and probe is not None else None
         self._wanted = wanted
         self._static_every_ns = static_every_ns
@@ -214,12 +213,12 @@ class Messages:
     def _parts(self, sample: Sample) -> Iterator[tuple[Topic, int, Callable[[], Any]]]:
         """What there is in a sample: topic, time, and how to make the message."""
         t_ns, q, touch, patch = sample.t_ns, sample.q, sample.touch, sample.patch
-        if self._model is not None and t_ns >= self._static_due_ns:
+        if self._chain is not None and t_ns >= self._static_due_ns:
             self._static_due_ns = t_ns + self._static_every_ns
             yield TF_STATIC, t_ns, lambda: self._static(t_ns)
-        if q is not None and (model := self._model) is not None:
-            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, q)
-            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(model, q))
+        if q is not None and (chain := self._chain) is not None:
+            yield JOINT_STATES, t_ns, lambda: self._joint_state(t_ns, chain, q)
+            yield TF, t_ns, lambda: self._tf(t_ns, link_transforms(chain, q))
         if touch is not None:
             if (counts := touch.counts) is not None:
                 yield TAXELS, touch.t_ns, lambda: self._image(touch.t_ns, counts)
@@ -234,15 +233,16 @@ class Messages:
 
     # one function a message
 
-    def _joint_state(self, t_ns: int, q: Array) -> Any:
+    def _joint_state(self, t_ns: int, chain: Chain, q: Array) -> Any:
         unknown = np.zeros(0)  # rates and torques in SI units are not measured: left empty, as the message allows
-        header, names = self._header(t_ns, BASE), list(JOINT_NAMES)
+        header, names = self._header(t_ns, BASE), list(chain.joints)
         return self._make(
             "sensor_msgs/msg/JointState", header=header, name=names, position=q, velocity=unknown, effort=unknown
         )
 
     def _static(self, t_ns: int) -> Any:
-        fixed = [flange_transform()]
+        assert self._chain is not None
+        fixed = [flange_transform(self._chain)]
         if self._T_flange_probe is not None:
             fixed.append((FLANGE, PROBE, self._T_flange_probe))
         return self._tf(t_ns, fixed)

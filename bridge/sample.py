@@ -17,15 +17,14 @@ from numpy.typing import NDArray
 
 from canprobe.bus.port import TimedFrame
 from canprobe.planning.model import Plan
-from canprobe.robot.kinematics import PumaModel
+from canprobe.robot import chain as serial
+from canprobe.robot.chain import Chain
 from canprobe.scene.model import BridgeSettings
 
 Array = NDArray[np.float64]
 
 BASE, FLANGE, PROBE, CONTACT = "base_link", "flange", "probe", "contact"
-LINKS = (BASE, "link_1", "link_2", "link_3", "link_4", "link_5", "link_6")
-"""base_link, then the frame that each joint turns."""
-JOINT_NAMES = ("joint_1", "joint_2", "joint_3", "joint_4", "joint_5", "joint_6")
+"""Names of frames; between base and flange stand link_1, link_2, …, the frame that each joint moves."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -177,36 +176,24 @@ class Sample:
 # The tree of frames, base to contact, as every viewer with tf wants it.
 
 
-def link_transforms(model: PumaModel, q: Array) -> list[tuple[str, str, Array]]:
+def link_transforms(chain: Chain, q: Array) -> list[tuple[str, str, Array]]:
     """Frame of every link in that of the one before.
 
     Args:
-        model: the arm.
-        q: (6,) joint angles, rad.
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
 
     Returns:
-        (parent, child, (4, 4) T_parent_child) of the six links, m; `link_6` and the flange are the same.
-
-    Source: standard Denavit-Hartenberg transform.
+        (parent, child, (4, 4) T_parent_child) of the n links, m, base_link first; the last link and the flange are the
+        same.
     """
-    return [(LINKS[i], LINKS[i + 1], _dh(float(q[i]), *model.dh[i].tolist())) for i in range(6)]
+    names = [BASE, *(f"link_{i}" for i in range(1, chain.n + 1))]
+    return [(names[i], names[i + 1], T) for i, T in enumerate(serial.link_transforms(chain, q))]
 
 
-def flange_transform() -> tuple[str, str, Array]:
+def flange_transform(chain: Chain) -> tuple[str, str, Array]:
     """The flange lies in the last link's frame."""
-    return (LINKS[6], FLANGE, np.eye(4))
-
-
-def _dh(theta: float, a: float, alpha: float, d: float) -> Array:
-    ct, st, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-    return np.array(
-        [
-            [ct, -st * ca, st * sa, a * ct],
-            [st, ct * ca, -ct * sa, a * st],
-            [0.0, sa, ca, d],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    return (f"link_{chain.n}", FLANGE, np.eye(4))
 
 
 def quaternion_of(R: Array) -> tuple[float, float, float, float]:

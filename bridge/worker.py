@@ -114,7 +114,7 @@ class Health:
         return Diagnostic(f"node {node_id} ({node.role})", level, message, tuple(values))
 
     def _drive(self, node: PlannedNode, measurement: Measurement) -> DriveState | None:
-        arm = self._plan.scene.arm
+        arm = self._plan.setup.arm
         if arm is None or node.kind != "drive" or not measurement.statuswords:
             return None
         return known_state(measurement.statuswords[arm.node_ids.index(node.node_id)])

@@ -28,18 +28,23 @@ from canprobe.bridge.view.meshes import (
     scale,
 )
 from canprobe.protocol.tactile import SIDE
-from canprobe.robot.kinematics import PumaModel
+from canprobe.robot.chain import Chain
+from canprobe.robot.model import ArmModel
+from canprobe.robot.puma import DH_ROWS, dh_rows
 from canprobe.touch.contact import pad_to_direction
+from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
 from canprobe.touch.patch.image import PatchCalibration
 from canprobe.touch.shapes import Bowl, PlacedShape, Torus, Wave
 
-# The PUMA 260 as solid links, from its Denavit–Hartenberg rows: both published geometries, and any like them.
+# The PUMA 260 as solid links, from its Denavit–Hartenberg rows; any other arm as plain joints and bars.
 
 WHITE, GREY, DARK = (236, 233, 224), (150, 156, 163), (76, 84, 94)
 RIM = 5e-3
 SHOULDER, ELBOW, WRIST = 0.050, 0.040, 0.026
 """Radii round joints 2, 3 and 5, m."""
+PLAIN = 0.045
+"""Radius round the first joint of any other arm, m."""
 UPPER_ARM, FOREARM = 0.046, 0.058
 """Thickness of the two long links along the shoulder's axis, m."""
 
@@ -61,31 +66,56 @@ class Part:
     colour: tuple[int, int, int]
 
 
-def link_frames(model: PumaModel, q: ArrayLike) -> Array:
+def link_frames(chain: Chain, q: ArrayLike) -> Array:
     """Frames of the base and of every link.
 
     Args:
-        model: the arm.
-        q: (6,) joint angles, rad.
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
 
     Returns:
-        (7, 4, 4) T_base_link; the last is the flange.
+        (n + 1, 4, 4) T_base_link; the last is the flange.
     """
-    frames = np.empty((7, 4, 4))
+    frames = np.empty((chain.n + 1, 4, 4))
     frames[0] = np.eye(4)
-    for i, (_, _, T) in enumerate(link_transforms(model, np.asarray(q, dtype=np.float64))):
+    for i, (_, _, T) in enumerate(link_transforms(chain, np.asarray(q, dtype=np.float64))):
         frames[i + 1] = frames[i] @ T
     return frames
 
 
-def arm_parts(model: PumaModel) -> list[Part]:
+def arm_parts(model: ArmModel) -> list[Part]:
     """Solids of base and links."""
+    if model.name not in DH_ROWS:
+        return _plain(model.chain)
     return [*_trunk(model), *_upper_arm(model), *_forearm(model), *_wrist(model)]
 
 
-def _trunk(model: PumaModel) -> list[Part]:
-    d1 = model.links[0]
-    side = math.copysign(1.0, model.links[2])  # on which side of the trunk the arm hangs, along axis 2
+def _plain(chain: Chain) -> list[Part]:
+    """A drum along every axis and a bar to the next one, thinner towards the flange."""
+    parts = []
+    here = chain.fixed[0]  # of a joint in the frame that it stands in
+    for i, T in enumerate((*chain.fixed[1:], chain.T_last_flange)):
+        radius = PLAIN * (1.0 - 0.5 * i / chain.n)
+        parts.append(Part(f"joint_{i + 1}", i, cylinder(radius, (-radius, radius), RIM).moved(here), DARK))
+        back = np.linalg.inv(T)[:3, 3]  # the bar stands in the frame of the next joint
+        length = float(np.linalg.norm(back))
+        if length > radius:
+            bar = np.eye(4)
+            bar[:3, :3] = tangent_rotation(back / length)
+            parts.append(Part(f"link_{i + 1}", i + 1, cylinder(0.7 * radius, (0.0, length), RIM).moved(bar), WHITE))
+        here = np.eye(4)
+    return parts
+
+
+def _lengths(model: ArmModel) -> tuple[float, float, float, float, float, float]:
+    """d1, a2, d2 + d3, a3, d4 and d6 of a PUMA, m: d2 and d3 lie on parallel axes."""
+    a, _, d, _ = dh_rows(model).T.tolist()
+    return d[0], a[1], d[1] + d[2], a[2], d[3], d[5]
+
+
+def _trunk(model: ArmModel) -> list[Part]:
+    d1, _, offset, _, _, _ = _lengths(model)
+    side = math.copysign(1.0, offset)  # on which side of the trunk the arm hangs, along axis 2
     foot = merged([cylinder(0.092, (0.0, 0.016), 4e-3), cylinder(0.066, (0.016, 0.034), RIM)])
     column = cylinder(0.054, (0.030, d1 - 0.072), RIM)
     # frame 1: z along axis 2, y up along the trunk, origin at the shoulder
@@ -100,15 +130,15 @@ def _trunk(model: PumaModel) -> list[Part]:
     ]
 
 
-def _reach(model: PumaModel) -> float:
+def _reach(model: ArmModel) -> float:
     """From the trunk's axis to the near side of the upper arm, m, along axis 2."""
-    return max(abs(model.links[2]) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
+    return max(abs(_lengths(model)[2]) - 0.5 * FOREARM - 0.004 - UPPER_ARM, 0.02)
 
 
-def _upper_arm(model: PumaModel) -> list[Part]:
-    _, a2, offset, _, _, _ = model.links
+def _upper_arm(model: ArmModel) -> list[Part]:
+    _, a2, offset, _, _, _ = _lengths(model)
     side = math.copysign(1.0, offset)
-    shift = float(model.dh[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
+    shift = float(dh_rows(model)[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
     trunk = shift - offset
     near, far = trunk + side * _reach(model), trunk + side * (_reach(model) + UPPER_ARM)
     shoulder, elbow = (-a2, 0.0), (0.0, 0.0)
@@ -118,8 +148,8 @@ def _upper_arm(model: PumaModel) -> list[Part]:
     return [Part("upper_arm", 2, beam, WHITE), Part("shoulder_cap", 2, merged([cap, pin]), DARK)]
 
 
-def _forearm(model: PumaModel) -> list[Part]:
-    _, _, offset, a3, d4, _ = model.links
+def _forearm(model: ArmModel) -> list[Part]:
+    _, _, offset, a3, d4, _ = _lengths(model)
     # frame 3: z along the forearm, y against axis 2; the elbow is at x = −a3
     half, elbow = 0.5 * FOREARM, (-a3, 0.0)
     side = math.copysign(half, offset)
@@ -129,8 +159,8 @@ def _forearm(model: PumaModel) -> list[Part]:
     return [Part("forearm", 3, beam.moved(_ZX), WHITE), Part("elbow_cap", 3, merged([cap.moved(_ZX), ring]), DARK)]
 
 
-def _wrist(model: PumaModel) -> list[Part]:
-    d6 = model.links[5]
+def _wrist(model: ArmModel) -> list[Part]:
+    d6 = _lengths(model)[5]
     # frame 4: y along the forearm, z along axis 5; frame 5: z along axis 6
     stem = cylinder(WRIST - 0.003, (-0.030, 0.0), 3e-3).moved(_UP)
     hinge = cylinder(0.021, (-0.027, 0.027), 4e-3)

@@ -34,9 +34,10 @@ from canprobe.bridge.view.instants import Curves, Moment
 from canprobe.bridge.view.meshes import UNKNOWN, Array, Mesh, linear_light, scale
 from canprobe.bridge.view.path import ErrorScale
 from canprobe.errors import InterfaceError
-from canprobe.robot.kinematics import MODELS, PumaModel
+from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.model import Scene
+from canprobe.scene.resolve import resolve
 from canprobe.touch.shapes import PlacedShape
 
 # The scene in the browser: arm, probe, object, contact, force, patch and path as viser's nodes.
@@ -59,7 +60,8 @@ class Stage:
 
     def __init__(self, server: Any, scene: Scene) -> None:
         self._api = server.scene
-        self._model = None if scene.arm is None else MODELS[scene.arm.model]
+        arm = resolve(scene).arm
+        self._model = None if arm is None else arm.model
         self._shape = None if scene.object is None else true_object(scene.object)
         self._probe = None
         self._tool = np.eye(4) if scene.probe is None else T_flange_probe(scene.probe)
@@ -67,7 +69,7 @@ class Stage:
         if self._shape is not None:
             self._add_object(self._shape)
         if self._model is not None:
-            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(7)]
+            self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
             for part in arm_parts(self._model):
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
         if scene.probe is not None:
@@ -167,12 +169,12 @@ class Stage:
         self._show_contact(moment)
         self._show_patch(moment)
 
-    def _move_arm(self, model: PumaModel, q: Array) -> None:
-        frames = link_frames(model, q)
+    def _move_arm(self, model: ArmModel, q: Array) -> None:
+        frames = link_frames(model.chain, q)
         for handle, T in zip(self._links[1:], frames[1:], strict=True):  # the base stands still
             _place(handle, T)
         if self._probe is not None:
-            _place(self._probe, frames[6] @ self._tool)
+            _place(self._probe, frames[-1] @ self._tool)
 
     def _show_contact(self, moment: Moment) -> None:
         contact = moment.contact

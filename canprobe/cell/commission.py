@@ -77,7 +77,7 @@ def choose_assignments(
             raise NodeError(
                 one.node_id,
                 f"the device {one.address} could also be node {taken[one.address]}: name it by its serial number,"
-                " with --assign SERIAL=ID or the scene's serial_numbers",
+                " with --assign SERIAL=ID or the joints' serial_number in the scene",
             )
         taken[one.address] = one.node_id
     return chosen

@@ -38,7 +38,8 @@ from canprobe.planning.model import (
 from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
-from canprobe.robot.kinematics import Array, PumaModel
+from canprobe.robot.chain import Array
+from canprobe.robot.model import ArmModel
 
 INVALID = 1 << 31
 COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
@@ -202,7 +203,7 @@ def _drive_writes(plan: Plan, node: PlannedNode, dictionary: Any) -> list[Write]
     assert arm is not None and plan.sync.interpolation_100us is not None
     model, axis = arm.model, arm.node_ids.index(node.node_id)
     low, high = software_limits(model)
-    window = round(float(model.counts[axis, axis]) * np.radians(FOLLOWING_WINDOW_DEG))
+    window = round(abs(float(model.units_per_q[axis, axis] * model.radian[axis])) * np.radians(FOLLOWING_WINDOW_DEG))
     speed = motor_speed_limit(model, axis, setup.limits.speed_share, plan.sync.period_ns)
     missed = [Write(MISSED_SYNCS, 0, arm.missed_syncs, "SYNCs after which the drive stops by itself")]
     return [
@@ -220,23 +221,23 @@ def _drive_writes(plan: Plan, node: PlannedNode, dictionary: Any) -> list[Write]
     ]
 
 
-def motor_speed_limit(model: PumaModel, axis: int, share: float, period_ns: int) -> int:
-    """Counts/s beyond which a drive must not follow a target: all joints that turn the motor, at their limits.
+def motor_speed_limit(model: ArmModel, axis: int, share: float, period_ns: int) -> int:
+    """Drive units/s beyond which it must not follow a target: all joints that move the motor, at their limits.
 
     Args:
         model: the arm.
         axis: of the motor, 0-based.
         share: of the joints' speed limits.
-        period_ns: of the cycle; a target is a whole number of counts.
+        period_ns: of the cycle; a target is a whole number of drive units.
     """
-    fastest = float(np.abs(model.counts[axis]) @ model.qd_max) * share
+    fastest = float(np.abs(model.units_per_q[axis]) @ model.qd_max) * share
     return math.ceil(fastest + ROUNDING_COUNTS * 1e9 / period_ns)
 
 
-def software_limits(model: PumaModel) -> tuple[Array, Array]:
-    """Extremes of each motor (6,) and (6,), counts, over the joints' ranges; the coupled ones span both joints'."""
-    a, b = model.counts * model.q_min, model.counts * model.q_max
-    return np.floor(np.minimum(a, b).sum(axis=1)), np.ceil(np.maximum(a, b).sum(axis=1))
+def software_limits(model: ArmModel) -> tuple[Array, Array]:
+    """Extremes of each drive (n,) and (n,), units, over the joints' ranges; the coupled ones span both joints'."""
+    a, b, zero = model.units_per_q * model.q_min, model.units_per_q * model.q_max, model.zero_units
+    return np.floor(np.minimum(a, b).sum(axis=1) + zero), np.ceil(np.maximum(a, b).sum(axis=1) + zero)
 
 
 def _array_writes(plan: Plan, _: PlannedNode, dictionary: Any) -> list[Write]:

@@ -41,10 +41,10 @@ class Measurement:
     Attributes:
         cycle: number of the cycle, from 0.
         t_ns: time of its SYNC, ns since the first one.
-        q: joint angles at this SYNC (6,), rad; None in a scene without an arm.
-        q_age: cycles since the last position report of each joint (6,); 0 everywhere when all TPDOs came.
-        torque_permille: motor torque as reported (6,), NaN for a drive that does not report it; empty where none does.
-        statuswords: CiA 402 statuswords (6,).
+        q: joint positions at this SYNC (n,), rad or m; None in a scene without an arm.
+        q_age: cycles since the last position report of each joint (n,); 0 everywhere when all TPDOs came.
+        torque_permille: motor torque as reported (n,), NaN for a drive that does not report it; empty where none does.
+        statuswords: CiA 402 statuswords (n,).
         enabled: every drive is in operation enabled.
         tactile: a tactile sample that became usable in this cycle, else None. A frame triggered at SYNC k comes in
             cycle k + 1 at the earliest, on every bus.
@@ -68,7 +68,7 @@ class Command:
     """What a controller wants in this cycle.
 
     Attributes:
-        q_target: joint angles to reach two cycles later (6,), rad; None leaves the drives where they are.
+        q_target: joint positions to reach two cycles later (n,), rad or m; None leaves the drives where they are.
         done: the controller has finished; the cell is stopped in an orderly way.
         stop_reason: set to stop the cell for safety, with the reason.
         columns: named numbers for the log; a controller uses the same names in every cycle.

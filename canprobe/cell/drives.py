@@ -1,6 +1,6 @@
 """The drives as one: TPDOs in and joint angles out, targets in and RPDOs out.
 
-The drives hold *motor* positions; the wrist's coupling is undone here and nowhere else.
+The drives hold *motor* positions; gears and couplings are undone here and nowhere else.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
 from canprobe.protocol.frames import Frame
 from canprobe.protocol.pdo import PdoLayout
-from canprobe.robot.kinematics import PumaModel, counts_to_joints, joints_to_counts
+from canprobe.robot.model import ArmModel, joints_to_units, units_to_joints
 
 # The position of one motor as its TPDOs report it: what it can have reached, and where it is when one is missing.
 
@@ -98,7 +98,7 @@ class PositionTrack:
         return self.counts + self._rate * passed_ns
 
 
-# The six drives as one thing: TPDOs in, joint angles out; joint targets in, RPDOs out.
+# The drives as one thing: TPDOs in, joint positions out; joint targets in, RPDOs out.
 
 Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
@@ -155,11 +155,11 @@ def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
 
 
 class DriveGroup:
-    """State of six CiA 402 drives in cyclic synchronous position mode.
+    """State of the arm's CiA 402 drives in cyclic synchronous position mode.
 
     Args:
         axes: the drives, joint 1 first.
-        model: the arm, for counts ↔ joint angles.
+        model: the arm, for drive units ↔ joint positions.
         repeat_cycles: after how many cycles an event-driven RPDO is sent again without a change.
 
     Attributes:
@@ -169,7 +169,7 @@ class DriveGroup:
         stopped: node ids of drives that stop while the others go on.
     """
 
-    def __init__(self, axes: tuple[DriveAxis, ...], model: PumaModel, repeat_cycles: int = 40) -> None:
+    def __init__(self, axes: tuple[DriveAxis, ...], model: ArmModel, repeat_cycles: int = 40) -> None:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
@@ -270,9 +270,9 @@ class DriveGroup:
         return tuple([track.steady >= STEADY for track in self._tracks])
 
     def joints(self) -> Vector:
-        """Joint angles (6,), rad, at this SYNC; where a report is missing, carried on for a few cycles."""
+        """Joint angles (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
         now_ns = self._deadline_ns
-        q = counts_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
+        q = units_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it
         return q
 
@@ -307,12 +307,12 @@ class DriveGroup:
         return all(state in states for state in self.states)
 
     def set_target(self, q: Vector | None) -> None:
-        """Joint target (6,), rad, of the next RPDOs; None holds the last one."""
+        """Joint target (n,), rad or m, of the next RPDOs; None holds the last one."""
         if q is not None:
-            self._targets = [round(c) for c in joints_to_counts(self._model, q).tolist()]
+            self._targets = [round(c) for c in joints_to_units(self._model, q).tolist()]
 
     def targets(self) -> Vector:
-        """Where the motors were sent last (6,), counts; where they are, before they were sent anywhere."""
+        """Where the motors were sent last (n,), counts; where they are, before they were sent anywhere."""
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         return np.array(targets, dtype=float)
 

@@ -19,8 +19,9 @@ from canprobe.cell.watch import NodeWatch
 from canprobe.errors import NodeError
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import NmtState
+from canprobe.robot.chain import forward_jacobian
 from canprobe.robot.inverse import lifting_step
-from canprobe.robot.kinematics import PumaModel, forward_jacobian
+from canprobe.robot.model import ArmModel, units_to_joints
 
 Vector = NDArray[np.float64]
 WAY = 6e-3
@@ -38,12 +39,12 @@ class WayBack:
         model: the arm's geometry.
         flange_probe: transform (4, 4) from the probe's centre frame to the flange.
         period_s: of the cycle.
-        free: motors (6,) that may turn.
-        targets: where the motors were sent last (6,), counts.
+        free: drives (n,) that may move.
+        targets: where the drives were sent last (n,), drive units.
     """
 
     def __init__(
-        self, model: PumaModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
+        self, model: ArmModel, flange_probe: Vector, period_s: float, free: NDArray[np.bool_], targets: Vector
     ) -> None:
         self._model, self._flange_probe, self._period_s = model, flange_probe, period_s
         self._free, self._targets = free, targets
@@ -51,12 +52,12 @@ class WayBack:
         self._t = 0.0
 
     def step(self, measured: Vector) -> Vector | None:
-        """Joint targets (6,), rad, of this cycle; None at the end of the way, or where it cannot go on.
+        """Joint targets (n,), rad or m, of this cycle; None at the end of the way, or where it cannot go on.
 
         Args:
-            measured: joint angles (6,), rad.
+            measured: joint positions (n,), rad or m.
         """
-        T, J = forward_jacobian(self._model, measured, self._flange_probe)
+        T, J = forward_jacobian(self._model.chain, measured, self._flange_probe)
         if self._away is None:
             self._away = -T[:3, 2]
         before, self._t = self._gone(self._t), self._t + self._period_s
@@ -64,12 +65,11 @@ class WayBack:
             return None
         move = self._away * (self._gone(self._t) - before)
         if move.any():
-            counts = lifting_step(J[:3], self._model.joints_per_count, move, self._free)
-            if counts is None:
+            units = lifting_step(self._model, J[:3], move, self._free)
+            if units is None:
                 return None
-            self._targets = self._targets + counts
-        q: Vector = self._model.joints_per_count @ self._targets
-        return q
+            self._targets = self._targets + units
+        return units_to_joints(self._model, self._targets)
 
     @staticmethod
     def cycles(period_s: float) -> int:

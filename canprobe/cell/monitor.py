@@ -18,7 +18,7 @@ from canprobe.planning.model import MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import describe_state
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, NO_ERROR, SYNC_ID, Emcy, describe, unpack_heartbeat
-from canprobe.robot.kinematics import counts_to_joints
+from canprobe.robot.model import units_to_joints
 
 SECOND_NS = 1_000_000_000
 CLASSIC_BYTES = 8
@@ -173,7 +173,7 @@ class Monitor:
         view.nodes = list(self._nodes.values())
         counts = [c for c in self._counts if c is not None]
         if self._model is not None and len(counts) == len(self._counts):
-            view.q_deg = np.degrees(counts_to_joints(self._model, np.array(counts, dtype=float))).tolist()
+            view.q_deg = np.degrees(units_to_joints(self._model, np.array(counts, dtype=float))).tolist()
         self._measure_bus(view, now_ns)
         return view
 

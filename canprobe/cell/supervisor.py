@@ -16,7 +16,7 @@ from canprobe.cell.conditions import BY_KEY, COUNTERS, CYCLE_CHECKS, touch_findi
 from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.supervision import TOUCH_FORCE, Contact, Finding, Reaction, Seen
 from canprobe.planning.model import Plan
-from canprobe.robot.kinematics import forward
+from canprobe.robot.chain import forward
 
 if TYPE_CHECKING:
     from canprobe.touch.patch.image import Patch
@@ -33,7 +33,7 @@ _NUMBERS = "fiu"
 
 @dataclass(frozen=True, slots=True)
 class GuardedTarget:
-    """A joint target as it may be sent (6,), rad; or why it may not."""
+    """A joint target as it may be sent (n,), rad or m; or why it may not."""
 
     q: Vector | None
     limit: str | None = None
@@ -56,22 +56,22 @@ class JointGuard:
         plan: of a cell with an arm.
 
     Attributes:
-        low, high: range of the joint targets (6,), rad.
-        count: joint angle of one encoder count (6,), rad.
+        low, high: range of the joint targets (n,), rad or m.
+        count: joint motion of one drive unit (n,), rad or m.
         slowed: targets that were too far away for one cycle.
     """
 
     def __init__(self, plan: Plan) -> None:
         arm, probe, safety = plan.setup.arm, plan.setup.probe, plan.setup.limits
         assert arm is not None
-        model, margin = arm.model, safety.joint_margin - _ROUNDING
+        model, margin = arm.model, (safety.joint_margin - _ROUNDING) * arm.model.radian
         self.low, self.high = model.q_min + margin, model.q_max - margin
-        self.count = np.abs(model.joints_per_count).sum(axis=1)
+        self.count = np.abs(model.q_per_unit).sum(axis=1)
         self.slowed = 0
         self._model, self._workspace, self._period_ns = model, safety.workspace, plan.sync.period_ns
         self._T_flange_tip = probe.T_flange_probe.copy()
         self._T_flange_tip[:3, 3] += probe.radius * self._T_flange_tip[:3, 2]
-        # plain floats: six of them are compared before numpy has begun
+        # plain floats: a handful is compared before numpy has begun
         self._speed: list[float] = (model.qd_max * safety.speed_share).tolist()
         self._counts: list[float] = self.count.tolist()
         self._range: list[tuple[float, float]] = list(zip(self.low.tolist(), self.high.tolist(), strict=True))
@@ -80,11 +80,11 @@ class JointGuard:
         self._t_ns = 0
 
     def T_base_tip(self, q: Vector) -> Vector:
-        """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joint angles (6,), rad."""
-        return forward(self._model, q) @ self._T_flange_tip
+        """Transform (4, 4) from the probe's tip (z = pole, towards the object) to base at joints (n,), rad or m."""
+        return forward(self._model.chain, q) @ self._T_flange_tip
 
     def outside(self, q: Vector) -> str | None:
-        """How the probe's tip leaves the workspace at joint angles (6,), rad; None where it does not."""
+        """How the probe's tip leaves the workspace at joint positions (n,), rad or m; None where it does not."""
         return None if self._workspace is None else outside_workspace(self.T_base_tip(q)[:3, 3], self._workspace)
 
     def measure(self, measurement: Measurement) -> str | None:
@@ -101,25 +101,30 @@ class JointGuard:
         if max(beyond) <= 0.0:
             return None
         joint = beyond.index(max(beyond))
-        degrees = math.degrees(abs(self._q[joint] - before[joint]))
-        return f"joint {joint + 1} reports a motion of {degrees:.1f} deg in one cycle, more than it can make"
+        way = self._model.joints[joint].text(abs(self._q[joint] - before[joint]))
+        return f"joint {joint + 1} reports a motion of {way} in one cycle, more than it can make"
 
     def command(self, q_target: Vector, measurement: Measurement) -> GuardedTarget:
-        """The target that may be sent for `q_target` (6,), rad."""
+        """The target that may be sent for `q_target` (n,), rad or m."""
         try:
             given = np.asanyarray(q_target)
         except (TypeError, ValueError):
             given = np.array(None)
         if given.dtype.kind not in _NUMBERS or isinstance(given, np.ma.MaskedArray):
-            return GuardedTarget(None, f"the controller's joint target is {q_target!r}: expected 6 angles, rad")
+            return GuardedTarget(
+                None, f"the controller's joint target is {q_target!r}: expected {len(self._range)} angles, rad"
+            )
         target = np.asarray(given, dtype=np.float64)
         wanted = target.tolist() if target.shape == (len(self._range),) else [math.nan]
         if not all(map(math.isfinite, wanted)):
-            return GuardedTarget(None, f"the controller's joint target is {target}: expected 6 finite angles, rad")
+            return GuardedTarget(
+                None, f"the controller's joint target is {target}: expected {len(self._range)} finite angles, rad"
+            )
         inside = [low <= q <= high for q, (low, high) in zip(wanted, self._range, strict=True)]
         if not all(inside):
             joint = inside.index(False)
-            return GuardedTarget(None, f"joint {joint + 1} at {math.degrees(wanted[joint]):.1f} deg, its stop")
+            where = self._model.joints[joint].text(wanted[joint])
+            return GuardedTarget(None, f"joint {joint + 1} at {where}, its stop")
         if (left := self.outside(target)) is not None:
             return GuardedTarget(None, left)
         last = self._target

@@ -22,6 +22,8 @@ from canprobe.errors import CanprobeError
 
 COMMANDS = (
     "scenes",
+    "cells",
+    "init",
     "plan",
     "run",
     "up",

@@ -5,20 +5,19 @@ from __future__ import annotations
 import argparse
 
 from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Commands, Parser, add_options
+from canprobe.cli.parser import Parser, add_options
 
-_EXAMPLE = """\
+HELP = "list the packaged cells"
+EXAMPLE = """\
 examples:
   canprobe cells
   canprobe run cylinder --cell puma560
 """
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser("cells", help="list the packaged cells", description=__doc__, epilog=_EXAMPLE)
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     add_options(parser, "--json")
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:

@@ -119,7 +119,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         if getattr(args, option):
             name = option.replace("_", "-")
             raise UsageError(f"emulate: --{name} belongs to --eds; of a scene's nodes, choose with --nodes")
-    scene = with_realtime(load_scene(args.scene), args.realtime)
+    scene = with_realtime(load_scene(args.scene, args.cell), args.realtime)
     wanted = _nodes(args.nodes, scene)
     target = _scene_target(args, scene, wanted)
     if absent := sorted(set(args.without_id) - set(wanted)):
@@ -200,7 +200,7 @@ def _scene_target(args: argparse.Namespace, scene: Scene, node_ids: tuple[int, .
 
 
 def _nodes(wanted: tuple[int, ...] | None, scene: Scene) -> tuple[int, ...]:
-    known = {*(scene.arm.node_ids if scene.arm else ()), *([scene.sensor.node_id] if scene.sensor else ())}
+    known = {*scene.drives, *([scene.sensor.node_id] if scene.sensor else ())}
     if wanted is None:
         wanted = scene.emulated_node_ids
     if missing := sorted(set(wanted) - known):

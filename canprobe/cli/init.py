@@ -12,19 +12,19 @@ import math
 import shutil
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from canprobe.cli.parser import Commands, Parser, folder_path
-from canprobe.errors import CanprobeError, PlanError, UsageError
+from canprobe.cli.parser import Parser, folder_path
+from canprobe.errors import PlanError, UsageError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from canprobe.robot.model import ArmModel, Joint
     from canprobe.robot.urdf import UrdfArm
-    from canprobe.scene.model import Scene
 
-_EXAMPLE = """\
+HELP = "write a cell file and a first scene for your own arm"
+EXAMPLE = """\
 examples:
   canprobe init my-cell --urdf arm.urdf --tip tool0 --eds drive.eds
   canprobe run my-cell/first.toml
@@ -34,11 +34,8 @@ _TRIES = 400
 _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
 
-def add_parser(commands: Commands[Parser]) -> None:
-    """Add the command."""
-    parser = commands.add_parser(
-        "init", help="write a cell file and a first scene for your own arm", description=__doc__, epilog=_EXAMPLE
-    )
+def add_arguments(parser: Parser) -> None:
+    """Add the command's arguments."""
     parser.add_argument("folder", metavar="DIR", type=folder_path, help="folder to write into; made if it is missing")
     parser.add_argument("--urdf", metavar="FILE", type=Path, help="URDF of the arm [rows of a PUMA 560]")
     parser.add_argument("--base", metavar="LINK", help="link of the URDF that is the base [its root]")
@@ -46,7 +43,6 @@ def add_parser(commands: Commands[Parser]) -> None:
     parser.add_argument(
         "--eds", metavar="FILE", type=Path, action="append", default=[], help="EDS of the drives; once, or once a joint"
     )
-    parser.set_defaults(run=run)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -175,7 +171,7 @@ def _dh_cell(args: argparse.Namespace) -> str:
 
 
 def _cell_name(folder: Path) -> str:
-    name = "".join(c if c.isalnum() and c.isascii() or c in "_.-" else "-" for c in folder.resolve().name)
+    name = "".join(c if (c.isalnum() and c.isascii()) or c in "_.-" else "-" for c in folder.resolve().name)
     return name if name and name[0].isalnum() else f"cell{name}"
 
 
@@ -226,7 +222,7 @@ def _candidates(folder: Path) -> Iterator[str]:
     from canprobe.scene.resolve import resolve
 
     for rate in _RATES_HZ:
-        head = f'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
+        head = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
         cycle = "" if rate == _RATES_HZ[0] else f"\n[cycle]\nrate_hz = {rate!r}\n"
         cycle += f"\n[sensor]\nrate_hz = {min(200.0, rate)!r}\n" if rate < 200.0 else ""
         free = head + cycle + '\n[task]\nkind = "free"\nduration_s = 5\n'
@@ -237,7 +233,7 @@ def _candidates(folder: Path) -> Iterator[str]:
         yield free
 
 
-def _touch(model: ArmModel, q: NDArray, T_flange_probe: NDArray, speed: float, length: float) -> str:
+def _touch(model: ArmModel, q: NDArray[Any], T_flange_probe: NDArray[Any], speed: float, length: float) -> str:
     """A straight scan over a plane that faces the pole of the probe in the start posture."""
     import numpy as np
 
@@ -249,10 +245,8 @@ def _touch(model: ArmModel, q: NDArray, T_flange_probe: NDArray, speed: float, l
     start = place - 45.0 * normal
     rows = ", ".join(f"{value:.1f}" for value in start)
     roll, pitch = math.degrees(math.asin(-float(normal[1]))), math.degrees(math.atan2(normal[0], normal[2]))
-    if abs(normal[2]) < 0.9:  # the plane is steep: a heading in the xy-plane, across the normal
-        heading = math.degrees(math.atan2(normal[0], -normal[1]))
-    else:
-        heading = 0.0
+    steep = abs(normal[2]) < 0.9  # then the heading lies in the xy-plane, across the normal
+    heading = math.degrees(math.atan2(normal[0], -normal[1])) if steep else 0.0
     rolling = "rolling_share = 1 # the arm holds its orientation\n" if model.n <= 4 else ""
     return f"""
 [object] # the truth of the emulated contact; delete the section for a real object

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Show the cell ten times a second; with --json print it once, at the end."""
     from canprobe.scene.load import load_scene
 
-    scene = load_scene(args.scene)
+    scene = load_scene(args.scene, args.cell)
     scene = target_of(args, scene).applied_to(scene)
 
     from canprobe import api

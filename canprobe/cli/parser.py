@@ -173,7 +173,10 @@ def add_scene(parser: Parser, optional: bool = False) -> None:
         "scene",
         metavar="SCENE",
         nargs="?" if optional else None,
-        help="a packaged scene (`canprobe scenes` lists them) or the path of a TOML file",
+        help="a packaged scene (`canprobe scenes` lists them), a cell, or the path of a TOML file",
+    )
+    parser.add_argument(
+        "--cell", metavar="C", type=word, help="a packaged cell (`canprobe cells` lists them) or a path [the scene's]"
     )
 
 
@@ -197,7 +200,7 @@ def scene_of(args: argparse.Namespace) -> Scene:
     """
     from canprobe.scene.load import load_scene
 
-    scene = with_realtime(load_scene(args.scene), args.realtime)
+    scene = with_realtime(load_scene(args.scene, args.cell), args.realtime)
     if args.patient:
         if _has_real_nodes(scene):
             raise UsageError("--patient is for emulated nodes: real drives must stop soon after their master")

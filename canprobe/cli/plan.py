@@ -85,7 +85,7 @@ def run(args: argparse.Namespace) -> int:
 
     if args.measured is not None and (args.export or args.figure is not None):
         raise UsageError("plan: --measured sets a log beside the plan and writes no --export or --figure")
-    scene = load_scene(args.scene)
+    scene = load_scene(args.scene, args.cell)
     try:
         setup = resolve(scene)
         plan = make_plan(opened(setup) if args.auto else setup)

@@ -95,7 +95,7 @@ def run(args: argparse.Namespace) -> int:
     if args.scene is not None:
         from canprobe.scene.load import load_scene
 
-        scene = load_scene(args.scene)
+        scene = load_scene(args.scene, args.cell)
     done = api.commission(target, scene=scene, assign=args.assign, store=not args.no_store, say=say)
     if args.json:
         print_json(done.as_document())

@@ -25,8 +25,8 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.planning.model import Plan, PlannedNode
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
+from canprobe.robot.chain import Array, Chain, forward
 from canprobe.robot.inverse import start_posture
-from canprobe.robot.kinematics import Array, PumaModel, forward
 from canprobe.scene.setup import Arm, Setup
 
 
@@ -167,11 +167,11 @@ def _plant_config(setup: Setup) -> PlantConfig:
         q0=q0,
         fidelity=truth.fidelity,
         dynamics=truth.dynamics,
-        base_offset_m=_base_offset(setup.arm.model, truth.model, q0, setup.probe.T_flange_probe),
+        base_offset_m=_base_offset(setup.arm.model.chain, truth.model.chain, q0, setup.probe.T_flange_probe),
     )
 
 
-def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe: Array) -> Array:
+def _base_offset(believed: Chain, real: Chain, q: Array, T_flange_probe: Array) -> Array:
     """Where the real arm's base stands in the controller's base frame, (3,), m.
 
     An experimenter moves the arm to the object and takes that place for what the encoders show: both arms hold the
@@ -182,7 +182,7 @@ def _base_offset(believed: PumaModel, real: PumaModel, q: Array, T_flange_probe:
 
 
 def _first_posture(setup: Setup, arm: Arm) -> Array:
-    """Joint angles (n,), rad, at power on: above the start point of a touch, else as in the scene."""
+    """Joint positions (n,), rad or m, at power on: above the start point of a touch, else as in the scene."""
     touch = setup.touch
     if touch is None:
         return arm.q_start
@@ -190,10 +190,10 @@ def _first_posture(setup: Setup, arm: Arm) -> Array:
         arm.model,
         touch.approach.start,
         touch.approach.normal,
+        arm.q_start,
         radius_m=touch.probe.radius,
         T_flange_probe=touch.probe.T_flange_probe,
         clearance_m=touch.approach.clearance + PARKED_ABOVE,
-        q_near=arm.q_start,
     )
 
 

@@ -234,7 +234,7 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion of the task, and what is allowed, one value a joint, deg/s."""
+    """Fastest joint motion of the task, and what is allowed, one value a joint, deg/s; of a prismatic joint mm/s."""
 
     needed_deg_s: tuple[float, ...]
     limit_deg_s: tuple[float, ...]

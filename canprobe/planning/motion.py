@@ -13,8 +13,8 @@ from canprobe.errors import PlanError
 from canprobe.planning.model import JointSpeeds
 from canprobe.planning.window import PITCH_M
 from canprobe.protocol.tactile import SIDE
+from canprobe.robot.chain import forward
 from canprobe.robot.inverse import inverse_near, probe_pose
-from canprobe.robot.kinematics import forward
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.touch.shapes import PlacedShape
 
@@ -167,48 +167,50 @@ class _Stops:
     limits: SafetyLimits
 
     def inside(self, low: Array, high: Array) -> NDArray[np.bool_]:
-        """For each joint whether a range of angles, (n,) rad each, is allowed."""
-        model, margin = self.arm.model, self.limits.joint_margin
+        """For each joint whether a range of positions, (n,) rad or m each, is allowed."""
+        model = self.arm.model
+        margin = self.limits.joint_margin * model.radian
         inside: NDArray[np.bool_] = (low >= model.q_min + margin) & (high <= model.q_max - margin)
         return inside
 
     def allowed(self, joint: int) -> str:
         """A joint's range, for people."""
-        model, margin = self.arm.model, math.degrees(self.limits.joint_margin)
-        low, high = math.degrees(model.q_min[joint]), math.degrees(model.q_max[joint])
-        return f"{low + margin:g} to {high - margin:g} deg ({margin:g} deg from its stops)"
+        a, kept = self.arm.model.joints[joint], self.limits.joint_margin * float(self.arm.model.radian[joint])
+        low, high, margin = a.shown(a.q_min), a.shown(a.q_max), a.shown(kept)
+        return f"{low + margin:g} to {high - margin:g} {a.unit} ({margin:g} {a.unit} from its stops)"
 
     def start_problems(self) -> list[str]:
         """Joints that would start outside."""
-        q = self.arm.q_start
+        q, joints = self.arm.q_start, self.arm.model.joints
         return [
-            f"arm.start_deg: joint {i + 1} at {math.degrees(q[i]):g} deg, allowed {self.allowed(i)}"
+            f"joints.{joints[i].name}.start_deg: at {joints[i].text(q[i], 'g')}, allowed {self.allowed(i)}"
             for i in np.flatnonzero(~self.inside(q, q)).tolist()
         ]
 
     def problems(self, joints: Array) -> list[str]:
-        """Joints that would leave their range, of angles (m, n) rad."""
-        low, high = joints.min(axis=0), joints.max(axis=0)
+        """Joints that would leave their range, of positions (m, n) rad or m."""
+        low, high, its = joints.min(axis=0), joints.max(axis=0), self.arm.model.joints
         return [
-            f"task: joint {i + 1} would move from {math.degrees(low[i]):.1f} to {math.degrees(high[i]):.1f} deg, "
+            f"task: joint {i + 1} would move from {its[i].shown(low[i]):.1f} to {its[i].text(high[i])}, "
             f"allowed {self.allowed(i)}; move the object, shorten the path, or raise task.rolling_share"
             for i in np.flatnonzero(~self.inside(low, high)).tolist()
         ]
 
     def speeds(self, needed: Array) -> JointSpeeds:
-        """Needed speeds (n,), rad/s, beside what is allowed."""
-        limit = self.arm.model.qd_max * self.limits.speed_share
+        """Needed speeds (n,), rad/s or m/s, beside what is allowed."""
+        joints, limit = self.arm.model.joints, self.arm.model.qd_max * self.limits.speed_share
         return JointSpeeds(
-            tuple(round(rate, 3) for rate in np.degrees(needed).tolist()),
-            tuple(round(rate, 3) for rate in np.degrees(limit).tolist()),
+            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, needed.tolist(), strict=True)),
+            tuple(round(joint.shown(rate), 3) for joint, rate in zip(joints, limit.tolist(), strict=True)),
         )
 
 
-def _too_fast(speeds: JointSpeeds, way_out: str) -> list[str]:
+def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     """One line for every joint that the task asks to be too fast."""
+    each = zip(arm.model.joints, speeds.needed_deg_s, speeds.limit_deg_s, strict=True)
     return [
-        f"task: joint {i + 1} would need {need:.0f} deg/s, allowed {limit:.0f}; {way_out}"
-        for i, (need, limit) in enumerate(zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True))
+        f"task: joint {i} would need {need:.0f} {joint.unit}/s, allowed {limit:.0f}; {way_out}"
+        for i, (joint, need, limit) in enumerate(each, start=1)
         if need > limit
     ]
 
@@ -223,7 +225,7 @@ def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSp
     speeds = stops.speeds(rates.max(axis=0))
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
-    return speeds, problems + _too_fast(speeds, way_out)
+    return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 
 def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:
@@ -232,7 +234,7 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
     slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
     way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (task.swing_deg)"
-    return speeds, problems + _too_fast(speeds, way_out)
+    return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 
 def _hollow_problems(path: SurfacePath, probe: Probe) -> list[str]:
@@ -251,7 +253,7 @@ class _Pose:
     Attributes:
         centre: (3,), m, base frame.
         pole: (3,) from the centre away from the object, base frame.
-        most_rad: largest move of a joint from the pose before; farther away lies another branch.
+        most_rad: largest move of a joint from the pose before, see `inverse_near`; farther away lies another branch.
         out_of_reach: message, to be filled with why.
     """
 
@@ -271,7 +273,7 @@ def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
         pole /= np.linalg.norm(pole)
         out_of_reach = (
             f"task: contact at {_mm(point)} mm out of reach: {{why}}; move the object, shorten the "
-            "path, or set arm.start_deg to another branch"
+            "path, or set start_deg of the joints to another branch"
         )
         yield _Pose(point + radius * normal, pole, _BRANCH_RAD, out_of_reach)
 
@@ -289,19 +291,19 @@ def _over_ball(task: Calibrate) -> Iterator[_Pose]:
 
 
 def _follow(arm: Arm, probe: Probe, poses: Iterable[_Pose]) -> Array:
-    """Joint angles at the poses (m, n), rad, each near the one before.
+    """Joint positions at the poses (m, n), rad or m, each near the one before.
 
     Raises:
         PlanError: the first pose that is out of reach.
     """
-    to_flange, q = np.linalg.inv(probe.T_flange_probe), arm.q_start
-    x_hint = (forward(arm.model, q) @ probe.T_flange_probe)[:3, 0]
+    q = arm.q_start
+    x_hint = (forward(arm.model.chain, q) @ probe.T_flange_probe)[:3, 0]
     found: list[Array] = []
     for pose in poses:
         try:
             T_base_probe = probe_pose(pose.centre, pose.pole, 0.0, x_hint)
-            most_rad = pose.most_rad if found else math.inf
-            q = inverse_near(arm.model, T_base_probe @ to_flange, q, max_move_rad=most_rad)
+            most_rad, q_rest = (pose.most_rad, found[0]) if found else (math.inf, q)
+            q = inverse_near(arm.model, T_base_probe, probe.T_flange_probe, q, max_move_rad=most_rad, q_rest=q_rest)
         except (PlanError, ValueError) as error:
             raise PlanError([pose.out_of_reach.format(why=error)]) from error
         found.append(q)

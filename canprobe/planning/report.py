@@ -14,7 +14,6 @@ from canprobe.planning.model import (
     HEARTBEAT_PRODUCED_MS,
     MASTER_NODE_ID,
     CycleBudget,
-    JointSpeeds,
     Plan,
     PlannedBus,
     PlannedPdo,
@@ -196,7 +195,7 @@ def _lines(plan: Plan) -> Iterator[str]:
     parts = "(S SYNC, f feedback, C controller, r commands, t tactile)"
     yield from _titled(f"{each} {parts}", timeline_rows(plan, TIMELINE_WIDTH))
     yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices))
-    yield from _titled("joint speeds", _speed_rows(plan.joint_speeds))
+    yield from _titled("joint speeds", _speed_rows(plan))
     yield from _titled("uses", _use_rows(plan))
     yield from _titled("leaves out", plan.left_out)
     yield from _titled("could not have", plan.not_available)
@@ -238,11 +237,13 @@ def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
         yield [*[pdo.channel] * several, *name, *frame, *times, _content(pdo.entries)]
 
 
-def _speed_rows(speeds: JointSpeeds | None) -> Iterator[list[str]]:
-    if speeds is not None:
+def _speed_rows(plan: Plan) -> Iterator[list[str]]:
+    speeds, arm = plan.joint_speeds, plan.setup.arm
+    if speeds is not None and arm is not None:
         yield ["joint", "needed deg/s", "allowed deg/s"]
-        for joint, (needed, limit) in enumerate(zip(speeds.needed_deg_s, speeds.limit_deg_s, strict=True), start=1):
-            yield [str(joint), f"{needed:.1f}", f"{limit:g}"]
+        rows = zip(arm.model.joints, speeds.needed_deg_s, speeds.limit_deg_s, strict=True)
+        for number, (joint, needed, limit) in enumerate(rows, start=1):
+            yield [f"{number}{' (mm/s)' if joint.prismatic else ''}", f"{needed:.1f}", f"{limit:g}"]
 
 
 def _content(entries: Sequence[PdoEntry]) -> str:

@@ -21,7 +21,7 @@ from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import known_state
 from canprobe.protocol.frame_bits import INTERMISSION_BITS, exact_bits
 from canprobe.recorded.recording import STAMP_JITTER_NS, Recording, find_deadlines
-from canprobe.robot.kinematics import PumaModel, joints_to_counts
+from canprobe.robot.model import ArmModel, joints_to_units
 from canprobe.scene.setup import Touch
 from canprobe.tasks.from_plan import make_sensing, make_shape_tracker, make_task
 from canprobe.tasks.shape import ShapeTracker
@@ -219,7 +219,7 @@ class LoggedWayBack:
         plan: of the cell.
 
     Attributes:
-        steps: its cycles with their joint targets (6,), rad; empty without a lift-off.
+        steps: its cycles with their joint targets (n,), rad or m; empty without a lift-off.
     """
 
     def __init__(self, plan: Plan) -> None:
@@ -261,9 +261,9 @@ class LoggedWayBack:
         return steps
 
 
-def worst_count(model: PumaModel, q: Vector, targets: tuple[int, ...]) -> int:
-    """Largest difference of joint angles (6,), rad, and recorded motor targets, counts."""
-    return int(np.abs(np.round(joints_to_counts(model, q)) - targets).max())
+def worst_count(model: ArmModel, q: Vector, targets: tuple[int, ...]) -> int:
+    """Largest difference of joint positions (n,), rad or m, and recorded motor targets, counts."""
+    return int(np.abs(np.round(joints_to_units(model, q)) - targets).max())
 
 
 # The contacts of the run: by the scene's task, or from the images alone.
@@ -359,7 +359,7 @@ class _Comparison:
         self._away = 0
 
     def add(self, cycle: LogCycle, q: Vector | None) -> None:
-        """One cycle, and the joint targets (6,), rad, of the replay."""
+        """One cycle, and the joint targets (n,), rad or m, of the replay."""
         if cycle.targets is None or q is None:
             return
         self.differences.append(worst_count(self._model, q, cycle.targets))

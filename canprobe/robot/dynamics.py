@@ -1,7 +1,7 @@
 """Rigid-body dynamics of the arm: masses, mass matrix, Coriolis and centrifugal torques, gravity.
 
 Equation of motion: ``M(q) q'' + b(q, q') = tau``, all at the joints; b holds gravity. Motors, gears and friction are
-not in it (``canprobe.robot.kinematics``). The recursion over the links (``mass_and_bias``) is compiled once for each
+not in it (``canprobe.robot.model``). The recursion over the links (``mass_and_bias``) is compiled once for each
 pattern of zeros in what is known of the links.
 """
 
@@ -15,7 +15,9 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.robot.kinematics import Array, PumaModel
+from canprobe.robot.chain import Array
+from canprobe.robot.model import ArmModel
+from canprobe.robot.puma import dh_rows
 from canprobe.robot.straight_line import Value, call, compiled
 
 # Masses of the PUMA 260's links. No maker ever published them: they are those of a PUMA 560, scaled by size.
@@ -82,14 +84,14 @@ def _steiner(mass: float, offset: Array) -> Array:
     return mass * (float(offset @ offset) * np.eye(3) - np.outer(offset, offset))
 
 
-def puma260_inertia(model: PumaModel) -> LinkInertia:
+def puma260_inertia(model: ArmModel) -> LinkInertia:
     """Links of the bare arm.
 
     Args:
         model: the geometry; how it splits the shoulder's offset moves the frame of link 2, not the link.
     """
     com = 1e-3 * np.array(_COM_MM)
-    com[1, 2] -= float(model.dh[1, 2])
+    com[1, 2] -= float(dh_rows(model)[1, 2])
     tensor = np.array([np.diag(row) for row in _INERTIA_KG_MM2]) * 1e-6
     return LinkInertia(np.array(_MASS_KG), com, tensor)
 
@@ -300,7 +302,7 @@ class RigidBody:
 
     def __init__(
         self,
-        model: PumaModel,
+        model: ArmModel,
         inertia: LinkInertia,
         gravity: float = GRAVITY_M_S2,
         *,
@@ -311,7 +313,7 @@ class RigidBody:
         back = np.eye(6) if joints_per_coordinate is None else joints_per_coordinate
         self._known = (
             _about_the_frames(inertia),
-            tuple(model.dh[:, (0, 2)].ravel().tolist()),
+            tuple(dh_rows(model)[:, (0, 2)].ravel().tolist()),
             (gravity,),
             tuple(back.ravel().tolist()),
             tuple(rotors),

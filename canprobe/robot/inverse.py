@@ -1,187 +1,242 @@
-"""From poses and velocities of the tool to the joints: inverse kinematics in closed form, and steps by the Jacobian.
+"""From poses and velocities of the tool to the joints of any arm, numerically.
 
-Two shoulder solutions (the arm reaches forward or over its back), two elbow solutions, two wrist solutions.
-The elbow offset a3 and the forearm d4 act as one link of length hypot(a3, d4), turned by atan2(d4, a3).
+What n joints can hold of a tool's pose is a number of rows, in this order: position (3), the direction of the pole, the
+tool's z axis (2), and the turn about the pole (1). Six or more joints hold all six rows, with more than six they stay
+near a posture besides. Five joints hold position and pole. Fewer hold the position; the pole comes out as it does.
+`task_rows` says so for a model, `in_rows` takes those rows out of a Jacobian or a twist; tasks and planning use both.
 
-Source: Paul & Zhang, "Computationally efficient kinematics for manipulators with spherical wrists", IJRR 5(2), 1986.
+- `inverse_near` finds the joints for a pose from a known posture on, within the joint limits (Levenberg-Marquardt). It
+  stays on the branch of that posture, as an arm that moves there does.
+- `damped_step` is one step of the Jacobian, damped near singular poses; `lifting_step` one with some drives at rest.
+- `probe_pose` and `start_posture` put a probe on a surface.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from math import atan2, ceil, cos, degrees, hypot, inf, pi, sin, sqrt
+from math import atan2, degrees, inf, pi
 
 import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import ELBOW_FORM, Array, PumaModel, forward
+from canprobe.robot.chain import Array, forward, forward_jacobian
+from canprobe.robot.model import ArmModel
 
-# Closed-form inverse kinematics: eight branches, angles placed inside the joint ranges, singularities named.
+LENGTH_M = 0.2
+"""Makes linear rows comparable to angular ones: about the length of a link."""
 
-_TURN = 2 * pi
+
+def task_rows(model: ArmModel) -> int:
+    """How many rows of a tool's pose an arm can hold.
+
+    Args:
+        model: the arm.
+
+    Returns:
+        6 from six joints on: position, pole and the turn about it; 5 of five: position and pole; 3 of fewer: position.
+    """
+    return 6 if model.n >= 6 else 5 if model.n == 5 else 3
+
+
+def in_rows(rows: int, R_base_tool: Array, six: Array) -> Array:
+    """The rows that an arm can hold, of a Jacobian (6, n) or a twist (6,).
+
+    Args:
+        rows: of `task_rows`.
+        R_base_tool: (3, 3) axes of the tool; the turns about its x and y are those of the pole.
+        six: linear rows, then angular ones, base frame.
+
+    Returns:
+        (rows, n) or (rows,): linear rows in the base frame, then angular ones, of five rows in the frame of the tool.
+    """
+    if rows == 5:
+        return np.concatenate((six[:3], R_base_tool[:, :2].T @ six[3:]))
+    return six[:rows]
+
+
+# A pose from a known posture on.
+
+_REACHED = 1e-9
+"""Error of a pose, rad or m over `LENGTH_M`, that is rounding."""
+_STEPS = 200
+_LONGEST_STEP = 0.3
+"""Of a joint in one step, rad: farther the Jacobian is another one."""
+_LEAST_DAMPING, _MOST_DAMPING = 1e-12, 1e8
+
+
+def inverse_near(
+    model: ArmModel,
+    T_base_tool: Array,
+    T_flange_tool: Array,
+    q_near: npt.ArrayLike,
+    *,
+    max_move_rad: float = inf,
+    q_rest: npt.ArrayLike | None = None,
+) -> Array:
+    """Joints within their limits that hold a tool at a pose, reached from a known posture on.
+
+    Args:
+        model: the arm; `task_rows` says what of the pose it can hold.
+        T_base_tool: (4, 4) pose of the tool, m.
+        T_flange_tool: (4, 4) tool in the flange frame, m.
+        q_near: (n,) rad or m; the answer is on its branch.
+        max_move_rad: farthest that a joint may be from `q_near`, rad; for a prismatic one see `ArmModel.radian`.
+        q_rest: (n,) posture near which more than six joints stay; `q_near` by default.
+
+    Returns:
+        (n,) joint positions, rad or m.
+
+    Raises:
+        PlanError: out of reach from there, with the nearest pose that can be reached; or too far, with the joint.
+
+    Source: Nocedal & Wright, Numerical Optimization, 10.3 (Levenberg-Marquardt), 16.7 (projected to bounds).
+    """
+    near = np.asarray(q_near, dtype=float)
+    pose = _Pose(model, np.asarray(T_base_tool, dtype=float), np.asarray(T_flange_tool, dtype=float))
+    q = _reach(pose, near)
+    if pose.rows < model.n:
+        q = _rest(pose, q, near if q_rest is None else np.asarray(q_rest, dtype=float))
+    if float(np.linalg.norm(pose.error(q)[0])) > _REACHED:
+        raise PlanError([_out_of_reach(pose, q)])
+    moves = np.abs(q - near) / model.radian
+    if float(moves.max()) > max_move_rad:
+        i = int(np.argmax(moves))
+        joint = model.joints[i]
+        raise PlanError(
+            [
+                f"{_place(T_base_tool)}: not near the posture before: joint {i + 1} would have to move by "
+                f"{joint.text(abs(float(q[i] - near[i])))}"
+            ]
+        )
+    return q
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class IkSolution:
-    """One branch.
+class _Pose:
+    """A pose to be reached by an arm."""
 
-    Attributes:
-        q: (6,) joint angles, rad, in the joint ranges wherever that is possible.
-        shoulder: +1 wrist centre in front of the shoulder, -1 behind it (over the back).
-        elbow: sign of the sine of the angle between upper arm and effective forearm.
-        wrist: sign of sin(q5).
-        within_limits: whether every angle lies in its range.
-    """
+    model: ArmModel
+    T_base_tool: Array
+    T_flange_tool: Array
 
-    q: Array
-    shoulder: int
-    elbow: int
-    wrist: int
-    within_limits: bool
+    @property
+    def rows(self) -> int:
+        return task_rows(self.model)
 
+    def error(self, q: Array) -> tuple[Array, Array]:
+        """What is left (rows,) and its Jacobian (rows, n), in rad: lengths are divided by `LENGTH_M`.
 
-def _wrap(angle: float, low: float, high: float, near: float) -> tuple[float, bool]:
-    """The representation of an angle inside [low, high] that is nearest to ``near``, or nearest at all."""
-    inside = angle + _TURN * ceil((low - angle) / _TURN - 1e-12)
-    if inside > high + 1e-9:
-        return angle + _TURN * round((near - angle) / _TURN), False
-    best = inside
-    while inside <= high + 1e-9:
-        if abs(inside - near) < abs(best - near):
-            best = inside
-        inside += _TURN
-    return best, True
+        The Jacobian is per radian of a joint, see `ArmModel.radian`.
+        """
+        T, J = forward_jacobian(self.model.chain, q, self.T_flange_tool)
+        R, aim, rows = T[:3, :3], self.T_base_tool, self.rows
+        turn = _turn(R, aim[:3, :3]) if rows == 6 else _turn_of_pole(R, aim[:3, 2])
+        left = np.concatenate(((aim[:3, 3] - T[:3, 3]) / LENGTH_M, turn))
+        J[:3] /= LENGTH_M
+        return in_rows(rows, R, left), in_rows(rows, R, J) * self.model.radian
 
 
-def _arm_angles(model: PumaModel, wx: float, wy: float, wz: float) -> list[tuple[float, float, float, int, int]]:
-    """(q1, q2, q3, shoulder, elbow) of every branch that reaches the wrist centre."""
-    d1, a2, offset, a3, d4, _ = model.links
-    forearm, phi = hypot(a3, d4), atan2(d4, a3)
-    h = wz - d1
-    r2 = wx * wx + wy * wy - offset * offset
-    cos_psi = (r2 + h * h - a2 * a2 - forearm * forearm) / (2 * a2 * forearm)
-    if r2 < 0.0 or abs(cos_psi) > 1.0:
-        return []
-    found = []
-    for shoulder in (1, -1):
-        r = shoulder * sqrt(r2)
-        q1 = atan2(wy, wx) - atan2(-offset, r)
-        for elbow in (1, -1):
-            sin_psi = elbow * sqrt(max(0.0, (1.0 - cos_psi) * (1.0 + cos_psi)))
-            q2 = atan2(h, r) - atan2(forearm * sin_psi, a2 + forearm * cos_psi)
-            found.append((q1, q2, atan2(sin_psi, cos_psi) - phi, shoulder, elbow))
-    return found
+def _turn(R: Array, R_aim: Array) -> Array:
+    """(3,) rotation vector from one orientation to another, base frame."""
+    E = R_aim @ R.T
+    axis = 0.5 * np.array((E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]))
+    sine, cosine = float(np.linalg.norm(axis)), 0.5 * (float(np.trace(E)) - 1.0)
+    if sine > 1e-8:
+        return np.array(axis * (atan2(sine, cosine) / sine))
+    if cosine > 0.0:
+        return axis
+    column = (E + np.eye(3))[:, int(np.argmax(np.diag(E)))]  # half a turn: any sign of its axis
+    return np.array(column * (pi / float(np.linalg.norm(column))))
 
 
-def _wrist_angles(R: list[list[float]], q1: float, q23: float, q4_near: float) -> list[tuple[float, float, float, int]]:
-    """(q4, q5, q6, wrist) of both wrist branches; at the singularity q4 is free and taken from ``q4_near``."""
-    c1, s1, c, s = cos(q1), sin(q1), cos(q23), sin(q23)
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = R
-    # Columns of R36 = R03' R: rows are x3, y3, z3.
-    x2, y2, z2 = c * (c1 * r02 + s1 * r12) + s * r22, c1 * r12 - s1 * r02, c * r22 - s * (c1 * r02 + s1 * r12)
-    x0, y0 = c * (c1 * r00 + s1 * r10) + s * r20, c1 * r10 - s1 * r00
-    x1, y1 = c * (c1 * r01 + s1 * r11) + s * r21, c1 * r11 - s1 * r01
-    singular = hypot(x2, y2) < 1e-12
-    found = []
-    for wrist in (1, -1):
-        q4 = q4_near if singular else atan2(-wrist * y2, -wrist * x2)
-        c4, s4 = cos(q4), sin(q4)
-        # q5 and q6 follow from this q4, not from entries of their own: exact near the singularity too.
-        q5 = atan2(-(c4 * x2 + s4 * y2), z2)
-        q6 = atan2(c4 * y0 - s4 * x0, c4 * y1 - s4 * x1)
-        found.append((q4, q5, q6, wrist))
-    return found
+def _turn_of_pole(R: Array, pole: Array) -> Array:
+    """(3,) shortest rotation vector that brings z to a direction, base frame."""
+    axis = np.cross(R[:, 2], pole)
+    sine, cosine = float(np.linalg.norm(axis)), float(R[:, 2] @ pole)
+    if sine > 1e-8:
+        return np.array(axis * (atan2(sine, cosine) / sine))
+    return axis if cosine > 0.0 else np.array(pi * R[:, 0])
 
 
-def inverse(model: PumaModel, T_base_flange: Array, q_near: npt.ArrayLike | None = None) -> list[IkSolution]:
-    """All branches that reach a flange pose.
-
-    Args:
-        model: the arm.
-        T_base_flange: (4, 4) flange pose, m.
-        q_near: (6,) rad; chooses among representations that differ by whole turns. Default: middle of the ranges.
-
-    Returns:
-        Eight solutions, or none where the wrist centre is out of reach. At a singular pose branches coincide.
-    """
-    low, high = model.q_min.tolist(), model.q_max.tolist()
-    near = [(a + b) / 2 for a, b in zip(low, high, strict=True)] if q_near is None else np.asarray(q_near).tolist()
-    R = T_base_flange[:3, :3].tolist()
-    wx, wy, wz = (T_base_flange[:3, 3] - model.links[5] * T_base_flange[:3, 2]).tolist()
-    solutions = []
-    for q1, q2, q3, shoulder, elbow in _arm_angles(model, wx, wy, wz):
-        for q4, q5, q6, wrist in _wrist_angles(R, q1, q2 + q3, near[3]):
-            wrapped = [_wrap(*a) for a in zip((q1, q2, q3, q4, q5, q6), low, high, near, strict=True)]
-            q = np.array([angle for angle, _ in wrapped])
-            solutions.append(IkSolution(q, shoulder, elbow, wrist, all(ok for _, ok in wrapped)))
-    return solutions
+def _reach(pose: _Pose, near: Array) -> Array:
+    """The joints where the error of a pose is least, from a posture on: Levenberg-Marquardt, joints held at stops."""
+    model = pose.model
+    q = np.clip(near, model.q_min, model.q_max)
+    left, J = pose.error(q)
+    damping = 1e-3
+    for _ in range(_STEPS):
+        cost = float(left @ left)
+        uphill = J.T @ left
+        free = ~(((q <= model.q_min) & (uphill < 0.0)) | ((q >= model.q_max) & (uphill > 0.0)))
+        if cost < 1e-3 * _REACHED**2 or not np.abs(uphill[free]).max(initial=0.0) > 1e-14 or damping > _MOST_DAMPING:
+            break
+        tried = np.clip(q + _step(J, left, free, damping) * model.radian, model.q_min, model.q_max)
+        new_left, new_J = pose.error(tried)
+        if float(new_left @ new_left) < cost:
+            q, left, J, damping = tried, new_left, new_J, max(damping * 0.1, _LEAST_DAMPING)
+        else:
+            damping = max(10.0 * damping, 1e-6)
+    return q
 
 
-def inverse_near(model: PumaModel, T_base_flange: Array, q_near: npt.ArrayLike, *, max_move_rad: float = inf) -> Array:
-    """The solution within the joint limits that is nearest to a given posture (largest joint move smallest).
-
-    Args:
-        model: the arm.
-        T_base_flange: (4, 4) flange pose, m.
-        q_near: (6,) rad.
-        max_move_rad: farthest that any joint may be from ``q_near``; without it the answer may be another branch
-            (over the back, elbow turned, wrist turned) when the nearest one breaks a limit.
-
-    Returns:
-        (6,) joint angles, rad.
-
-    Raises:
-        PlanError: out of reach, or every branch breaks a joint limit or is too far; the message names the joints.
-    """
-    near = np.asarray(q_near, dtype=float)
-    solutions = inverse(model, T_base_flange, near)
-    allowed = [s.q for s in solutions if s.within_limits and float(np.max(np.abs(s.q - near))) <= max_move_rad]
-    if not allowed:
-        raise PlanError([_why_not(model, T_base_flange, solutions, near)])
-    return min(allowed, key=lambda q: float(np.max(np.abs(q - near))))
+def _step(J: Array, left: Array, free: NDArray[np.bool_], damping: float) -> Array:
+    """A damped step of the free joints, no longer than the Jacobian holds, rad."""
+    A = J[:, free]
+    step = np.zeros(len(free))
+    step[free] = A.T @ np.linalg.solve(A @ A.T + damping * np.eye(len(left)), left)
+    step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+    return step
 
 
-def _why_not(model: PumaModel, T_base_flange: Array, solutions: list[IkSolution], near: Array) -> str:
-    x, y, z = (1e3 * T_base_flange[:3, 3]).tolist()
-    where = f"flange at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
-    if not solutions:
-        return f"{where}: out of reach of the {model.name} arm; move the object or shorten the probe"
-    q = min((s.q for s in solutions), key=lambda q: float(np.max(np.abs(q - near))))
-    bad = [
-        f"joint {i + 1} would be at {degrees(q[i]):.1f} deg, allowed {degrees(model.q_min[i]):.0f} to "
-        f"{degrees(model.q_max[i]):.0f}"
-        for i in range(6)
-        if not model.q_min[i] - 1e-9 <= q[i] <= model.q_max[i] + 1e-9
+def _rest(pose: _Pose, reached: Array, rest: Array) -> Array:
+    """Of the joints that hold a pose the ones nearest to a posture: Newton's steps towards the pose, and along the
+    null space towards the posture. What was reached, where that does not settle."""
+    model, q = pose.model, reached
+    for _ in range(_STEPS):
+        left, J = pose.error(q)
+        wish = (rest - q) / model.radian
+        free = ~(((q <= model.q_min) & (wish < 0.0)) | ((q >= model.q_max) & (wish > 0.0)))
+        A = J[:, free]
+        step = np.zeros(model.n)
+        # wish + A'(AA')^-1 (left - A wish): the nearest to the wish that makes up for what is left
+        damped = A @ A.T + 1e-12 * np.eye(pose.rows)
+        step[free] = wish[free] + A.T @ np.linalg.solve(damped, left - A @ wish[free])
+        step /= max(1.0, float(np.abs(step).max()) / _LONGEST_STEP)
+        moved = np.clip(q + step * model.radian, model.q_min, model.q_max)
+        settled, q = float(np.abs(moved - q).max()) < _REACHED, moved
+        if settled:
+            break
+    back = _reach(pose, q)
+    still = float(np.linalg.norm(pose.error(back)[0])) <= _REACHED
+    return back if still else reached
+
+
+def _out_of_reach(pose: _Pose, q: Array) -> str:
+    """What is nearest, and what holds it there."""
+    model, T = pose.model, forward(pose.model.chain, q) @ pose.T_flange_tool
+    away = 1e3 * float(np.linalg.norm(T[:3, 3] - pose.T_base_tool[:3, 3]))
+    turned = degrees(float(np.linalg.norm(pose.error(q)[0][3:])))
+    stops = [
+        f"joint {i + 1} at its stop, {joint.text(float(value))}"
+        for i, (joint, value) in enumerate(zip(model.joints, q, strict=True))
+        if not joint.q_min + 1e-9 < value < joint.q_max - 1e-9
     ]
-    if not bad:
-        move, joint = max((abs(float(q[i] - near[i])), i + 1) for i in range(6))
-        bad = [f"joint {joint} would have to move by {degrees(move):.1f} deg"]
-    return f"{where}: no branch within the joint limits nearby; nearest branch: " + "; ".join(bad)
+    nearest = f"nearest reachable: {_place(T)}, {away:.1f} mm and {turned:.1f} deg away"
+    because = f" with {', '.join(stops)}" if stops else ""
+    return (
+        f"{_place(pose.T_base_tool)}: out of reach of the {model.name} arm; {nearest}{because}; move the object or "
+        "shorten the probe"
+    )
 
 
-def singularities(model: PumaModel, q: npt.ArrayLike, *, tolerance: float = 0.05) -> tuple[str, ...]:
-    """Names of the singularities that a posture is close to.
-
-    Args:
-        model: the arm.
-        q: (6,) joint angles, rad.
-        tolerance: dimensionless: sine of the elbow or wrist angle, or reach over upper arm for the shoulder.
-
-    Returns:
-        Any of "shoulder" (wrist centre on the axis of joint 1, offset aside), "elbow" (arm stretched or folded),
-        "wrist" (axes 4 and 6 in line).
-    """
-    _, a2, _, a3, d4, _ = model.links
-    _, q2, q3, _, q5, _ = np.asarray(q, dtype=float).tolist()
-    reach = a2 * cos(q2) + a3 * cos(q2 + q3) - d4 * sin(q2 + q3)
-    measures = {"shoulder": reach / a2, "elbow": sin(q3 + atan2(d4, a3)), "wrist": sin(q5)}
-    return tuple(name for name, value in measures.items() if abs(value) < tolerance)
+def _place(T_base_tool: Array) -> str:
+    x, y, z = (1e3 * T_base_tool[:3, 3]).tolist()
+    return f"tool at ({x:.1f}, {y:.1f}, {z:.1f}) mm"
 
 
-# Poses that put a spherical probe on a surface point, and the joint angles for them: start poses of a scene.
+# Poses that put a spherical probe on a surface point, and the joints for them: start poses of a scene.
 
 
 def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: float, x_hint: npt.ArrayLike) -> Array:
@@ -215,132 +270,119 @@ def probe_pose(point: npt.ArrayLike, normal: npt.ArrayLike, centre_height_m: flo
 
 
 def start_posture(
-    model: PumaModel,
+    model: ArmModel,
     point: npt.ArrayLike,
     normal: npt.ArrayLike,
+    q_near: npt.ArrayLike,
     *,
     radius_m: float,
     T_flange_probe: Array,
     clearance_m: float = 0.0,
-    yaw_rad: float | None = None,
-    q_near: npt.ArrayLike = ELBOW_FORM,
 ) -> Array:
-    """Joint angles that hold the probe over a surface point, pole against the normal, nearest to a known posture.
+    """Joints that hold the probe over a surface point, pole against the normal, from a known posture on.
 
-    The turn about the normal is free: by default it is what ``q_near`` has (joint 6 moves least); with ``yaw_rad``
-    the probe's x axis points at that angle from base x, in the horizontal plane, counted about base z.
+    The turn about the normal is free: it is what `q_near` has.
 
     Args:
         model: the arm.
         point: (3,) surface point, base frame, m.
         normal: (3,) outward normal there.
+        q_near: (n,) rad or m.
         radius_m: probe radius, m.
         T_flange_probe: (4, 4) probe centre in the flange frame, m.
         clearance_m: gap between probe and surface, m; negative presses.
-        yaw_rad: optional heading of the probe's x axis, rad.
-        q_near: (6,) rad.
 
     Returns:
-        (6,) joint angles, rad, within the limits.
+        (n,) joint positions, rad or m, within the limits.
 
     Raises:
-        PlanError: when no branch reaches the pose within the limits.
+        PlanError: the pose cannot be reached from there within the limits.
     """
-    if yaw_rad is None:
-        x_hint = (forward(model, q_near) @ T_flange_probe)[:3, 0]
-    else:
-        x_hint = np.array((math.cos(yaw_rad), math.sin(yaw_rad), 0.0))
+    x_hint = (forward(model.chain, q_near) @ T_flange_probe)[:3, 0]
     T_base_probe = probe_pose(point, normal, radius_m + clearance_m, x_hint)
-    return inverse_near(model, T_base_probe @ np.linalg.inv(T_flange_probe), q_near)
+    return inverse_near(model, T_base_probe, T_flange_probe, q_near)
 
 
 # Damped least-squares inverse of the Jacobian, damped only near singular poses.
 
 
-def damped_step(
-    J: Array,
-    twist: Array,
-    *,
-    qd_max: Array | None = None,
-    damping: float = 0.05,
-    threshold: float = 0.08,
-    length_m: float = 0.2,
-) -> Array:
+_DAMPING, _THRESHOLD = 0.05, 0.08
+"""Largest damping, and the singular value below which it starts; linear rows are divided by `LENGTH_M`."""
+
+
+def damped_step(J: Array, twist: Array, wish: Array | None = None) -> Array:
     """Joint rates for a tool twist.
 
-    Away from singular poses this is the exact inverse. Where the smallest singular value s falls below the threshold
-    the squared damping rises as ``damping^2 (1 - (s/threshold)^2)``, on all directions alike, so that rates stay
-    bounded and continuous. Rates beyond ``qd_max`` are scaled together: the direction of motion is kept.
+    Away from singular poses this is the exact inverse, of least norm where there are more joints than rows. Where the
+    smallest singular value s falls below the threshold the squared damping rises as
+    0.05^2 (1 - (s / 0.08)^2), on all directions alike, so that rates stay bounded and continuous.
 
     Args:
-        J: (6, 6) geometric Jacobian, linear rows first.
-        twist: (6,) linear m/s then angular rad/s (or a displacement: the map is linear up to the limits).
-        qd_max: (6,) limits in the unit of the result; none if omitted.
-        damping: largest damping, dimensionless (linear rows are divided by ``length_m``).
-        threshold: singular value below which damping starts, dimensionless.
-        length_m: characteristic length of the arm that makes linear and angular rows comparable, m.
+        J: (m, n) rows of the geometric Jacobian that the arm can hold, linear rows first, see `task_rows`.
+        twist: (m,) linear m/s then angular rad/s, or a displacement: the map is linear.
+        wish: (n,) rates that the joints have as far as the tool does not notice; none by default.
 
     Returns:
-        (6,) joint rates, rad/s.
+        (n,) joint rates, rad/s or m/s.
 
-    Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor).
+    Source: Nakamura & Hanafusa 1986; Maciejewski & Klein 1988 (variable damping factor); Liegeois 1977 (null space).
     """
-    scale = np.array((1 / length_m,) * 3 + (1.0,) * 3)
-    scaled = J * scale[:, None]
-    qd = _regular_step(scaled, scale * twist, threshold)
-    if qd is None:
-        U, s, Vt = np.linalg.svd(scaled)
-        ratio = float(s[-1]) / threshold
-        lambda2 = damping**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
-        qd = Vt.T @ ((U.T @ (scale * twist)) * (s / (s * s + lambda2)))
-    if qd_max is not None:
-        qd = qd / max(1.0, float(np.max(np.abs(qd) / qd_max)))
-    return qd
+    rows, joints = J.shape
+    scale = np.array((1 / LENGTH_M,) * 3 + (1.0,) * (rows - 3))
+    scaled, aim = J * scale[:, None], scale * twist
+    regular = _regular_step(scaled, aim) if rows == joints else None
+    if regular is not None:
+        return regular
+    U, s, Vt = np.linalg.svd(scaled, full_matrices=False)
+    ratio = float(s[-1]) / _THRESHOLD
+    lambda2 = _DAMPING**2 * (1.0 - ratio**2) if ratio < 1.0 else 0.0
+    step: Array = Vt.T @ ((U.T @ aim) * (s / (s * s + lambda2)))
+    return step if wish is None else step + wish - Vt.T @ (Vt @ wish)
 
 
-def _regular_step(J: Array, twist: Array, threshold: float) -> Array | None:
+def _regular_step(J: Array, twist: Array) -> Array | None:
     """The exact inverse where it is cheap to see that no damping is due (1/‖J⁻¹‖ is below every singular value)."""
     try:
         inverse = np.linalg.inv(J)
     except np.linalg.LinAlgError:
         return None
-    if float(np.vdot(inverse, inverse)) * threshold**2 >= 1.0:
+    if float(np.vdot(inverse, inverse)) * _THRESHOLD**2 >= 1.0:
         return None
     step: Array = inverse @ twist
     return step
 
 
-# Moving the tool with the motors that are left: what the others would have done is shared among them.
+# Moving the tool with the drives that are left: what the others would have done is shared among them.
 
 WORST_GAIN = 30.0
-"""Joint motion per motion of the tool, rad/m, beyond which the motors that are left are badly placed for it."""
+"""Joint motion per motion of the tool, rad/m, beyond which the drives that are left are badly placed for it."""
 _EXACT = 1e-6
 
 
-def lifting_step(J: Array, joints_per_count: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
-    """Motor steps that move the tool's point, its orientation left open, while some motors stand still.
+def lifting_step(model: ArmModel, J: Array, move: Array, free: NDArray[np.bool_]) -> Array | None:
+    """Drive steps that move the tool's point, its orientation left open, while some drives stand still.
 
-    Of all steps the one with the least joint motion. The motors' coupling in the wrist is in it: a motor that stands
-    still is not a joint that stands still.
+    Of all steps the one with the least joint motion. Couplings between the joints are in it: a drive that stands still
+    is not a joint that stands still.
 
     Args:
-        J: (3, 6) velocity of the point per joint rate, m/rad, base frame.
-        joints_per_count: (6, 6) joint angles of motor counts, rad.
+        model: the arm.
+        J: (3, n) velocity of the point per joint rate, base frame.
         move: (3,) of the point, m, base frame.
-        free: (6,) motors that may turn.
+        free: (n,) drives that may move.
 
     Returns:
-        (6,) counts; None where the free motors cannot make this move, or only by turning far.
+        (n,) drive units; None where the free drives cannot make this move, or only by moving far.
 
     Source: least-norm solution of an underdetermined system (Golub and Van Loan, Matrix Computations, 5.6).
     """
-    turns = joints_per_count[:, free]
-    scale = 1.0 / np.linalg.norm(turns, axis=0)  # counts of a motor for one rad of joints
-    shares, *_ = np.linalg.lstsq(J @ turns * scale, move, rcond=None)
-    counts = np.zeros(len(free))
-    counts[free] = scale * shares
-    dq = joints_per_count @ counts
+    turns = (model.q_per_unit / model.radian[:, None])[:, free]
+    scale = 1.0 / np.linalg.norm(turns, axis=0)  # units of a drive for one rad of joints
+    shares, *_ = np.linalg.lstsq(J @ model.q_per_unit[:, free] * scale, move, rcond=None)
+    units = np.zeros(len(free))
+    units[free] = scale * shares
+    dq = model.q_per_unit @ units
     size = float(np.linalg.norm(move))
-    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq) > WORST_GAIN * size:
+    if np.linalg.norm(J @ dq - move) > _EXACT * size or np.linalg.norm(dq / model.radian) > WORST_GAIN * size:
         return None
-    return counts
+    return units

@@ -10,16 +10,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Chain, from_dh
-from canprobe.robot.model import ArmModel, Body, Joint
-from canprobe.robot.urdf import UrdfArm, from_urdf
+from canprobe.robot.chain import Array, Chain, dh_step, from_dh
+from canprobe.robot.model import ArmModel, Joint
+from canprobe.robot.urdf import Body, UrdfArm, from_urdf
 from canprobe.scene.geometry import transform
 from canprobe.scene.hardware import ArmSettings, JointSettings
 
-Array = NDArray[np.float64]
 Bodies = tuple[Body | None, ...]
 
 _MM = 1e-3
@@ -58,13 +56,16 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
     """
     mount, flange = transform(arm.mount_mm, arm.mount_deg), transform(arm.flange_mm, arm.flange_deg)
     if arm.urdf is not None:
-        found = from_urdf_file(arm, name)
+        found = from_urdf(arm.urdf, arm.base, arm.tip, name=name)
         _refuse_other_names(found, sections, arm)
         chain = _moved(found.chain, mount, flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
         bodies = found.bodies
     else:
-        rows = [(s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg)) for s in sections.values()]
+        rows = [
+            (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
+            for s in sections.values()
+        ]
         slides = [section.kind == "prismatic" for section in sections.values()]
         chain = from_dh(
             rows,
@@ -81,17 +82,13 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
     return model, bodies
 
 
-def from_urdf_file(arm: ArmSettings, name: str) -> UrdfArm:
-    """The arm in the URDF of a section."""
-    assert arm.urdf is not None
-    return from_urdf(arm.urdf, arm.base, arm.tip, name=name)
-
-
 def _refuse_other_names(found: UrdfArm, sections: Mapping[str, JointSettings], arm: ArmSettings) -> None:
     names = found.chain.joints
     if tuple(sections) != names:
         listed = ", ".join(sections) or "none"
-        raise PlanError([f"joints: expected the joints of {arm.urdf} in their order ({', '.join(names)}), got {listed}"])
+        raise PlanError(
+            [f"joints: expected the joints of {arm.urdf} in their order ({', '.join(names)}), got {listed}"]
+        )
     for joint, section in zip(found.joints, sections.values(), strict=True):
         kind = "prismatic" if joint.prismatic else "revolute"
         if section.kind != kind:
@@ -128,27 +125,26 @@ def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
     return scaled
 
 
-def _body(section: JointSettings, row: tuple[float, ...], arm: ArmSettings) -> Body | None:
+def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body | None:
     """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
     if section.mass_kg is None:
         return None
-    T = np.eye(4) if arm.convention == "modified" else behind_joint(row, section.kind == "prismatic")
+    T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
     xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
     tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
     R = T[:3, :3]
     return Body(section.mass_kg, R @ (np.array(section.com_mm) * _MM) + T[:3, 3], R @ tensor @ R.T)
 
 
-def behind_joint(row: tuple[float, ...], prismatic: bool) -> Array:
-    """(4, 4) of what a standard row holds besides the motion of its joint."""
-    raise NotImplementedError
-
-
 def start_posture(sections: Mapping[str, JointSettings]) -> Array:
     """(n,) start of each joint, rad or m."""
-    return np.array([s.start_mm * _MM if s.kind == "prismatic" else math.radians(s.start_deg) for s in sections.values()])
+    return np.array(
+        [s.start_mm * _MM if s.kind == "prismatic" else math.radians(s.start_deg) for s in sections.values()]
+    )
 
 
 def swing(sections: Mapping[str, JointSettings]) -> Array:
     """(n,) amplitude of each joint in free motion, rad or m."""
-    return np.array([s.swing_mm * _MM if s.kind == "prismatic" else math.radians(s.swing_deg) for s in sections.values()])
+    return np.array(
+        [s.swing_mm * _MM if s.kind == "prismatic" else math.radians(s.swing_deg) for s in sections.values()]
+    )

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import SceneError
-from canprobe.robot.kinematics import tool_z_offset
+from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
+from canprobe.scene.hardware import Vec3
 from canprobe.scene.load import Reader, read_toml
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, TaskSettings
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
@@ -40,12 +41,17 @@ def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
     )
 
 
+def transform(position_mm: Vec3, rotation_deg: Vec3) -> Array:
+    """(4, 4), m, of a position, mm, and roll, pitch and yaw about the fixed axes, deg."""
+    T = np.eye(4)
+    T[:3, :3] = rotation_rpy(*(math.radians(angle) for angle in rotation_deg))
+    T[:3, 3] = np.array(position_mm) * 1e-3
+    return T
+
+
 def T_base_object(settings: ObjectSettings) -> Array:
     """Pose of the object frame, (4, 4), m: origin on the surface, z outward."""
-    T = np.eye(4)
-    T[:3, :3] = rotation_rpy(*(math.radians(angle) for angle in settings.rotation_deg))
-    T[:3, 3] = np.array(settings.position_mm) * 1e-3
-    return T
+    return transform(settings.position_mm, settings.rotation_deg)
 
 
 def true_object(settings: ObjectSettings) -> PlacedShape:

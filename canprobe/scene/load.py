@@ -20,6 +20,7 @@ from typing import Any
 
 from canprobe.errors import SceneError
 from canprobe.scene.checks import MismatchError, Only, ScenePath, choices_of, conditions_of, convert
+from canprobe.scene.hardware import CellInfo
 from canprobe.scene.model import Cell, Scene
 from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 
@@ -82,7 +83,8 @@ def load_scene(name_or_path: str | Path, cell: str | Path | None = None) -> Scen
     """Read a scene.
 
     Args:
-        name_or_path: a packaged scene's name, such as `cylinder`, or the path of a TOML file.
+        name_or_path: a packaged scene's name, such as `cylinder`, or the path of a TOML file. A cell stands for a scene
+            that moves its arm freely.
         cell: name or path of the cell, in the place of the scene's own.
 
     Raises:
@@ -90,32 +92,40 @@ def load_scene(name_or_path: str | Path, cell: str | Path | None = None) -> Scen
     """
     name = str(name_or_path)
     packaged = packaged_files("scenes")
+    if name not in packaged and name in packaged_files("cells"):
+        packaged = packaged_files("cells")
     path = find_file(name, packaged, "scene")
     file = path.name if name in packaged else name
     return _scene(read_toml(path, file), file, path.parent, cell)
 
 
 def load_cell(name_or_path: str | Path) -> dict[str, Any]:
-    """Read a cell file.
+    """The document of a cell file, checked section by section, with absolute paths of the files beside it.
 
     Args:
         name_or_path: a packaged cell's name, such as `puma260`, or the path of a TOML file.
 
-    Returns:
-        Its document, checked section by section, with absolute paths of the files beside it.
-
     Raises:
         SceneError: with every problem found.
     """
+    return _read_cell(name_or_path)[1]
+
+
+def read_cell(name_or_path: str | Path) -> Cell:
+    """A cell file; as `load_cell`."""
+    return _read_cell(name_or_path)[0]
+
+
+def _read_cell(name_or_path: str | Path) -> tuple[Cell, dict[str, Any]]:
     name = str(name_or_path)
     packaged = packaged_files("cells")
     path = find_file(name, packaged, "cell")
     file = path.name if name in packaged else name
     document = read_toml(path, file)
     reader = Reader(path.parent)
-    reader.read(Cell, document)
+    sections = reader.read(Cell, document, ("cell",))
     reader.refuse(file)
-    return reader.with_paths(document)
+    return Cell(**sections), reader.with_paths(document)
 
 
 def find_file(name: str, packaged: Mapping[str, Path], what: str) -> Path:
@@ -143,7 +153,7 @@ def packaged_scenes() -> list[tuple[str, str]]:
 
 def packaged_cells() -> list[tuple[str, str]]:
     """Name and title of every packaged cell, by name."""
-    return [(name, load_cell(name)["cell"]["title"]) for name in packaged_files("cells")]
+    return [(name, read_cell(name).cell.title) for name in packaged_files("cells")]
 
 
 def packaged_files(folder: str) -> dict[str, Path]:
@@ -192,6 +202,8 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | P
 
     Everything is checked together.
     """
+    if _are_tables(own.get("cell")) and not {"scene", "task"} & set(own):
+        own = _free_scene(own)
     task = own.get("task")
     kind = task.get("kind") if isinstance(task, dict) else None
     needs = SECTIONS_OF_TASK.get(kind, {}) if isinstance(kind, str) else {}
@@ -217,6 +229,13 @@ def _scene(own: Mapping[str, Any], file: str, folder: Path | None, cell: str | P
         reader.complain(where, complaint)
     reader.refuse(file)
     return Scene(**values)
+
+
+def _free_scene(cell: Mapping[str, Any]) -> dict[str, Any]:
+    """A scene that moves the arm of a cell freely."""
+    used = {name: table for name, table in cell.items() if SECTIONS_OF_TASK["free"].get(name, ("",))[0] != "never"}
+    name = cell["cell"].get("name", CellInfo().name)
+    return {"scene": {"name": name}, "task": {"kind": "free"}, **used}
 
 
 def _with_cell(

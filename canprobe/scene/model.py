@@ -410,7 +410,7 @@ class Scene:
     cycle: CycleSettings = CycleSettings()
     limits: LimitSettings = LimitSettings()
     bring_up: BringUpSettings = BringUpSettings()
-    cell: CellInfo = CellInfo()
+    cell: CellInfo = CellInfo()  # noqa: RUF009 - frozen
     arm: ArmSettings | None = None
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
     sensor: SensorSettings | None = None

@@ -12,10 +12,9 @@ from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.arms import Bodies, arm_model, start_posture, swing
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
+from canprobe.scene.load import read_cell
 from canprobe.scene.model import (
     BridgeSettings,
-    Cell,
-    EmulateSettings,
     LimitSettings,
     PlantSettings,
     ProbeSettings,
@@ -191,6 +190,19 @@ def _shape(settings: ShapeSettings) -> Shape:
     return Shape(settings.method, settings.also, settings.memory_mm * MM, settings.every_ms * 1e-3, settings.patch)
 
 
+def _true_arm(scene: Scene, arm: Arm | None) -> tuple[ArmModel | None, Bodies]:
+    """The arm that is emulated, and the bodies of its links."""
+    if scene.arm is None or arm is None:
+        return None, ()
+    other = scene.plant.true_cell if scene.plant is not None else None
+    if other is None:
+        return arm.model, arm_model(scene.cell.name, scene.arm, scene.joints)[1]
+    cell = read_cell(other)
+    if cell.arm is None or len(cell.joints) != arm.model.n:
+        raise PlanError([f"plant.true_cell: expected a cell with an arm of {arm.model.n} joints, got {other}"])
+    return arm_model(cell.cell.name, cell.arm, cell.joints)
+
+
 def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
     plant = scene.plant or PlantSettings()
     try:
@@ -199,10 +211,11 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         raise PlanError([f"object: {error}"]) from error
     T_flange_there = probe.T_flange_probe.copy()
     T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
-    model = MODELS[plant.arm_model] if plant.arm_model is not None else arm.model if arm is not None else None
+    model, bodies = _true_arm(scene, arm)
     return Truth(
         object=shape,
-        model=model if arm is not None else None,
+        model=model,
+        bodies=bodies,
         T_flange_probe=T_flange_there,
         stiffness=plant.stiffness_n_m3 or probe.stiffness,
         damping=plant.contact_damping_s_m,

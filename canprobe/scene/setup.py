@@ -19,10 +19,11 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.robot.kinematics import PumaModel
+from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import BallApproach
+from canprobe.robot.urdf import Body
+from canprobe.scene.hardware import Auto
 from canprobe.scene.model import (
-    Auto,
     BridgeSettings,
     BringUpSettings,
     BusSettings,
@@ -76,7 +77,7 @@ class Arm:
         grouped: two targets share an RPDO through dummy mapping.
     """
 
-    model: PumaModel
+    model: ArmModel
     drives: tuple[Drive, ...]
     q_start: Floats
     missed_syncs: int
@@ -317,6 +318,7 @@ class Truth:
     Attributes:
         object: None where nothing can be touched.
         model: the arm; None without one.
+        bodies: of its links, None for one of unknown mass; for a dynamic arm.
         T_flange_probe: (4, 4) of the probe's centre.
         stiffness: K/h of its layer, N/m³.
         damping: Hunt–Crossley α, s/m.
@@ -328,7 +330,8 @@ class Truth:
     """
 
     object: PlacedShape | None
-    model: PumaModel | None
+    model: ArmModel | None
+    bodies: tuple[Body | None, ...]
     T_flange_probe: Floats
     stiffness: float
     damping: float

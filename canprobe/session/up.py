@@ -6,8 +6,6 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from canprobe.cell.controller import Measurement
 from canprobe.errors import NodeError, UsageError
 from canprobe.planning.make import make_plan
@@ -19,7 +17,7 @@ from canprobe.session.target import need_real_bus
 from canprobe.tasks.from_plan import make_task
 
 if TYPE_CHECKING:
-    from canprobe.robot.kinematics import PumaModel
+    from canprobe.robot.model import ArmModel
     from canprobe.tasks.untouched import JointFinding, Operator, Vector
 
 ROWS_OF_UP = 4000
@@ -93,11 +91,11 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
     """
     if scene.arm is None:
         raise UsageError(f"up --check-joints: scene {scene.name} has no [arm]")
-    from canprobe.robot.kinematics import MODELS
     from canprobe.tasks.untouched import JointCheck
 
     plan = make_plan(resolve(scene))
-    check = JointCheck(plan, operator)
+    assert plan.setup.arm is not None
+    arm, check = plan.setup.arm, JointCheck(plan, operator)
     try:
         with Session(plan, None, say, (), ROWS_OF_UP) as session:
             session.run(check)
@@ -105,21 +103,21 @@ def check_joints(scene: Scene, *, operator: Operator | None = None, say: Say = q
         for finding in check.findings:
             say(str(finding))
         if check.start is not None:
-            say(_zero_pose(MODELS[scene.arm.model], check.start))
+            say(_zero_pose(arm.model, check.start))
     wrong = [finding for finding in check.findings if finding.fault is not None]
     if wrong:
-        ids = scene.arm.node_ids
+        ids = arm.node_ids
         first, *others = [(ids[f.joint], f"(joint {f.joint + 1}) {f.fault}") for f in wrong]
         raise NodeError(first[0], "; ".join([first[1], *(f"node {node_id}: {text}" for node_id, text in others)]))
     return check.findings
 
 
-def _zero_pose(model: PumaModel, start: Vector) -> str:
+def _zero_pose(model: ArmModel, start: Vector) -> str:
     """Where the arm has to be if its zeros are right, for a look at its marks."""
-    from canprobe.robot.kinematics import forward
+    from canprobe.robot.chain import forward
 
-    angles = ", ".join(f"{angle:.2f}" for angle in np.degrees(start))
-    x, y, z = forward(model, start)[:3, 3] * 1e3
+    angles = ", ".join(f"{joint.shown(q):.2f}" for joint, q in zip(model.joints, start, strict=True))
+    x, y, z = forward(model.chain, start)[:3, 3] * 1e3
     return (
         f"by its encoders the arm stands at {angles} deg, its flange at x {x:.1f}, y {y:.1f}, z {z:.1f} mm: compare"
         " that with its marks; where it differs, a zero is wrong"

@@ -46,7 +46,8 @@ from canprobe.errors import CanprobeError, SafetyStop
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.results.summary import summarise
-from canprobe.robot.kinematics import MODELS, forward_jacobian
+from canprobe.robot.chain import forward_jacobian
+from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe
 from canprobe.scene.model import ServoSettings
 from canprobe.session.session import Session
@@ -104,30 +105,36 @@ def peak_of(session: Session) -> Peak | None:
     )
 
 
+def _model(session: Session) -> ArmModel:
+    arm = session.plan.setup.arm
+    assert arm is not None
+    return arm.model
+
+
 def _wrong_reach(session: Session) -> float:
     """How far (m) the probe sinks in where one motor moves as far in a cycle as its drive allows."""
     scene, period_ns = session.scene, session.plan.sync.period_ns
     assert scene.arm is not None and scene.probe is not None
-    model, share = MODELS[scene.arm.model], scene.limits.joint_speed_share
-    counts = [motor_speed_limit(model, axis, share, period_ns) * period_ns * 1e-9 for axis in range(6)]
+    model, share = _model(session), scene.limits.joint_speed_share
+    counts = [motor_speed_limit(model, axis, share, period_ns) * period_ns * 1e-9 for axis in range(model.n)]
     q = session.cell.log.arrays()["q_target_rad"]
     angles = q[np.isfinite(q).all(axis=1)][-1]
-    T, J = forward_jacobian(model, angles, T_flange_probe(scene.probe))
-    return float(np.abs(T[:3, 2] @ J[:3] @ model.joints_per_count * counts).max())
+    T, J = forward_jacobian(model.chain, angles, T_flange_probe(scene.probe))
+    return float(np.abs(T[:3, 2] @ J[:3] @ model.q_per_unit * counts).max())
 
 
 def _torn_speeds(session: Session) -> NDArray[np.float64]:
     """Greatest speeds (7,), m/s, at which the probe sinks in while 0…6 joints stand still and the others move."""
     scene = session.scene
     assert scene.arm is not None and scene.probe is not None
-    model, flange_probe = MODELS[scene.arm.model], T_flange_probe(scene.probe)
+    model, flange_probe = _model(session), T_flange_probe(scene.probe)
     columns = session.cell.log.arrays()
     q, phase = columns["q_target_rad"], columns["phase"]
     near = (phase >= Phase.APPROACH) & (phase <= Phase.RETREAT)
     rates = np.diff(q, axis=0) / (session.plan.sync.period_ns * 1e-9)
-    greatest = np.zeros(7)
+    greatest = np.zeros(model.n + 1)
     for angles, rate in zip(q[1:][near[1:]], rates[near[1:]], strict=True):
-        T, J = forward_jacobian(model, angles, flange_probe)
+        T, J = forward_jacobian(model.chain, angles, flange_probe)
         shares = T[:3, 2] @ J[:3] * rate
         missing = np.sort(np.maximum(-shares, 0.0))[::-1]
         greatest = np.maximum(greatest, shares.sum() + np.concatenate([[0.0], np.cumsum(missing)]))

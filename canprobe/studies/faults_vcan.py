@@ -254,16 +254,15 @@ class _Run:
 
     def _ask(self, index: int) -> dict[int, int]:
         """An object of each drive; empty where one does not answer."""
-        arm = served_scene().arm
-        assert arm is not None
+        drives = served_scene().drives
         port = self._open()
         answers: dict[int, int] = {}
         try:
-            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in arm.node_ids}
+            dialogues = {node_id: _read(index, node_id, answers.__setitem__) for node_id in drives}
             hold_dialogues(PumpedNetwork(port), dialogues, timeout_s=1.0, retries=1)
         finally:
             port.close()
-        return answers if len(answers) == len(arm.node_ids) else {}
+        return answers if len(answers) == len(drives) else {}
 
 
 def score_end(fault: ProcessFault, status: int | None, folder: Path) -> list[str]:

@@ -22,11 +22,13 @@ from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.ideal_arm import natural_frequency
 from canprobe.errors import PlanError, SafetyStop
 from canprobe.protocol.frames import Frame
+from canprobe.robot.chain import forward
 from canprobe.robot.inverse import inverse_near
-from canprobe.robot.kinematics import MODELS, forward
+from canprobe.robot.model import ArmModel
 from canprobe.scene.geometry import T_flange_probe, true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, PlantSettings, ProbeSettings, Scene, ServoSettings
+from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session, resolve_scene
 from canprobe.studies.fault_scores import RELEASE_NS, Witness, longest_above, reaction_ns, run_to_end
 from canprobe.studies.harness import Array, Row
@@ -259,22 +261,29 @@ def _object(case: Case) -> ObjectSettings:
     return ObjectSettings(kind=case.kind, radius_mm=radius, position_mm=case.at_mm, rotation_deg=upright(case.normal))  # type: ignore[arg-type]
 
 
+def arm_of(scene: Scene) -> ArmModel:
+    """The arm of a scene that has one."""
+    arm = resolve(scene).arm
+    assert arm is not None
+    return arm.model
+
+
 def touch_in_posture(
     posture_deg: tuple[float, ...], above_mm: float = 10.0
 ) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, ...]]:
     """A touch with the pole of the default probe and these joint angles, deg.
 
     Returns:
-        Where it is, mm; the outward normal there; joint angles (6,) so far above it, deg.
+        Where it is, mm; the outward normal there; joint angles (n,) so far above it, deg.
     """
-    model, probe = MODELS["upenn"], ProbeSettings()
+    model, probe = arm_of(load_scene("press")), ProbeSettings()
     q = np.radians(posture_deg)
     T_flange_centre = T_flange_probe(probe)
-    T = forward(model, q) @ T_flange_centre
+    T = forward(model.chain, q) @ T_flange_centre
     pole = T[:3, 2]
     above = T.copy()
     above[:3, 3] -= above_mm * 1e-3 * pole
-    away = np.degrees(inverse_near(model, above @ np.linalg.inv(T_flange_centre), q))
+    away = np.degrees(inverse_near(model, above, T_flange_centre, q))
     at = 1e3 * T[:3, 3] + probe.radius_mm * pole
     x, y, z = (float(value) for value in at)
     nx, ny, nz = (-float(value) for value in pole)
@@ -308,7 +317,10 @@ def scene_of(case: Case) -> Scene:
         bus=replace(scene.bus, timed=False),
         cycle=replace(scene.cycle, rate_hz=case.rate_hz),
         limits=replace(scene.limits, joint_margin_deg=0.5),
-        arm=replace(scene.arm, start_deg=case.posture_deg),  # type: ignore[arg-type]
+        joints={
+            name: replace(joint, start_deg=start)
+            for (name, joint), start in zip(scene.joints.items(), case.posture_deg, strict=True)
+        },
         sensor=replace(
             scene.sensor,
             rate_hz=min(SENSOR_HZ, case.rate_hz),
@@ -355,7 +367,7 @@ def stated_sensing(scene: Scene, kind: type[ContactSensing] = StatedSensing) -> 
     assert scene.arm is not None and scene.probe is not None and scene.sensor is not None
     radius = scene.probe.radius_mm * 1e-3
     return kind(
-        MODELS[scene.arm.model],
+        arm_of(scene),
         T_flange_probe(scene.probe),
         array_calibration(scene.sensor.full_scale_kpa * 1e3, radius),
         radius,

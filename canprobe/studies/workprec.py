@@ -30,8 +30,10 @@ from canprobe.emulator.plant.plant import Plant, PlantState
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
+from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.inverse import inverse_near, probe_pose, start_posture
-from canprobe.robot.kinematics import UPENN, counts_per_radian, counts_to_joints, joints_to_counts, tool_z_offset
+from canprobe.robot.model import joints_to_units, units_per_motor, units_to_joints
+from canprobe.robot.puma import UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -45,6 +47,7 @@ CYCLE_NS = 2_500_000
 SPEED_M_S, FORCE_N = 0.025, 2.0
 NUDGE_COUNTS, AT_REST_COUNTS_S = 5.0, 20.0
 _POINT, _TOOL, _RADIUS = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0), 0.036
+_NEAR = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
 
 
 @cache
@@ -54,7 +57,7 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
     pose[:3, 3] = _POINT
     shape = make_object("cylinder", T_base_object=pose, radius=_RADIUS)
     depth = depth_for_force(FORCE_N, (1.0 / _RADIUS, 0.0), 0.040, stiffness_n_m3)
-    q = start_posture(UPENN, _POINT, (0, 0, 1), radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
+    q = start_posture(UPENN, _POINT, (0, 0, 1), _NEAR, radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
     config = PlantConfig(
         UPENN, q, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=TaxelConfig()
     )
@@ -63,10 +66,10 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
         turn = SPEED_M_S * k * CYCLE_NS * 1e-9 / _RADIUS
         normal = np.array((0.0, math.sin(turn), math.cos(turn)))
         point = _POINT + _RADIUS * (normal - (0.0, 0.0, 1.0))
-        q = inverse_near(UPENN, probe_pose(point, normal, 0.040 - depth, (1, 0, 0)) @ np.linalg.inv(_TOOL), q)
-        targets.append(np.rint(joints_to_counts(UPENN, q)))
+        q = inverse_near(UPENN, probe_pose(point, normal, 0.040 - depth, (1, 0, 0)), _TOOL, q)
+        targets.append(np.rint(joints_to_units(UPENN, q)))
     counts = np.array(targets)
-    start = counts_to_joints(UPENN, counts[0])  # a posture that the encoders can hold
+    start = units_to_joints(UPENN, counts[0])  # a posture that the encoders can hold
     return PlantConfig(
         UPENN, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=config.taxels
     ), counts
@@ -111,7 +114,7 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     from scipy.integrate import solve_ivp
 
     config, targets = trial(stiffness_n_m3, cycles)
-    equations, scale = make_equations(config, held=False), counts_per_radian(UPENN)
+    equations, scale = make_equations(config, held=False), units_per_motor(UPENN)
     h, seen = CYCLE_NS * 1e-9, []
     y = equations.resting(targets[0] / scale)
     for k in range(cycles):

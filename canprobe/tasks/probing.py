@@ -15,8 +15,8 @@ from canprobe.cell.controller import Command, Measurement, TactileSample
 from canprobe.cell.supervision import Contact, limits_of
 from canprobe.cell.supervisor import outside_workspace
 from canprobe.planning.model import Plan
-from canprobe.robot.inverse import damped_step
-from canprobe.robot.kinematics import forward_jacobian
+from canprobe.robot.chain import forward_jacobian
+from canprobe.robot.inverse import damped_step, in_rows, task_rows
 from canprobe.scene.setup import Arm, Probe, SafetyLimits
 from canprobe.tasks.sensing import ContactSensing
 from canprobe.tasks.task import Task, TaskRecord
@@ -33,19 +33,22 @@ if TYPE_CHECKING:
 Vector = NDArray[np.float64]
 SMALL_STEP = 0.01
 """Joint step of one cycle (rad) below which the exact inverse is taken: 230 deg/s at 400 Hz."""
+REST_HZ = 1.0
+"""How fast more joints than a pose needs go back to the posture they began with."""
 
 
 class ProbeMotion:
-    """Keeps the commanded joint angles of a probe whose pose is asked for cycle by cycle.
+    """Keeps the commanded joint positions of a probe whose pose is asked for cycle by cycle.
 
     Each cycle one damped step from the *commanded* joints, never from the measured ones: encoder noise stays out of the
-    command, and the step is small enough that its second-order error is gone in the next cycle.
+    command, and the step is small enough that its second-order error is gone in the next cycle. An arm follows the rows
+    of the pose that it can hold (`task_rows`).
 
     Args:
         arm, probe: what moves.
         safety: what joints and probe must keep to.
         period_s: of the cycle.
-        q: joint angles to start from (6,), rad.
+        q: joint positions to start from (n,), rad or m; more than six joints stay near them.
 
     Attributes:
         limit: what a joint or the workspace forbids; None where nothing does.
@@ -55,12 +58,15 @@ class ProbeMotion:
     def __init__(self, arm: Arm, probe: Probe, safety: SafetyLimits, period_s: float, q: Vector) -> None:
         self.q = np.array(q, dtype=float)
         self._model = model = arm.model
+        self._rows = task_rows(model)
         self._flange_probe = flange_probe = probe.T_flange_probe
         self._workspace, self._radius = safety.workspace, probe.radius
         self._step_max: list[float] = (model.qd_max * safety.speed_share * period_s).tolist()
-        self._low, self._high = model.q_min + safety.joint_margin, model.q_max - safety.joint_margin
+        self._rest, self._rest_share = self.q, 2.0 * math.pi * REST_HZ * period_s
+        margin = safety.joint_margin * model.radian
+        self._low, self._high = model.q_min + margin, model.q_max - margin
         self._range: list[tuple[float, float]] = list(zip(self._low.tolist(), self._high.tolist(), strict=True))
-        self.pose_matrix, _ = forward_jacobian(model, self.q, flange_probe)
+        self.pose_matrix, _ = forward_jacobian(model.chain, self.q, flange_probe)
         self._x_reference: tuple[float, float, float] = tuple(self.pose_matrix[:3, 0].tolist())
         self.limit: str | None = None
         self.slowed = 0
@@ -71,12 +77,17 @@ class ProbeMotion:
         return ProbePose(self.pose_matrix[:3, 3], self.pose_matrix[:3, 2])
 
     def step(self, pose: ProbePose) -> Vector:
-        """Joint targets (6,), rad, one step nearer to ``pose``."""
-        T, J = forward_jacobian(self._model, self.q, self._flange_probe)
+        """Joint targets (n,), rad or m, one step nearer to ``pose``."""
+        T, J = forward_jacobian(self._model.chain, self.q, self._flange_probe)
         self.pose_matrix = T
         if self._workspace is not None:
             self.limit = outside_workspace(T[:3, 3] + self._radius * T[:3, 2], self._workspace)
-        twist = _pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
+        twist: tuple[float, ...] | Vector
+        if self._rows == 6:
+            twist = _pose_error(T.tolist(), pose.centre.tolist(), pose.pole.tolist(), self._x_reference)
+        else:
+            R, six = T[:3, :3], np.concatenate((pose.centre - T[:3, 3], np.cross(T[:3, 2], pose.pole)))
+            J, twist = in_rows(self._rows, R, J), in_rows(self._rows, R, six)
         dq = self._increment(J, twist)
         share = max([abs(step) / most for step, most in zip(dq.tolist(), self._step_max, strict=True)])
         if share > 1.0:
@@ -87,17 +98,18 @@ class ProbeMotion:
             self._stop_at_limit()
         return self.q
 
-    def _increment(self, J: Vector, twist: tuple[float, ...]) -> Vector:
+    def _increment(self, J: Vector, twist: tuple[float, ...] | Vector) -> Vector:
         """The exact step; the damped one where the exact step would be no small one, as near a singular pose."""
-        _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
-        if info == 0 and max(map(abs, dq.tolist())) < SMALL_STEP:
-            exact: Vector = dq
-            return exact
-        return damped_step(J, np.array(twist))
+        if J.shape[0] == J.shape[1]:
+            _, _, dq, info = dgesv(J, twist)  # LAPACK itself: numpy's wrapper costs four times as much
+            if info == 0 and max(map(abs, dq.tolist())) < SMALL_STEP:
+                exact: Vector = dq
+                return exact
+        return damped_step(J, np.asarray(twist), self._rest_share * (self._rest - self.q))
 
     def _stop_at_limit(self) -> None:
         joint = int(np.flatnonzero((self.q < self._low) | (self.q > self._high))[0])
-        self.limit = f"joint {joint + 1} at {math.degrees(self.q[joint]):.1f} deg, its stop"
+        self.limit = f"joint {joint + 1} at {self._model.joints[joint].text(self.q[joint])}, its stop"
         self.q = np.clip(self.q, self._low, self._high)
 
 

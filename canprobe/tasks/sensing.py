@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Measurement, TactileSample
-from canprobe.robot.kinematics import PumaModel, count_sigma, forward
+from canprobe.robot.chain import forward
+from canprobe.robot.model import ArmModel, position_sigma
 from canprobe.touch.contact import ContactSample, contact_sample, indentation_from_force, stiffness_from_slope
 from canprobe.touch.patch.image import Patch, PatchCalibration, mended
 from canprobe.touch.patch.moments import Lag, MomentImage, Moments, PadLag
@@ -43,17 +44,17 @@ class JointHistory:
         self._joints: deque[Vector] = deque(maxlen=HISTORY)
 
     def add(self, t_ns: int, q: Vector) -> None:
-        """Remember joint angles (6,), rad, at ``t_ns``; times must increase."""
+        """Remember joint angles (n,), rad or m, at ``t_ns``; times must increase."""
         self._times.append(t_ns)
         self._joints.append(q)
 
     @property
     def newest(self) -> Vector:
-        """Joint angles (6,), rad, that were added last."""
+        """Joint angles (n,), rad or m, that were added last."""
         return self._joints[-1]
 
     def at(self, t_ns: int) -> Vector | None:
-        """Joint angles (6,), rad, at ``t_ns``, linear between SYNCs; None outside the history."""
+        """Joint angles (n,), rad or m, at ``t_ns``, linear between SYNCs; None outside the history."""
         if not self._times or not self._times[0] <= t_ns <= self._times[-1]:
             return None
         for i in range(len(self._times) - 1, -1, -1):
@@ -91,7 +92,7 @@ class ContactSensing:
 
     def __init__(
         self,
-        model: PumaModel,
+        model: ArmModel,
         flange_probe: Vector,
         calibration: PatchCalibration,
         radius: float,
@@ -124,7 +125,7 @@ class ContactSensing:
 
     def position_sigma(self, direction: Vector) -> float:
         """Standard deviation of the probe's position along a unit vector (3,), m: joints come in whole counts."""
-        return count_sigma(self.model, self._history.newest, self.flange_probe, direction)
+        return position_sigma(self.model, self._history.newest, self.flange_probe, direction)
 
     def set_kappa(self, kappa: Vector, sigma: float = 0.0) -> None:
         """Take the object's principal curvatures (2,), 1/m, as the estimator knows them.
@@ -169,7 +170,7 @@ class ContactSensing:
         if q is None:
             self.dropped += 1
             return None
-        T_base_probe = forward(self.model, q) @ self.flange_probe
+        T_base_probe = forward(self.model.chain, q) @ self.flange_probe
         t_s, uv = sample.t_sample_ns * 1e-9, (patch.u, patch.v)
         return contact_sample(
             t_s=t_s,

@@ -15,7 +15,6 @@ from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.cell.supervisor import JointGuard
 from canprobe.planning.model import Plan
-from canprobe.robot.kinematics import joints_to_counts
 from canprobe.tasks.probing import smooth_step
 from canprobe.tasks.task import Task, TaskRecord
 from canprobe.touch.patch.image import PatchCalibration
@@ -29,7 +28,7 @@ class FreeTask(Task):
     """Swing every joint sinusoidally about where it stood, with a soft start and end.
 
     Args:
-        amplitude: of each joint (6,), rad.
+        amplitude: of each joint (n,), rad or m.
         swing_period_s: of the swing.
         duration_s: of the whole task.
         period_s: of the cycle.
@@ -128,10 +127,11 @@ class JointFinding:
     """What became of one joint.
 
     Attributes:
-        joint: 0 to 5.
-        start_deg: where it stood.
+        joint: from 0.
+        start_deg: where it stood; this and the next two are mm for a prismatic joint.
         asked_deg: the way of its target; 0 where it was not moved.
         moved_deg: how far it turned, by its own motor's encoder.
+        unit: deg or mm.
         fault: what is wrong; None where nothing is.
         skipped: why it was not moved; None where it was.
     """
@@ -142,12 +142,13 @@ class JointFinding:
     moved_deg: float = 0.0
     fault: str | None = None
     skipped: str | None = None
+    unit: str = "deg"
 
     def __str__(self) -> str:
-        where = f"joint {self.joint + 1} at {self.start_deg:.2f} deg: "
+        where = f"joint {self.joint + 1} at {self.start_deg:.2f} {self.unit}: "
         if self.skipped is not None:
             return where + f"not moved, {self.skipped}"
-        way = f"asked {self.asked_deg:+.2f} deg, turned {self.moved_deg:+.2f} deg"
+        way = f"asked {self.asked_deg:+.2f} {self.unit}, turned {self.moved_deg:+.2f} {self.unit}"
         return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
@@ -155,8 +156,8 @@ def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
     """What is wrong with the motors' ways, the joint's own first; None where nothing is.
 
     Args:
-        joint: that was to turn, 0 to 5.
-        asked, moved: ways of the motors (6,), counts.
+        joint: that was to turn, from 0.
+        asked, moved: ways of the motors (n,), drive units.
     """
     tolerance = np.maximum(TOLERANCE * np.abs(asked), TOLERANCE_COUNTS)
     wrong = np.abs(moved - asked) > tolerance
@@ -198,7 +199,7 @@ class JointCheck(Controller):
 
     Attributes:
         findings: one for each joint that its turn has come to.
-        start: joint angles (6,), rad, before any motion; None as long as they are not known.
+        start: joint positions (n,), rad or m, before any motion; None as long as they are not known.
     """
 
     def __init__(self, plan: Plan, operator: Operator | None) -> None:
@@ -219,16 +220,16 @@ class JointCheck(Controller):
             return Command(done=True)
 
     def inspect(self, q: Vector) -> str | None:
-        """Why an arm that stands at joint angles (6,), rad, must not be enabled."""
+        """Why an arm that stands at joint positions (n,), rad or m, must not be enabled."""
         self.start = q
         outside = np.flatnonzero((q < self._guard.low) | (q > self._guard.high))
         if not outside.size:
             return None
         joint = int(outside[0])
-        low, high = np.degrees((self._guard.low[joint], self._guard.high[joint]))
+        its = self._model.joints[joint]
         return (
-            f"joint {joint + 1} stands at {math.degrees(q[joint]):.1f} deg, outside {low:.1f} to {high:.1f} deg:"
-            " move it there by hand, or its zero is wrong"
+            f"joint {joint + 1} stands at {its.text(q[joint])}, outside {its.shown(self._guard.low[joint]):.1f} to "
+            f"{its.text(self._guard.high[joint])}: move it there by hand, or its zero is wrong"
         )
 
     def _all_joints(self) -> Generator[Command, Measurement, None]:
@@ -244,32 +245,35 @@ class JointCheck(Controller):
 
     def _joint(self, joint: int, start: Vector) -> Generator[Command, Measurement, JointFinding | None]:
         """Ask, move, look, ask, move back; None where the operator has enough before it has moved."""
-        degrees = math.degrees(start[joint])
+        its, units_per_q = self._model.joints[joint], self._model.units_per_q
+        stood, unit = its.shown(start[joint]), its.unit
         way = self._way(joint, start)
         if way is None:
-            return JointFinding(joint, degrees, skipped="either way it would leave its limits or the workspace")
-        told = math.degrees(way[joint])
-        question = f"joint {joint + 1} at {degrees:.2f} deg: turn it by {told:+.2f} deg?"
+            why = "either way it would leave its limits or the workspace"
+            return JointFinding(joint, stood, skipped=why, unit=unit)
+        told = its.shown(way[joint])
+        question = f"joint {joint + 1} at {its.text(start[joint], '.2f')}: turn it by {told:+.2f} {unit}?"
         if (yield from self._asked(question, start)) is not Answer.YES:
-            return None if self._quits else JointFinding(joint, degrees, skipped="as the operator wished")
+            return None if self._quits else JointFinding(joint, stood, skipped="as the operator wished", unit=unit)
         before = yield from self._hold(start)
         measured = yield from self._move(start, start + way)
         assert before.q is not None and measured.q is not None
-        moved = joints_to_counts(self._model, measured.q - before.q)
-        fault = find_fault(joint, joints_to_counts(self._model, way), moved)
-        seen = f"did joint {joint + 1} turn by about {told:+.1f} deg, positive by the right hand round its axis?"
+        moved = units_per_q @ (measured.q - before.q)
+        fault = find_fault(joint, units_per_q @ way, moved)
+        positive = "along" if its.prismatic else "by the right hand round"
+        seen = f"did joint {joint + 1} turn by about {told:+.1f} {unit}, positive {positive} its axis?"
         answer = yield from self._asked(seen, start + way)
         yield from self._move(start + way, start)
         if answer is Answer.NO and fault is None:
             fault = "the operator did not see it turn that way: polarity, gear or another joint's drive"
-        turned = math.degrees(float(moved[joint] / self._model.counts[joint, joint]))
-        return JointFinding(joint, degrees, told, turned, fault)
+        turned = its.shown(float(moved[joint] / units_per_q[joint, joint]))
+        return JointFinding(joint, stood, told, turned, fault, unit=unit)
 
     def _way(self, joint: int, start: Vector) -> Vector | None:
-        """The change of the joint angles (6,), rad: forwards, or else backwards; None where there is no room."""
+        """The change of the joints (n,), rad or m: forwards, or else backwards; None where there is no room."""
         for angle in (ANGLE, -ANGLE):
             way = np.zeros_like(start)
-            way[joint] = angle
+            way[joint] = angle * self._model.radian[joint]
             goal = start + way
             if self._guard.low[joint] <= goal[joint] <= self._guard.high[joint] and self._guard.outside(goal) is None:
                 return way

@@ -5,14 +5,16 @@ Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, imag
 
 import numpy as np
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
+from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.dynamics import RigidBody, puma260_inertia
 from canprobe.robot.inverse import damped_step, inverse_near, start_posture
-from canprobe.robot.kinematics import ELBOW_FORM, UPENN, forward, forward_jacobian, tool_z_offset
+from canprobe.robot.puma import UPENN
 from canprobe.touch.objects import make_object
 
 POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
@@ -22,7 +24,7 @@ SHAPES = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y"
 
 
 def plant_of(fidelity):
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
     shape = make_object("cylinder", T_base_object=POSE, radius=0.036)
     return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity))
 
@@ -33,19 +35,19 @@ def plant():
 
 
 def test_bench_forward(benchmark):
-    benchmark(forward, UPENN, ELBOW_FORM)
+    benchmark(forward, UPENN.chain, ELBOW_FORM)
 
 
 def test_bench_forward_jacobian(benchmark):
-    benchmark(forward_jacobian, UPENN, ELBOW_FORM, TOOL)
+    benchmark(forward_jacobian, UPENN.chain, ELBOW_FORM, TOOL)
 
 
 def test_bench_inverse_near(benchmark):
-    benchmark(inverse_near, UPENN, forward(UPENN, ELBOW_FORM), ELBOW_FORM)
+    benchmark(inverse_near, UPENN, forward(UPENN.chain, ELBOW_FORM), np.eye(4), ELBOW_FORM)
 
 
 def test_bench_damped_step(benchmark):
-    benchmark(damped_step, forward_jacobian(UPENN, ELBOW_FORM, TOOL)[1], np.ones(6))
+    benchmark(damped_step, forward_jacobian(UPENN.chain, ELBOW_FORM, TOOL)[1], np.ones(6))
 
 
 @pytest.mark.parametrize("kind", SHAPES)

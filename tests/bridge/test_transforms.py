@@ -9,16 +9,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from canprobe.bridge.sample import flange_transform, link_transforms, quaternion_of
-from canprobe.robot.kinematics import MODELS, forward
+from canprobe.robot.chain import forward
+from canprobe.robot.puma import MODELS
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 def test_the_chain_of_links_ends_at_the_flange(model):
     for q in np.random.default_rng(2).uniform(model.q_min, model.q_max, (50, 6)):
-        links = [*link_transforms(model, q), flange_transform()]
+        links = [*link_transforms(model.chain, q), flange_transform(model.chain)]
         assert [child for _, child, _ in links[:-1]] == [parent for parent, _, _ in links[1:]]
         product = reduce(np.matmul, (T for _, _, T in links))
-        np.testing.assert_allclose(product, forward(model, q), atol=1e-12)
+        np.testing.assert_allclose(product, forward(model.chain, q), atol=1e-12)
 
 
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))

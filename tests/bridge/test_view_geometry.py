@@ -15,7 +15,8 @@ from canprobe.bridge.view import bodies as taxels
 from canprobe.bridge.view import meshes
 from canprobe.bridge.view import meshes as colours
 from canprobe.emulator.plant.taxels import pad_coordinates
-from canprobe.robot.kinematics import MODELS, chain, forward, tool_z_offset
+from canprobe.robot.chain import forward, posture, tool_z_offset
+from canprobe.robot.puma import MODELS, dh_rows
 from canprobe.touch.linear_algebra import homogeneous, tangent_rotation
 from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 
@@ -90,15 +91,13 @@ def test_moving_keeps_faces_outside():
 @MODEL
 @pytest.mark.parametrize("q", QS[:6])
 def test_link_frames_end_at_the_flange_and_pass_the_wrist(model, q):
-    frames = arm.link_frames(model, q)
-    assert frames[6] == pytest.approx(forward(model, q), abs=1e-14)
-    c = chain(model, q)
-    assert frames[4][:3, 3] == pytest.approx(c.wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(
-        c.wrist, abs=1e-14
-    )
-    assert frames[1][:3, 2] == pytest.approx(c.axis2, abs=1e-14) and frames[3][:3, 2] == pytest.approx(
-        c.axis4, abs=1e-14
-    )
+    frames = arm.link_frames(model.chain, q)
+    assert frames[6] == pytest.approx(forward(model.chain, q), abs=1e-14)
+    c = posture(model.chain, q)
+    wrist = c.origins[4]
+    assert frames[4][:3, 3] == pytest.approx(wrist, abs=1e-14) and frames[5][:3, 3] == pytest.approx(wrist, abs=1e-14)
+    assert frames[1][:3, 2] == pytest.approx(c.axes[1], abs=1e-14)
+    assert frames[3][:3, 2] == pytest.approx(c.axes[3], abs=1e-14)
 
 
 @MODEL
@@ -125,16 +124,18 @@ def test_joints_lie_in_the_bodies_that_they_join(model):
         return winding(part.mesh.moved(frames[part.frame]), point) > 0.5
 
     for q in QS:
-        frames, c = arm.link_frames(model, q), chain(model, q)
-        axis, side = np.array(c.axis2), math.copysign(1.0, model.links[2])
-        shoulder = np.array([0.0, 0.0, c.d1])
-        beam = side * (abs(model.links[2]) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
+        frames, c = arm.link_frames(model.chain, q), posture(model.chain, q)
+        axis, offset = np.array(c.axes[1]), float(dh_rows(model)[1:3, 2].sum())
+        shoulder, wrist = np.array([0.0, 0.0, dh_rows(model)[0, 2]]), np.array(c.origins[4])
+        elbow = np.array(c.origins[2]) - dh_rows(model)[1, 2] * axis  # in the plane of joint 1's axis
+        side = math.copysign(1.0, offset)
+        beam = side * (abs(offset) - 0.5 * arm.FOREARM - 0.004 - 0.5 * arm.UPPER_ARM)
         assert inside("shoulder", frames, shoulder)
         assert inside("upper_arm", frames, shoulder + beam * axis)  # round joint 2
-        assert inside("upper_arm", frames, np.array(c.elbow) + beam * axis)  # round joint 3
-        assert inside("forearm", frames, np.array(c.elbow) + model.links[2] * axis)
-        assert inside("wrist", frames, np.array(c.wrist)) and inside("hub", frames, np.array(c.wrist))
-        assert not inside("forearm", frames, np.array(c.wrist) + 0.04 * np.array(c.axis4))
+        assert inside("upper_arm", frames, elbow + beam * axis)  # round joint 3
+        assert inside("forearm", frames, elbow + offset * axis)
+        assert inside("wrist", frames, wrist) and inside("hub", frames, wrist)
+        assert not inside("forearm", frames, wrist + 0.04 * np.array(c.axes[3]))
 
 
 def test_the_two_published_arms_differ_where_their_numbers_do():

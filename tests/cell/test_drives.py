@@ -8,7 +8,8 @@ from canprobe.cell.drives import BASE_COUNTS, CARRIED_CYCLES, STEADY, DriveAxis,
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
-from canprobe.robot.kinematics import MODELS, joints_to_counts
+from canprobe.robot.model import joints_to_units
+from canprobe.robot.puma import MODELS
 
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
@@ -41,7 +42,7 @@ def test_joint_angles_come_back_through_the_coupled_wrist():
     q = np.array((0.3, -0.2, 0.1, 0.5, -0.4, 1.0))
     group = make_group()
     group.begin(0)
-    hear(group, joints_to_counts(MODEL, q))
+    hear(group, joints_to_units(MODEL, q))
     assert group.complete
     assert group.joints() == pytest.approx(q, abs=2e-4)
     assert group.torque_permille == [-7] * 6
@@ -57,7 +58,7 @@ def test_a_drive_without_torque_in_its_tpdo_is_heard_like_the_others(torque, tol
 
 
 def test_wrist_motors_turn_with_joint_4():
-    counts = joints_to_counts(MODEL, np.array((0, 0, 0, 2 * np.pi, 0, 0)))
+    counts = joints_to_units(MODEL, np.array((0, 0, 0, 2 * np.pi, 0, 0)))
     assert counts[4] == pytest.approx(-9.8462 * 800, rel=1e-6)
     assert counts[5] == pytest.approx(1.0 * 800, rel=1e-6)
 
@@ -76,7 +77,7 @@ def test_a_tpdo_twice_or_after_the_window_is_late_and_not_used():
     group.end_collect()
     assert group.missed == 1
     assert group.ages() == (0, 0, 1, 0, 0, 0)
-    counts = joints_to_counts(MODEL, group.joints())
+    counts = joints_to_units(MODEL, group.joints())
     assert counts == pytest.approx([15, 15, 10, 15, 15, 15], abs=1e-6)
 
 

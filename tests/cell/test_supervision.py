@@ -16,7 +16,7 @@ from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
 from canprobe.protocol.cia402 import DriveState
 from canprobe.protocol.frames import HEARTBEAT_BASE, NmtState
-from canprobe.robot.kinematics import MODELS
+from canprobe.robot.puma import MODELS
 from canprobe.scene.setup import SafetyLimits
 
 LIMITS = Limits(SafetyLimits(5.0, 0.15, 0.0, 1.0, 0.8, None), period_ns=2_500_000)

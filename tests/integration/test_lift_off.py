@@ -58,7 +58,7 @@ def test_the_probe_is_taken_off(what):
     assert 0.95 * WAY < back < 1.2 * WAY and aside < 0.05 * WAY, "without a sensor the task begins to retreat by itself"
     assert any(fault.startswith("lift off, at ") for fault in run.session.cell.faults)
     if what.startswith("joint"):
-        motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.counts.T
+        motors = run.session.truth["q"][run.at :] @ run.session.cell.drives._model.units_per_q.T
         lost = int(what.split()[1]) - 1
         turned = np.ptp(motors, axis=0)
         assert turned[lost] < 30, "it stood still"

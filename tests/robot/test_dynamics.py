@@ -4,8 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
+from canprobe.robot.chain import forward_jacobian, tool_z_offset
 from canprobe.robot.dynamics import LinkInertia, RigidBody, ball_inertia, puma260_inertia
-from canprobe.robot.kinematics import MODELS, UPENN, forward_jacobian, tool_z_offset
+from canprobe.robot.puma import MODELS, UPENN, dh_rows
 
 TOOL = tool_z_offset(80.0)
 BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
@@ -29,7 +30,9 @@ def in_mujoco(model, links):
     """The same arm for MuJoCo: a body frame is the Denavit-Hartenberg frame before, turned by the joint."""
     words = lambda values: " ".join(repr(float(v)) for v in values)  # noqa: E731
     pose, bodies = "", ""
-    for (a, alpha, d), mass, com, tensor in zip(model.dh, links.mass, links.com, links.tensor, strict=True):
+    for (a, alpha, d), mass, com, tensor in zip(
+        dh_rows(model)[:, :3], links.mass, links.com, links.tensor, strict=True
+    ):
         c, s = np.cos(alpha), np.sin(alpha)
         R = np.array(((1, 0, 0), (0, c, -s), (0, s, c)))
         T = R @ tensor @ R.T
@@ -66,7 +69,7 @@ def test_pose_and_jacobian_are_those_of_mujoco(model):
     for q in rng.uniform(-3.0, 3.0, (20, 6)):
         data.qpos[:] = q
         mujoco.mj_forward(made, data)
-        T, J = forward_jacobian(model, q, np.eye(4))
+        T, J = forward_jacobian(model.chain, q, np.eye(4))
         linear, angular = np.zeros((3, 6)), np.zeros((3, 6))
         mujoco.mj_jacSite(made, data, linear, angular, 0)
         assert T[:3, 3] == pytest.approx(data.site_xpos[0], abs=1e-10)
@@ -89,7 +92,7 @@ def test_gravity_is_the_slope_of_the_height(model):
 
     def potential(q):
         T, heights = np.eye(4), []
-        for angle, row, com in zip(q, model.dh, links.com, strict=True):
+        for angle, row, com in zip(q, dh_rows(model)[:, :3], links.com, strict=True):
             T = T @ denavit_hartenberg(angle, *row)
             heights.append(T[2, :3] @ com + T[2, 3])
         return 9.81 * float(links.mass @ heights)

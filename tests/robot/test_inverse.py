@@ -1,177 +1,193 @@
-"""Inverse kinematics: all branches close, angles land in the ranges, refusals name the joint."""
+"""Inverse kinematics of arms of 3 to 8 joints: it comes back to the posture, and says what it cannot reach."""
 
 import math
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
-from hypothesis import strategies as st
+from puma_arm import ELBOW_FORM
+from serial_arms import five, gantry, model_of, random_chain, scara, seven
 
 from canprobe.errors import PlanError
+from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import (
+    LENGTH_M,
     damped_step,
-    inverse,
+    in_rows,
     inverse_near,
     lifting_step,
     probe_pose,
-    singularities,
     start_posture,
+    task_rows,
 )
-from canprobe.robot.kinematics import (
-    ELBOW_FORM,
-    MODELS,
-    UPENN,
-    counts_to_joints,
-    forward,
-    forward_jacobian,
-    joints_to_counts,
-    tool_z_offset,
-)
+from canprobe.robot.model import joints_to_units, units_to_joints
+from canprobe.robot.puma import MODELS, UPENN
 
+TOOL = tool_z_offset(80.0)
+POINT = np.array((-0.120, -0.1225, 0.374))
 BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+ARMS = {model.name: model for model in (*MODELS.values(), gantry(), scara(), five(), seven())}
+ARMS |= {f"random {n}": model_of(random_chain(np.random.default_rng(n), n), slide=(-0.6, 0.6)) for n in (5, 6, 7, 8)}
+EACH = pytest.mark.parametrize("model", ARMS.values(), ids=ARMS)
 
 
-def dh_product(model, q):
-    T = np.eye(4)
-    for (a, alpha, d), theta in zip(model.dh, q, strict=True):
-        ct, st_, ca, sa = math.cos(theta), math.sin(theta), math.cos(alpha), math.sin(alpha)
-        T = T @ [[ct, -st_ * ca, st_ * sa, a * ct], [st_, ct * ca, -ct * sa, a * st_], [0, sa, ca, d], [0, 0, 0, 1]]
-    return T
+def pose(model, q, tool=TOOL):
+    return forward(model.chain, q) @ tool
 
 
-@BOTH
-def test_eight_branches_close_over_random_poses(model):
-    rng = np.random.default_rng(260)
-    worst = 0.0
-    for _ in range(400):
-        q = rng.uniform(model.q_min, model.q_max)
-        T = dh_product(model, q)
-        solutions = inverse(model, T, q)
-        assert len({(s.shoulder, s.elbow, s.wrist) for s in solutions}) == 8
-        worst = max(worst, *(np.abs(dh_product(model, s.q) - T).max() for s in solutions))
-        assert min(np.abs(s.q - q).max() for s in solutions) < 1e-7, "the posture that made the pose is one of them"
-        for s in solutions:
-            inside = bool(np.all(s.q >= model.q_min - 1e-9) and np.all(s.q <= model.q_max + 1e-9))
-            assert s.within_limits == inside
-            assert s.wrist * math.sin(s.q[4]) >= -1e-12
-    assert worst < 1e-11
+def away(model, q, T_base_tool):
+    """What is left of the rows that the arm holds: m, and what the angles between the axes leave over."""
+    T = pose(model, q)
+    turn = {3: 0.0, 5: T[:3, 2] - T_base_tool[:3, 2], 6: T[:3, :3] - T_base_tool[:3, :3]}[task_rows(model)]
+    return max(np.abs(T[:3, 3] - T_base_tool[:3, 3]).max(), np.abs(turn).max())
+
+
+def test_rows_follow_from_the_number_of_joints():
+    rows = {n: task_rows(model_of(random_chain(np.random.default_rng(n), n))) for n in range(1, 9)}
+    assert rows == {1: 3, 2: 3, 3: 3, 4: 3, 5: 5, 6: 6, 7: 6, 8: 6}
+
+
+def test_five_rows_are_those_that_the_pole_needs():
+    T, J = forward_jacobian(five().chain, np.array((0.3, 0.5, -0.7, 0.4, 1.0)), TOOL)
+    rows, turn = in_rows(5, T[:3, :3], J), np.array((0.0, 0.0, 0.0, *(0.7 * T[:3, 2])))
+    assert rows[:3] == pytest.approx(J[:3])
+    assert np.cross(J[3:].T, T[:3, 2]) == pytest.approx(np.cross(rows[3:].T @ T[:3, :2].T, T[:3, 2]))
+    assert in_rows(5, T[:3, :3], turn) == pytest.approx(np.zeros(5), abs=1e-15)
+
+
+@EACH
+def test_it_comes_back_to_the_posture_that_made_the_pose(model):
+    """Well inside the stops and off singular poses; joints that the rows do not need stay where they were."""
+    rng = np.random.default_rng(5)
+    for _ in range(40):
+        q = model.q_min + rng.uniform(0.15, 0.85, model.n) * (model.q_max - model.q_min)
+        T, J = forward_jacobian(model.chain, q, TOOL)
+        if np.linalg.svd(in_rows(task_rows(model), T[:3, :3], J))[1][-1] < 0.08:
+            continue
+        near = q + rng.uniform(-0.02, 0.02, model.n) * model.radian
+        found = inverse_near(model, T, TOOL, near)
+        assert away(model, found, T) < 2e-9
+        assert np.all(found >= model.q_min) and np.all(found <= model.q_max)
+        if task_rows(model) == model.n:
+            assert found == pytest.approx(q, abs=1e-7)
+        else:
+            _, J = forward_jacobian(model.chain, found, TOOL)
+            rows = in_rows(task_rows(model), T[:3, :3], J) * model.radian
+            back = (near - found) / model.radian  # what the pose leaves free stays: nothing of it in the null space
+            free = back - np.linalg.pinv(rows) @ (rows @ back)
+            inside = np.all((found > model.q_min + 1e-9) & (found < model.q_max - 1e-9))
+            assert not inside or np.abs(free).max() < 1e-6
+
+
+@EACH
+def test_a_path_is_followed_on_one_branch(model):
+    """A straight line of 40 mm, as a task makes it."""
+    rng = np.random.default_rng(6)
+    for _ in range(10):
+        q = model.q_min + rng.uniform(0.3, 0.7, model.n) * (model.q_max - model.q_min)
+        T, J = forward_jacobian(model.chain, q, TOOL)
+        if np.linalg.svd(in_rows(task_rows(model), T[:3, :3], J))[1][-1] < 0.15:
+            continue
+        direction = rng.normal(size=3)
+        for _ in range(20):
+            T[:3, 3] += 0.002 * direction / np.linalg.norm(direction)
+            before, q = q, inverse_near(model, T, TOOL, q, max_move_rad=0.3)
+            assert away(model, q, T) < 2e-9
+            assert np.abs((q - before) / model.radian).max() < 0.15
 
 
 @BOTH
 @pytest.mark.parametrize(
-    "q_deg",
-    [
-        (10, 20, -40, 30, 0.0, 50),
-        (10, 20, -40, 30, 1e-7, 50),
-        (10, 20, -40, 30, 180.0, 50),
-        (0, 90, -90, 10, 30, 0),
-        (-170, 200, -89.9999999, -500, 60, 280),
-    ],
-    ids=["wrist", "wrist nearly", "wrist folded", "elbow stretched", "elbow nearly"],
+    "q_deg", [(10, 20, -40, 30, 0.0, 50), (10, 20, -40, 30, 1e-7, 50), (0, 90, -90, 10, 30, 0)], ids=str
 )
-def test_residual_holds_at_singular_postures(model, q_deg):
+def test_it_reaches_singular_postures_from_beside_them(model, q_deg):
     q = np.radians(q_deg)
-    T = dh_product(model, q)
-    solutions = inverse(model, T, q)
-    assert len(solutions) == 8
-    assert max(np.abs(dh_product(model, s.q) - T).max() for s in solutions) < 1e-11
+    found = inverse_near(model, pose(model, q), TOOL, q + np.array((0.01, -0.01, 0.02, 0.01, 0.02, -0.01)))
+    assert away(model, found, pose(model, q)) < 2e-9
 
 
-def test_free_wrist_angle_stays_where_it_was_at_the_singularity():
+def test_a_free_wrist_angle_stays_where_it_was_at_the_singularity():
     q = np.radians((10, 20, -40, 30, 0.0, 50))
-    assert np.degrees(inverse_near(UPENN, dh_product(UPENN, q), q)) == pytest.approx((10, 20, -40, 30, 0, 50), abs=1e-6)
-
-
-@BOTH
-@settings(max_examples=60)
-@given(
-    fraction=st.lists(st.floats(0.02, 0.98), min_size=6, max_size=6),
-    nudge=st.lists(st.floats(-0.01, 0.01), min_size=6, max_size=6),
-)
-def test_nearest_solution_returns_to_its_posture_over_the_whole_range(model, fraction, nudge):
-    q = model.q_min + np.array(fraction) * (model.q_max - model.q_min)
-    assume(not singularities(model, q, tolerance=0.1))
-    found = inverse_near(model, dh_product(model, q), q + nudge)
-    assert np.abs(found - q).max() < 1e-7  # joint 4 spans 620 degrees: whole turns are kept apart too
+    assert np.degrees(inverse_near(UPENN, pose(UPENN, q), TOOL, q)) == pytest.approx((10, 20, -40, 30, 0, 50), abs=1e-6)
 
 
 def test_whole_turns_follow_the_nearby_posture():
-    q = np.radians((90, 65, 15, -300, 60, 200))
-    T = dh_product(UPENN, q)
+    T = pose(UPENN, np.radians((90, 65, 15, -300, 60, 200)))
     for j4, j6 in ((-300, 200), (-300, -160)):
-        near = np.radians((90, 65, 15, j4, 60, j6))
-        assert np.degrees(inverse_near(UPENN, T, near))[[3, 5]] == pytest.approx((j4, j6))
+        near = np.radians((91, 66, 15, j4 + 2, 60, j6 - 1))
+        assert np.degrees(inverse_near(UPENN, T, TOOL, near))[[3, 5]] == pytest.approx((j4, j6))
 
 
-def test_out_of_reach_says_so():
-    T = np.eye(4)
-    T[:3, 3] = (1.0, 0.0, 0.3)
-    assert inverse(UPENN, T) == []
-    with pytest.raises(PlanError, match="out of reach"):
-        inverse_near(UPENN, T, ELBOW_FORM)
+def test_it_crosses_the_workspace_from_a_far_posture():
+    q = np.radians((20.0, 40.0, 30.0, 20.0, 60.0, -40.0))
+    found = inverse_near(UPENN, pose(UPENN, q), TOOL, ELBOW_FORM)
+    assert away(UPENN, found, pose(UPENN, q)) < 2e-9
 
 
-def test_inside_the_shoulder_offset_is_out_of_reach():
-    T = np.eye(4)
-    T[:3, 3] = (0.05, 0.05, 0.5)
-    assert inverse(UPENN, T) == []
+@pytest.mark.parametrize("model", [UPENN, five(), seven()], ids=lambda model: model.name)
+def test_out_of_reach_names_the_nearest_pose(model):
+    q = 0.5 * (model.q_min + model.q_max) + 0.3
+    T = pose(model, q)
+    T[:3, 3] = (3.0, 0.0, 0.3)
+    with pytest.raises(PlanError, match=r"tool at \(3000.0, 0.0, 300.0\) mm: out of reach of the") as refused:
+        inverse_near(model, T, TOOL, q)
+    assert "nearest reachable: tool at (" in str(refused.value) and "mm and " in str(refused.value)
 
 
-def test_joint_limit_refusal_names_the_joint():
+def test_the_nearest_pose_of_a_gantry_is_where_its_axes_end():
+    model = gantry()
+    T = pose(model, (0.3, 0.3, 0.3))
+    T[:3, 3] += (0.4, 0.1, 0.0)
+    with pytest.raises(PlanError, match=r"100.0 mm and 0.0 deg away with joint 1 at its stop, 600.0 mm"):
+        inverse_near(model, T, TOOL, (0.3, 0.3, 0.3))
+
+
+def test_beyond_a_stop_the_joint_at_it_is_named():
     q = ELBOW_FORM.copy()
     q[0] = math.radians(150.0)  # 40 degrees beyond the stop of joint 1
-    with pytest.raises(PlanError, match=r"joint 1 would be at 150\.0 deg, allowed -180 to 110"):
-        inverse_near(UPENN, dh_product(UPENN, q), q, max_move_rad=0.5)
-
-
-def test_another_branch_is_taken_only_when_far_moves_are_allowed():
-    q = ELBOW_FORM.copy()
-    q[0] = math.radians(150.0)
-    T = dh_product(UPENN, q)
-    over_the_back = inverse_near(UPENN, T, q)
-    assert np.abs(over_the_back - q).max() > 0.5
-    assert np.abs(dh_product(UPENN, over_the_back) - T).max() < 1e-11
+    with pytest.raises(PlanError, match=r"out of reach.* joint 1 at its stop, 110\.0 deg"):
+        inverse_near(UPENN, pose(UPENN, q), TOOL, ELBOW_FORM)
 
 
 def test_a_far_target_is_refused_with_the_move_it_needs():
     near = ELBOW_FORM + np.array((0, 0, 0, 0, 0, 1.0))
     with pytest.raises(PlanError, match=r"joint 6 would have to move by 57\.3 deg"):
-        inverse_near(UPENN, dh_product(UPENN, ELBOW_FORM), near, max_move_rad=0.5)
+        inverse_near(UPENN, pose(UPENN, ELBOW_FORM), TOOL, near, max_move_rad=0.5)
+    with pytest.raises(PlanError, match=r"joint 1 would have to move by 200\.0 mm"):
+        inverse_near(gantry(), pose(gantry(), (0.5, 0.3, 0.3)), TOOL, (0.3, 0.3, 0.3), max_move_rad=0.5)
 
 
-@pytest.mark.parametrize(
-    ("q_deg", "names"),
-    [
-        ((0, 65, 15, 0, 100, 0), ()),
-        ((0, 65, 15, 0, 0, 0), ("wrist",)),
-        ((0, 65, -90, 0, 90, 0), ("elbow",)),
-        ((0, 45, 0, 0, 90, 0), ("shoulder",)),
-        ((0, 90, -90, 0, 180, 0), ("shoulder", "elbow", "wrist")),
-    ],
-)
-def test_singularities_are_named(q_deg, names):
-    assert singularities(UPENN, np.radians(q_deg)) == names
+def test_seven_joints_go_back_to_the_posture_of_rest():
+    model = seven()
+    rest = np.array((0.2, 0.5, 0.1, -1.2, 0.3, 0.8, 0.4))
+    T = pose(model, rest)
+    other = inverse_near(model, T, TOOL, rest, q_rest=rest + np.array((0, 0, 0.4, 0, 0, 0, 0)))
+    assert np.abs(other - rest).max() > 0.1 and away(model, other, T) < 2e-9
+    assert inverse_near(model, T, TOOL, other, q_rest=rest) == pytest.approx(rest, abs=1e-6)
+
+
+def test_four_joints_hold_the_position_alone():
+    model, q = scara(), np.array((0.3, 0.8, 0.1, 0.5))
+    T = pose(model, q)
+    T[:3, :3] = np.eye(3)
+    found = inverse_near(model, T, TOOL, q)
+    assert found == pytest.approx(q, abs=1e-8), "whatever orientation is asked for"
 
 
 @pytest.mark.parametrize("offset_mm", [60.0, 80.0, 100.0])
 def test_scan_region_is_reachable_in_the_elbow_form(offset_mm):
-    down = forward(UPENN, ELBOW_FORM)
+    down, tool = forward(UPENN.chain, ELBOW_FORM), tool_z_offset(offset_mm)
     worst_j1 = -math.inf
     for x in (-0.100, -0.120, -0.140):
         for y in (-0.105, -0.1225, -0.140):
             for z in (0.364, 0.374):
                 T = down.copy()
                 T[:3, 3] = (x, y, z + 0.040)
-                q = inverse_near(UPENN, T @ np.linalg.inv(tool_z_offset(offset_mm)), ELBOW_FORM)
-                assert not singularities(UPENN, q)
+                q = inverse_near(UPENN, T, tool, ELBOW_FORM)
                 worst_j1 = max(worst_j1, q[0])
     assert 110.0 - math.degrees(worst_j1) == pytest.approx(2.5, abs=0.1)  # published check of the inner corner
 
 
 # Start poses: the probe stands on the surface with its pole against the normal.
-
-TOOL = tool_z_offset(80.0)
-POINT = np.array((-0.120, -0.1225, 0.374))
 
 
 def test_probe_pose_is_a_rotation_with_the_pole_against_the_normal():
@@ -185,23 +201,18 @@ def test_probe_pose_is_a_rotation_with_the_pole_against_the_normal():
     assert T[:3, 0] @ np.array((1.0, 0.0, 0.0)) > 0.9
 
 
-@pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+@BOTH
 def test_start_posture_of_the_default_scan_point(model):
-    q = start_posture(model, POINT, (0, 0, 1), radius_m=0.040, T_flange_probe=TOOL, clearance_m=0.005)
-    T = forward(model, q) @ TOOL
-    assert T[:3, 3] == pytest.approx(POINT + np.array((0, 0, 0.045)), abs=1e-12)
-    assert T[:3, 2] == pytest.approx((0, 0, -1), abs=1e-12)
+    q = start_posture(model, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.040, T_flange_probe=TOOL, clearance_m=0.005)
+    T = pose(model, q)
+    assert T[:3, 3] == pytest.approx(POINT + np.array((0, 0, 0.045)), abs=1e-9)
+    assert T[:3, 2] == pytest.approx((0, 0, -1), abs=1e-9)
     assert np.abs(q - ELBOW_FORM).max() < math.radians(10.0)
-
-
-def test_yaw_turns_the_pad():
-    q = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, yaw_rad=0.3)
-    assert (forward(UPENN, q) @ TOOL)[:3, 0] == pytest.approx((math.cos(0.3), math.sin(0.3), 0.0), abs=1e-12)
 
 
 def test_unreachable_and_degenerate_requests_are_refused():
     with pytest.raises(PlanError, match="out of reach"):
-        start_posture(UPENN, (0.9, 0, 0), (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL)
+        start_posture(UPENN, (0.9, 0, 0), (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL)
     with pytest.raises(ValueError, match="parallel"):
         probe_pose(POINT, (0, 0, 1), 0.04, (0, 0, 2))
 
@@ -210,7 +221,7 @@ def test_unreachable_and_degenerate_requests_are_refused():
 
 
 def jacobian(q):
-    return forward_jacobian(UPENN, q, TOOL)[1]
+    return forward_jacobian(UPENN.chain, q, TOOL)[1]
 
 
 def test_exact_inverse_in_the_scan_pose():
@@ -238,14 +249,19 @@ def test_exactly_singular_gives_a_finite_step():
     assert np.all(np.isfinite(damped_step(jacobian(q), np.ones(6))))
 
 
-def test_speed_limit_keeps_the_direction():
-    J = jacobian(ELBOW_FORM)
-    twist = np.array((1.0, 0.5, -0.4, 0.0, 0.0, 0.0))
-    free = damped_step(J, twist)
-    limited = damped_step(J, twist, qd_max=UPENN.qd_max / 10)
-    assert np.max(np.abs(limited) / UPENN.qd_max) == pytest.approx(0.1)
-    assert limited / np.linalg.norm(limited) == pytest.approx(free / np.linalg.norm(free))
-    assert damped_step(J, 1e-3 * twist, qd_max=UPENN.qd_max) == pytest.approx(1e-3 * free)
+def test_more_joints_than_rows_move_least_and_as_wished():
+    J = forward_jacobian(seven().chain, np.array((0.2, 0.5, 0.1, -1.2, 0.3, 0.8, 0.4)), TOOL)[1]
+    twist, wish = np.array((0.02, -0.01, 0.03, 0.1, 0.2, -0.1)), np.array((0.1, -0.2, 0.3, 0.0, 0.1, 0.2, -0.3))
+    least = damped_step(J, twist)
+    assert least == pytest.approx(np.linalg.pinv(J) @ twist)
+    moved = damped_step(J, twist, wish)
+    assert J @ moved == pytest.approx(twist) and moved - least == pytest.approx(wish - np.linalg.pinv(J) @ (J @ wish))
+
+
+def test_fewer_joints_than_rows_come_as_near_as_they_can():
+    J = np.random.default_rng(1).normal(size=(3, 2))
+    twist = np.array((0.1, 0.2, -0.3))
+    assert damped_step(J, twist) == pytest.approx(np.linalg.lstsq(J, twist, rcond=None)[0])
 
 
 @pytest.mark.parametrize("smallest", [0.07, 0.04, 0.004])
@@ -257,7 +273,8 @@ def test_damping_rises_by_its_law_below_the_threshold(smallest):
     lambda2 = 0.05**2 * (1 - (smallest / 0.08) ** 2)
     twist = rng.normal(size=6)
     rates = V @ (s / (s**2 + lambda2) * (U.T @ twist))
-    assert damped_step((U * s) @ V.T, twist, length_m=1.0) == pytest.approx(rates, rel=1e-9)
+    metres = np.array((LENGTH_M,) * 3 + (1.0,) * 3)
+    assert damped_step(metres[:, None] * (U * s) @ V.T, metres * twist) == pytest.approx(rates, rel=1e-9)
 
 
 # Moving the tool with the motors that are left: against the forward kinematics, with the wrist's coupling.
@@ -266,12 +283,12 @@ MOVE = np.array((0.6, -0.5, 0.9)) * 1e-4
 
 
 def stepped(free, move=MOVE, q=ELBOW_FORM):
-    return lifting_step(forward_jacobian(UPENN, q, TOOL)[1][:3], UPENN.joints_per_count, move, np.array(free, bool))
+    return lifting_step(UPENN, forward_jacobian(UPENN.chain, q, TOOL)[1][:3], move, np.array(free, bool))
 
 
 def moved(counts, q=ELBOW_FORM):
-    after = counts_to_joints(UPENN, joints_to_counts(UPENN, q) + counts)
-    return (forward(UPENN, after) @ TOOL)[:3, 3] - (forward(UPENN, q) @ TOOL)[:3, 3]
+    after = units_to_joints(UPENN, joints_to_units(UPENN, q) + counts)
+    return (forward(UPENN.chain, after) @ TOOL)[:3, 3] - (forward(UPENN.chain, q) @ TOOL)[:3, 3]
 
 
 @pytest.mark.parametrize("lost", [(), (0,), (1,), (2,), (3,), (4,), (5,), (0, 2), (3, 4, 5)])
@@ -283,10 +300,10 @@ def test_the_motors_that_are_left_make_the_move(lost):
 
 def test_with_all_motors_no_other_step_turns_the_joints_less():
     counts = stepped([True] * 6)
-    dq = UPENN.joints_per_count @ counts
-    J = forward_jacobian(UPENN, ELBOW_FORM, TOOL)[1][:3]
+    dq = UPENN.q_per_unit @ counts
+    J = forward_jacobian(UPENN.chain, ELBOW_FORM, TOOL)[1][:3]
     assert J @ dq == pytest.approx(MOVE, abs=1e-12)
-    with_motors_4_to_6 = UPENN.joints_per_count @ stepped([True] * 3 + [False] * 3)
+    with_motors_4_to_6 = UPENN.q_per_unit @ stepped([True] * 3 + [False] * 3)
     assert np.linalg.norm(dq) < np.linalg.norm(with_motors_4_to_6)
 
 
@@ -299,8 +316,17 @@ def test_a_move_that_the_motors_cannot_make_is_none(free):
 def test_motors_that_are_badly_placed_for_a_move_are_not_asked(bent, possible):
     """Back along an arm that is nearly stretched out, without the wrist."""
     q = np.array((0.3, 0.4, bent - np.pi / 2, 0.0, 0.2, 0.0))
-    x, y, _ = (forward(UPENN, q) @ TOOL)[:3, 3]
+    x, y, _ = (forward(UPENN.chain, q) @ TOOL)[:3, 3]
     back = -1e-4 * np.array((x, y, 0.0)) / np.hypot(x, y)
     counts = stepped([True] * 3 + [False] * 3, back, q)
     assert (counts is not None) is possible
     assert counts is None or moved(counts, q) == pytest.approx(back, abs=2e-6)
+
+
+@pytest.mark.parametrize("model", [gantry(), scara(), seven()], ids=lambda model: model.name)
+def test_drives_of_other_arms_make_the_move_too(model):
+    q = 0.5 * (model.q_min + model.q_max) + 0.4 * model.radian
+    T, J = forward_jacobian(model.chain, q, TOOL)
+    units = lifting_step(model, J[:3], MOVE, np.ones(model.n, bool))
+    after = units_to_joints(model, joints_to_units(model, q) + units)
+    assert pose(model, after)[:3, 3] - T[:3, 3] == pytest.approx(MOVE, abs=2e-3 * np.linalg.norm(MOVE))

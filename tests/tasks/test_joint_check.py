@@ -13,7 +13,8 @@ import canprobe
 from canprobe.cell.controller import Measurement
 from canprobe.cell.supervisor import JointGuard
 from canprobe.cli.operator import TerminalOperator
-from canprobe.robot.kinematics import UPENN, counts_to_joints, joints_to_counts
+from canprobe.robot.model import joints_to_units, units_to_joints
+from canprobe.robot.puma import UPENN
 from canprobe.tasks.untouched import Answer, JointCheck
 
 PERIOD_S = 0.02
@@ -51,7 +52,7 @@ class Scripted:
 def run(check, motors=None, start=START):
     """Motors that make `motors` (6, 6) of what they are told; the targets (n, 6), rad, and the last command."""
     motors = np.eye(6) if motors is None else motors
-    zero = joints_to_counts(UPENN, start)
+    zero = joints_to_units(UPENN, start)
     q, targets = start, []
     for cycle in range(20_000):
         command = check.step(Measurement(cycle, round(cycle * PERIOD_S * 1e9), q))
@@ -59,8 +60,8 @@ def run(check, motors=None, start=START):
             return np.array(targets), command
         if command.q_target is not None:
             targets.append(command.q_target)
-            told = joints_to_counts(UPENN, command.q_target) - zero
-            q = counts_to_joints(UPENN, np.round(zero + motors @ told))
+            told = joints_to_units(UPENN, command.q_target) - zero
+            q = units_to_joints(UPENN, np.round(zero + motors @ told))
     raise AssertionError("no end")
 
 
@@ -93,7 +94,7 @@ def test_a_motor_that_does_something_else_is_named(plan, joint, factor, fault):
     for other, text in findings.items():
         if other != joint:  # joints 4 and 5 drag the motors behind them along, which shows there too
             assert text is None or f"the motor of joint {joint + 1} turned by" in text
-    left_out = np.abs((1 - factor) * UPENN.counts[joint]) * math.radians(1.0)
+    left_out = np.abs((1 - factor) * UPENN.units_per_q[joint]) * math.radians(1.0)
     dragged = {other for other in range(6) if other != joint and left_out[other] > 4}
     assert {other for other, text in findings.items() if text is not None and other != joint} == dragged
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from canprobe.emulator.plant.taxels import TaxelConfig
-from canprobe.robot.kinematics import ELBOW_FORM, Array, PumaModel, tool_z_offset
+from canprobe.robot.chain import Array, tool_z_offset
+from canprobe.robot.model import ArmModel
 from canprobe.scene.setup import Dynamics, Fidelity
 from canprobe.touch.shapes import PlacedShape
 
@@ -33,7 +34,7 @@ class PlantConfig:
 
     Args:
         model: the arm; None for a sensor alone, pressed on the object by ``press``.
-        q0: (6,) joint angles at time 0, rad.
+        q0: (n,) joint positions at time 0, rad or m; empty without an arm.
         T_flange_probe_centre: (4, 4) centre of the probe sphere in the flange frame, z = pole of the pad, m.
         radius_m: probe radius.
         stiffness_n_m3: of the elastic layer (K/h).
@@ -50,8 +51,8 @@ class PlantConfig:
         base_offset_m: (3,) of the arm's base in the frame that counts as base.
     """
 
-    model: PumaModel | None
-    q0: Array = field(default_factory=lambda: ELBOW_FORM)
+    model: ArmModel | None
+    q0: Array = field(default_factory=lambda: np.zeros(0))
     T_flange_probe_centre: Array = field(default_factory=lambda: tool_z_offset(80.0))
     radius_m: float = 0.040
     stiffness_n_m3: float = 1.27e8

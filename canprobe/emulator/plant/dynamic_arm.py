@@ -16,19 +16,9 @@ import numpy.typing as npt
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.equations import STEPS, ArmEquations, Effects, State, rosenbrock2
 from canprobe.emulator.plant.held_step import held_rosenbrock2
-from canprobe.emulator.plant.ideal_arm import IdealArm, MotorDynamics
-from canprobe.robot.kinematics import (
-    CONTINUOUS_TORQUE_NM,
-    COULOMB_NM,
-    PEAK_PERMILLE,
-    REFLECTED_INERTIA,
-    VISCOUS_NMS,
-    Array,
-    PumaModel,
-    counts_per_radian,
-    counts_to_joints,
-    joints_to_counts,
-)
+from canprobe.emulator.plant.ideal_arm import PEAK_PERMILLE, IdealArm, MotorDynamics
+from canprobe.robot.chain import Array
+from canprobe.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor, units_to_joints
 
 # What a drive is asked for: straight ramps of counts, one after the other, each holding its end.
 
@@ -122,16 +112,16 @@ class DynamicArm:
         stepping: how they are integrated.
     """
 
-    def __init__(self, model: PumaModel, q0: npt.ArrayLike, equations: ArmEquations, stepping: Stepping) -> None:
+    def __init__(self, model: ArmModel, q0: npt.ArrayLike, equations: ArmEquations, stepping: Stepping) -> None:
         self.model = model
         self.equations = equations
         self.t_ns = 0
         self._stepping, self._step = stepping, STEPS[stepping.method]
-        scale = counts_per_radian(model)
+        scale, units = units_per_motor(model), joints_to_units(model, q0)
         self._scales: list[float] = scale.tolist()
-        counts = joints_to_counts(model, q0)
-        self._references = [Reference(c) for c in counts.tolist()]
-        self._y: State = equations.resting(counts / scale).tolist()
+        self._zeros: list[float] = model.zero_units.tolist()
+        self._references = [Reference(c) for c in units.tolist()]
+        self._y: State = equations.resting((units - model.zero_units) / scale).tolist()
         self._y_ns = 0
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
@@ -158,18 +148,19 @@ class DynamicArm:
     def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Positions (counts) and rates (counts/s) of the six motors now."""
         y = self._state()
-        positions = tuple([x * scale for x, scale in zip(y[:6], self._scales, strict=True)])
+        positions = tuple([x * scale + zero for x, scale, zero in zip(y[:6], self._scales, self._zeros, strict=True)])
         return positions, tuple([v * scale for v, scale in zip(y[6:12], self._scales, strict=True)])
 
     @property
     def q(self) -> Array:
         """(6,) joint angles now, rad."""
-        return counts_to_joints(self.model, self.motors()[0])
+        return units_to_joints(self.model, self.motors()[0])
 
     @property
     def qd(self) -> Array:
         """(6,) joint rates now, rad/s."""
-        return counts_to_joints(self.model, self.motors()[1])
+        rates: Array = self.model.q_per_unit @ np.array(self.motors()[1])
+        return rates
 
     def motor_counts(self, axis: int) -> float:
         """Position of one motor now, counts, continuous.
@@ -177,7 +168,7 @@ class DynamicArm:
         Args:
             axis: 0 to 5.
         """
-        return self._state()[axis] * self._scales[axis]
+        return self._state()[axis] * self._scales[axis] + self._zeros[axis]
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
@@ -188,7 +179,7 @@ class DynamicArm:
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
             self._torques = y, self.equations.torque(1e-9 * self.t_ns, y)
-        permille = round(1000.0 * self._torques[1][axis] / CONTINUOUS_TORQUE_NM[axis])
+        permille = round(1000.0 * self._torques[1][axis] / self.model.joints[axis].rated_torque)
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
@@ -201,7 +192,7 @@ class DynamicArm:
             torque_permille: added behind the velocity loop.
         """
         self._advance_to(self.t_ns)
-        rated = 1e-3 * CONTINUOUS_TORQUE_NM[axis]
+        rated = 1e-3 * self.model.joints[axis].rated_torque
         self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
         self._torques = None
 
@@ -211,11 +202,11 @@ class DynamicArm:
         Args:
             axis: 0 to 5.
         """
-        inertia, rated = REFLECTED_INERTIA[axis], CONTINUOUS_TORQUE_NM[axis]
+        joint = self.model.joints[axis]
         return MotorDynamics(
-            gain=1e-3 * rated * self._scales[axis] / inertia,
-            coulomb=1000.0 * COULOMB_NM[axis] / rated,
-            damping=VISCOUS_NMS[axis] / inertia,
+            gain=1e-3 * joint.rated_torque * abs(self._scales[axis]) / joint.rotor_inertia,
+            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
+            damping=joint.viscous / joint.rotor_inertia,
         )
 
     def _state(self) -> State:
@@ -243,9 +234,9 @@ class DynamicArm:
         """Some reference changes its slope here."""
         now_ns, theta, slope = self._y_ns, [], []
         self._bend_ns = NEVER
-        for reference, scale in zip(self._references, self._scales, strict=True):
+        for reference, scale, zero in zip(self._references, self._scales, self._zeros, strict=True):
             x, v = reference.at(now_ns)
-            theta.append(x / scale)
+            theta.append((x - zero) / scale)
             slope.append(v / scale)
             bend_ns = reference.next_bend(now_ns)
             self._bend_ns = min(self._bend_ns, bend_ns)
@@ -289,25 +280,24 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
     from canprobe.emulator.plant.equations import Cascade, DriveSettings
     from canprobe.emulator.plant.pushing import Neighbourhood, Rubbing
     from canprobe.robot.dynamics import RigidBody, ball_inertia, puma260_inertia
-    from canprobe.robot.kinematics import joints_per_motor
 
     assert config.model is not None
     d, effects = config.dynamics, effects or Effects()
     ball = ball_inertia(d.payload, config.radius_m)
     links = puma260_inertia(config.model).with_payload(d.payload, config.T_flange_probe_centre, ball)
     body = RigidBody(config.model, links)
-    back = joints_per_motor()
-    inertia = np.array(REFLECTED_INERTIA)
+    back = joints_per_motor(config.model)
+    inertia = np.array([joint.rotor_inertia for joint in config.model.joints])
     if effects.links:  # a drive is tuned to what its motor moves in the first posture
         inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(6))[0] @ back)
     drives = DriveSettings(
         config.bandwidth_hz, config.damping_ratio, d.integral_s, d.velocity_feed_forward, d.torque_limit_permille
     )
-    cascade = Cascade(drives, inertia)
+    cascade = Cascade(drives, inertia, config.model)
     if config.object is None:
         return ArmEquations(body, cascade, effects=effects, held=held)
     touching = Neighbourhood(
-        config.model,
+        config.model.chain,
         back,
         config.T_flange_probe_centre,
         config.base_offset_m,

@@ -16,18 +16,10 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.emulator.plant.ideal_arm import natural_frequency
+from canprobe.emulator.plant.ideal_arm import PEAK_PERMILLE, STICTION_RATE, natural_frequency
 from canprobe.emulator.plant.pushing import Contact
 from canprobe.robot.dynamics import RigidBody, dense
-from canprobe.robot.kinematics import (
-    CONTINUOUS_TORQUE_NM,
-    COULOMB_NM,
-    PEAK_PERMILLE,
-    REFLECTED_INERTIA,
-    STICTION_RATE,
-    VISCOUS_NMS,
-    joints_per_motor,
-)
+from canprobe.robot.model import ArmModel, joints_per_motor
 
 # Steps of ordinary differential equations y' = f(t, y), each one function of (problem, t, y, h).
 #
@@ -177,7 +169,7 @@ STEPS: Mapping[str, Step] = MappingProxyType(
 #
 # Position: ``v* = kp (r - x) + share r'``. Velocity: ``u = Kv (v* - v) + s + tau_ff``, ``s' = Ki (v* - v)``, where s
 # also unwinds while the torque is at its limit. Torque: ``min(max(u, -limit), limit)``, without a lag of its own. All
-# in motor coordinates (``robot.actuation``). The loops are continuous; a real drive samples them at some kHz.
+# in motor coordinates (``robot.model``). The loops are continuous; a real drive samples them at some kHz.
 #
 # With ``kp = w / 2z`` and ``Kv = 2 z w J`` a motor with the inertia J and nothing else is the second-order system of
 # the ideal arm: same bandwidth, same lag behind a ramp.
@@ -208,16 +200,18 @@ class Cascade:
     Args:
         settings: the tuning.
         inertia: (6,) what each drive takes for its motor's inertia, kg m^2.
+        model: the arm, for the rated torques.
     """
 
-    def __init__(self, settings: DriveSettings, inertia: Array) -> None:
+    def __init__(self, settings: DriveSettings, inertia: Array, model: ArmModel) -> None:
         w, z = natural_frequency(settings.bandwidth_hz, settings.damping_ratio), settings.damping_ratio
         self.position = w / (2.0 * z)
         self.velocity: Array = 2.0 * z * w * inertia
         self.integral: Array = self.velocity / settings.integral_s if settings.integral_s > 0.0 else 0.0 * inertia
         self.unwind = 1.0 / settings.integral_s if settings.integral_s > 0.0 else 0.0
         self.share = settings.velocity_feed_forward
-        self.limit: Array = np.array(CONTINUOUS_TORQUE_NM) * (1e-3 * settings.torque_limit_permille)
+        rated = np.array([joint.rated_torque for joint in model.joints])
+        self.limit: Array = rated * (1e-3 * settings.torque_limit_permille)
 
     @property
     def lag_s(self) -> float:
@@ -248,6 +242,7 @@ class DriveLoops:
 
     Args:
         cascade: the drives.
+        model: the arm, for its friction.
         friction: whether motors and gears rub.
 
     Attributes:
@@ -257,11 +252,11 @@ class DriveLoops:
         viscous, coulomb: (6,) friction.
     """
 
-    def __init__(self, cascade: Cascade, *, friction: bool) -> None:
+    def __init__(self, cascade: Cascade, model: ArmModel, *, friction: bool) -> None:
         on = 1.0 if friction else 0.0
         self.cascade = cascade
         self.position, self.unwind = cascade.position, cascade.unwind
-        self.viscous, self.coulomb = [on * x for x in VISCOUS_NMS], [on * x for x in COULOMB_NM]
+        self.viscous, self.coulomb = [on * j.viscous for j in model.joints], [on * j.coulomb for j in model.joints]
         self.gain: list[float] = cascade.velocity.tolist()
         self.integral: list[float] = cascade.integral.tolist()
         self.limit: list[float] = cascade.limit.tolist()
@@ -389,11 +384,12 @@ class ArmEquations:
         held: bool = True,
     ) -> None:
         self.body, self.effects, self.held = body, effects, held
-        self.loops = DriveLoops(cascade, friction=effects.friction)
+        self.loops = DriveLoops(cascade, body.model, friction=effects.friction)
         self.contact: Contact | None = None
         self._touching = touching
-        self._driven = body.along(joints_per_motor(), REFLECTED_INERTIA, weight=effects.gravity)
-        alone = [x if i == j else 0.0 for i, x in enumerate(REFLECTED_INERTIA) for j in range(i + 1)]
+        rotors = [joint.rotor_inertia for joint in body.model.joints]
+        self._driven = body.along(joints_per_motor(body.model), rotors, weight=effects.gravity)
+        alone = [x if i == j else 0.0 for i, x in enumerate(rotors) for j in range(i + 1)]
         self._take((*alone, *(0.0,) * 6))
 
     def hold(self, y: Array) -> None:

@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 
 from canprobe.emulator.plant.equations import GAMMA, ArmEquations, State, rosenbrock2
+from canprobe.emulator.plant.ideal_arm import STICTION_RATE
 from canprobe.emulator.plant.pushing import SLIP_M_S, OneTouch
 from canprobe.robot.dynamics import LOWER
-from canprobe.robot.kinematics import STICTION_RATE
 from canprobe.robot.straight_line import Value, call, compiled, where
 
 # What the step in straight-line code is made of, in symbols: a motor's loop, a touch, and a 6 x 6 system.

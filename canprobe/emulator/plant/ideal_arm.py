@@ -1,4 +1,4 @@
-"""Ideal arm: six decoupled second-order position loops, one per motor, solved exactly.
+"""Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
 
 Each motor position q (counts) follows its reference r: ``q'' = w^2 (r - q) - 2 z w q'``. References are ramps, for
 which the solution is closed: behind a steady ramp by the lag 2z/w, plus a decaying transient. The state is a function
@@ -14,18 +14,13 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from canprobe.robot.kinematics import (
-    CONTINUOUS_TORQUE_NM,
-    COULOMB_NM,
-    PEAK_PERMILLE,
-    REFLECTED_INERTIA,
-    STICTION_RATE,
-    VISCOUS_NMS,
-    Array,
-    PumaModel,
-    counts_to_joints,
-    joints_to_counts,
-)
+from canprobe.robot.chain import Array
+from canprobe.robot.model import ArmModel, joints_to_units, units_to_joints
+
+PEAK_PERMILLE = 2000
+"""Of the rated torque: what a drive can give for a while (assumed)."""
+STICTION_RATE = 0.01
+"""rad/s over which the Coulomb torque turns its sign; of a prismatic joint m/s."""
 
 # How a motor answers to torque: what a plant tells a drive that controls torque.
 
@@ -44,7 +39,7 @@ class MotorDynamics(NamedTuple):
     damping: float
 
 
-# Ideal arm: six decoupled second-order position loops, one per motor, solved exactly.
+# Ideal arm: decoupled second-order position loops, one per motor, solved exactly.
 
 Transition = tuple[float, float, float, float]
 State = tuple[float, float, float]
@@ -128,17 +123,17 @@ class _Axis:
 
 
 class IdealArm:
-    """Six motors that track ramps of counts with equal bandwidth.
+    """Motors that track ramps of counts with equal bandwidth.
 
     Args:
         model: the arm.
-        q0: (6,) joint angles at time 0, at rest, rad.
+        q0: (n,) joint positions at time 0, at rest, rad or m.
         bandwidth_hz: -3 dB frequency of every loop.
         damping_ratio: 1 is critical.
     """
 
     def __init__(
-        self, model: PumaModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0, damping_ratio: float = 1.0
+        self, model: ArmModel, q0: npt.ArrayLike, bandwidth_hz: float = 30.0, damping_ratio: float = 1.0
     ) -> None:
         self.model = model
         self.w, self.z = natural_frequency(bandwidth_hz, damping_ratio), damping_ratio
@@ -146,9 +141,9 @@ class IdealArm:
         """How far the motors stay behind a steady ramp, s."""
         self._stiffness, self._damping = self.w * self.w, 2 * damping_ratio * self.w
         self.t_ns = 0
-        self._axes = [_Axis(c, self.lag_s) for c in joints_to_counts(model, q0).tolist()]
+        self._axes = [_Axis(c, self.lag_s) for c in joints_to_units(model, q0).tolist()]
         self._phi: dict[int, Transition] = {}
-        self._rows = [[(j, g) for j, g in enumerate(row) if g] for row in model.joints_per_count.tolist()]
+        self._rows = [[(j, g) for j, g in enumerate(row) if g] for row in model.q_per_unit.tolist()]
         self._evaluated: list[State] | None = None
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -157,7 +152,7 @@ class IdealArm:
         A ramp that began in the past acts from the present time on.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
             start_counts: reference at t0.
             end_counts: reference at t1 and after.
             t0_ns: start.
@@ -187,35 +182,36 @@ class IdealArm:
             self._evaluated = None
 
     def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Positions (counts) and rates (counts/s) of the six motors now."""
+        """Positions (counts) and rates (counts/s) of the motors now."""
         positions, rates, _ = zip(*(self._evaluated or self._states()), strict=True)
         return positions, rates
 
     @property
     def counts(self) -> Array:
-        """(6,) motor positions now, counts."""
+        """(n,) motor positions now, counts."""
         return np.array(self.motors()[0])
 
     @property
     def count_rates(self) -> Array:
-        """(6,) motor rates now, counts/s."""
+        """(n,) motor rates now, counts/s."""
         return np.array(self.motors()[1])
 
     @property
     def q(self) -> Array:
-        """(6,) joint angles now, rad."""
-        return counts_to_joints(self.model, self.counts)
+        """(n,) joint positions now, rad or m."""
+        return units_to_joints(self.model, self.counts)
 
     @property
     def qd(self) -> Array:
-        """(6,) joint rates now, rad/s."""
-        return counts_to_joints(self.model, self.count_rates)
+        """(n,) joint rates now, rad/s or m/s."""
+        rates: Array = self.model.q_per_unit @ self.count_rates
+        return rates
 
     def motor_counts(self, axis: int) -> float:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
         return (self._evaluated or self._states())[axis][0]
 
@@ -225,21 +221,21 @@ class IdealArm:
         Model: reflected motor inertia, viscous and Coulomb friction; no gravity, no link inertia, no contact.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
 
         Returns:
             Permille, within the peak of +-2000.
         """
-        stiffness, damping = self._stiffness, self._damping
+        stiffness, damping, joint = self._stiffness, self._damping, self.model.joints[axis]
         states = self._evaluated or self._states()
         rate = acceleration = 0.0
         for motor, share in self._rows[axis]:
             q, v, r = states[motor]
             rate += share * v
             acceleration += share * (stiffness * (r - q) - damping * v)
-        torque: float = REFLECTED_INERTIA[axis] * acceleration + VISCOUS_NMS[axis] * rate
-        torque += COULOMB_NM[axis] * tanh(rate / STICTION_RATE)
-        permille = round(1000.0 * torque / CONTINUOUS_TORQUE_NM[axis])
+        torque: float = joint.rotor_inertia * acceleration + joint.viscous * rate
+        torque += joint.coulomb * tanh(rate / STICTION_RATE)
+        permille = round(1000.0 * torque / joint.rated_torque)
         if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
             return permille
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
@@ -248,7 +244,7 @@ class IdealArm:
         """Nothing: these motors track as they do, whatever torque that takes.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
             limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
         """
 
@@ -258,14 +254,13 @@ class IdealArm:
         The wrist's coupling is left out here: it acts on positions only.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
-        share = dict(self._rows[axis])[axis]
-        inertia = REFLECTED_INERTIA[axis]
+        joint, units = self.model.joints[axis], abs(float(self.model.units_per_q[axis, axis]))
         return MotorDynamics(
-            gain=CONTINUOUS_TORQUE_NM[axis] / (1000.0 * inertia * abs(share)),
-            coulomb=1000.0 * COULOMB_NM[axis] / CONTINUOUS_TORQUE_NM[axis],
-            damping=VISCOUS_NMS[axis] / inertia,
+            gain=1e-3 * joint.rated_torque * units / joint.rotor_inertia,
+            coulomb=1000.0 * joint.coulomb / joint.rated_torque,
+            damping=joint.viscous / joint.rotor_inertia,
         )
 
     def _states(self) -> list[State]:

@@ -19,7 +19,8 @@ from canprobe.emulator.plant.probe import NO_CONTACT, Contact, PressedProbe, Pro
 from canprobe.emulator.plant.pushing import LEAST_CURVATURE, total_force
 from canprobe.emulator.plant.taxels import SIDE, Image, TaxelArray, Vec, pad_coordinates
 from canprobe.errors import PlanError
-from canprobe.robot.kinematics import Array, chain, point_on_flange, point_velocity
+from canprobe.robot.chain import Array, point_on_flange, point_velocity, posture
+from canprobe.robot.model import ArmModel, units_to_joints
 from canprobe.robot.straight_line import matrix_product
 from canprobe.touch.shapes import Nearest, Touches
 
@@ -68,7 +69,8 @@ class Plant:
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
-        self._joints = _at_rest if config.model is None else matrix_product(config.model.joints_per_count.tolist())
+        self._rates = _at_rest if config.model is None else matrix_product(config.model.q_per_unit.tolist())
+        self._at_zero = _joints_at_zero(config.model)
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
 
@@ -96,7 +98,7 @@ class Plant:
         """Motor position now, counts, continuous; 0 without an arm.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
         return self.arm.motor_counts(axis) if self.arm is not None else 0.0
 
@@ -104,7 +106,7 @@ class Plant:
         """Torque of one drive now, see ``IdealArm.torque_permille``; 0 without an arm.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
         return self.arm.torque_permille(axis) if self.arm is not None else 0
 
@@ -112,7 +114,7 @@ class Plant:
         """Torque limit and feed-forwards of one drive, see ``DynamicArm.set_loop``; nothing without an arm.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
             limit_permille: of the rated torque.
             speed: counts/s.
             torque_permille: of the rated torque.
@@ -124,7 +126,7 @@ class Plant:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
 
         Raises:
             RuntimeError: without an arm.
@@ -194,7 +196,7 @@ class Plant:
         they are zeros.
 
         Returns:
-            q (6), probe_centre (3), pole (3), force, depth (negative: gap), depth_rate, contact_point (3) on the
+            q (n), probe_centre (3), pole (3), force, depth (negative: gap), depth_rate, contact_point (3) on the
             object, contact_normal (3) outward of the object, kappa (2), direction1 (3), direction2 (3), pad_uv (2),
             in_contact.
         """
@@ -225,7 +227,7 @@ class Plant:
             return self._pressed.at(1e-9 * t_ns)
         if self.arm is None:
             return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
-        c = chain(self.arm.model, q)
+        c = posture(self.arm.model.chain, q)
         centre = point_on_flange(c, self._tool_origin)
         axes = (c.x, c.y, c.z) if self._tool_axes is None else turned((c.x, c.y, c.z), self._tool_axes)
         b0, b1, b2 = self._base
@@ -233,7 +235,9 @@ class Plant:
 
     def _solve(self, state: PlantState) -> _Solution:
         config = self.config
-        q, qd = self._joints(state.counts), self._joints(state.rates)
+        q, qd = self._rates(state.counts), self._rates(state.rates)
+        if self._at_zero is not None:
+            q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
         probe = self._probe(state.t_ns, q, qd)
         if config.object is None:
             return _Solution(q, probe, _NOWHERE, 0.0, 0.0, NO_CONTACT, (0.0, 0.0), (0.0, 0.0), _POLE)
@@ -265,6 +269,14 @@ class Plant:
         rates = -(touches.normals @ np.array(probe.velocity))
         force = total_force(touches, config.radius_m, config.stiffness_n_m3, rates, config.damping_s_m)
         return NO_CONTACT._replace(force=float(np.linalg.norm(force)))
+
+
+def _joints_at_zero(model: ArmModel | None) -> list[float] | None:
+    """Joint positions where every drive counts zero; None where they are zero too."""
+    if model is None or not model.zero_units.any():
+        return None
+    q: list[float] = units_to_joints(model, np.zeros(model.n)).tolist()
+    return q
 
 
 def _at_rest(motors: Sequence[float]) -> tuple[float, ...]:

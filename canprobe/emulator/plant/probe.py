@@ -10,7 +10,7 @@ import numpy as np
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.taxels import Directions, Vec, pad_basis
-from canprobe.robot.kinematics import Array
+from canprobe.robot.chain import Array
 from canprobe.touch.shapes import Nearest
 
 # Contact of the probe's elastic layer with a surface of known curvature.

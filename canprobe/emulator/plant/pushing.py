@@ -16,8 +16,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 import numpy.typing as npt
 
+from canprobe.robot.chain import Chain, Vec, forward_jacobian, point_jacobian, point_on_flange, posture
 from canprobe.robot.dynamics import LOWER
-from canprobe.robot.kinematics import PumaModel, Vec, chain, forward_jacobian, point_jacobian, point_on_flange
 from canprobe.robot.straight_line import Value, compiled, matrix_product
 from canprobe.touch.shapes import PlacedShape, Touches
 
@@ -271,7 +271,7 @@ class Neighbourhood:
     """What ``ArmEquations`` asks for the contact.
 
     Args:
-        model: the arm.
+        chain: the arm.
         joints_per_motor: (6, 6) joint angles per motor coordinate.
         T_flange_probe: (4, 4) probe centre on the flange, m.
         base_offset: (3,) of the arm's base, m.
@@ -283,7 +283,7 @@ class Neighbourhood:
 
     def __init__(
         self,
-        model: PumaModel,
+        chain: Chain,
         joints_per_motor: Array,
         T_flange_probe: Array,
         base_offset: Array,
@@ -293,7 +293,7 @@ class Neighbourhood:
         stiffness_n_m3: float,
         rubbing: Rubbing,
     ) -> None:
-        self.model, self.shape, self.radius = model, shape, radius
+        self.chain, self.shape, self.radius = chain, shape, radius
         self.stiffness_n_m3, self.rubbing = stiffness_n_m3, rubbing
         self._T_flange_probe, self._joints_per_motor = T_flange_probe, joints_per_motor
         self._tool: Vec = tuple(T_flange_probe[:3, 3].tolist())
@@ -308,7 +308,7 @@ class Neighbourhood:
         Args:
             theta: (6,) motor coordinates, rad.
         """
-        c = chain(self.model, self._joints(theta))
+        c = posture(self.chain, self._joints(theta))
         x, y, z = self._base
         at = point_on_flange(c, self._tool)  # of the arm's own base
         centre = at[0] + x, at[1] + y, at[2] + z
@@ -338,7 +338,7 @@ class Neighbourhood:
     def _many(self, theta: Sequence[float], touches: Touches) -> Contact:
         """Several places at once."""
         back = self._joints_per_motor
-        J = forward_jacobian(self.model, back @ theta, self._T_flange_probe)[1] @ back
+        J = forward_jacobian(self.chain, back @ theta, self._T_flange_probe)[1] @ back
         depth, n = self.radius - touches.distances, touches.normals
         d1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.9, (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))
         d1 /= np.linalg.norm(d1, axis=1)[:, None]

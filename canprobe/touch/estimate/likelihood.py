@@ -112,11 +112,12 @@ def fit_ml(touches: Touches, prior: Prior | None, quadric: bool = False) -> Surf
     T = working_frame(touches)
     R = T[:3, :3]
     d = design((touches.points - T[:3, 3]) @ R / length, touches.normals @ R, touches.noise.scaled(length, R))
-    result = fit(d, stated.rows(length), touches.whitener())
+    independent = touches.whitener()
+    result = fit(d, stated.rows(length), independent)
     problem_root = result.root
     notes: tuple[str, ...] = () if result.converged else ("the iteration did not settle",)
     if result.decision.rank == 3 and not quadric:
-        corrected = correct(result.c, result.root, d, touches.whitener())
+        corrected = correct(result.c, result.root, d, independent)
         trusted = corrected.trusted and (result.converged or corrected.misfit <= CERTAIN)
         notes += misfit_notes(corrected.misfit, trusted=trusted)
         if trusted:

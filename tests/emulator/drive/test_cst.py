@@ -13,7 +13,7 @@ from canprobe.emulator.drive.reference import torque_run
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.ideal_arm import MotorDynamics
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.kinematics import UPENN
+from canprobe.robot.puma import UPENN
 
 GAIN, COULOMB, DAMPING = 100.0, 50.0, 4.0  # of the plant of numbers
 

@@ -2,12 +2,13 @@
 
 import numpy as np
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.kinematics import ELBOW_FORM, UPENN
+from canprobe.robot.puma import UPENN
 
 CSP, CSV, CST = 8, 9, 10
 HOLD = "0f0000000000"

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import NEVER, DynamicArm, Reference, Stepping, make_arm, make_equations
@@ -11,17 +12,10 @@ from canprobe.emulator.plant.equations import Effects, rosenbrock2
 from canprobe.emulator.plant.held_step import held_rosenbrock2
 from canprobe.emulator.plant.ideal_arm import IdealArm
 from canprobe.emulator.plant.plant import Plant
+from canprobe.robot.chain import forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import start_posture
-from canprobe.robot.kinematics import (
-    ELBOW_FORM,
-    MODELS,
-    UPENN,
-    counts_per_radian,
-    forward_jacobian,
-    joints_to_counts,
-    motors_per_joint,
-    tool_z_offset,
-)
+from canprobe.robot.model import joints_per_motor, joints_to_units, units_per_motor
+from canprobe.robot.puma import MODELS, UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.touch.objects import make_object
 
@@ -35,7 +29,7 @@ NOTHING = Effects(gravity=False, coriolis=False, friction=False, links=False, co
 
 
 def config(depth=0.43e-3, shape=CYLINDER, **dynamics):
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=Dynamics(**dynamics))
 
 
@@ -87,7 +81,7 @@ def test_at_rest_the_motors_carry_the_weight_and_nothing_moves(model):
     arm.advance(500_000_000)
     assert arm.motors()[0] == pytest.approx(start, abs=1e-6)
     body = arm.equations.body
-    share = np.linalg.inv(motors_per_joint()).T @ body.gravity(STRETCHED)
+    share = joints_per_motor(UPENN).T @ body.gravity(STRETCHED)
     assert torques == pytest.approx(1e3 * share / np.array((6.4, 6.4, 6.4, 1.4, 0.7, 0.7)), abs=0.51)
     assert abs(torques[1]) > 100
 
@@ -100,8 +94,8 @@ def test_the_push_of_the_object_is_the_force_through_the_jacobian():
         a.equations.hold(state(a))
     pushed = arm.equations.rate(0.0, state(arm)) - free.equations.rate(0.0, state(free))
     mass, _ = arm.equations.mass()
-    J = forward_jacobian(UPENN, c.q0, TOOL)[1][:3]
-    expected = np.linalg.inv(motors_per_joint()).T @ J.T @ (truth["force"] * truth["contact_normal"])
+    J = forward_jacobian(UPENN.chain, c.q0, TOOL)[1][:3]
+    expected = joints_per_motor(UPENN).T @ J.T @ (truth["force"] * truth["contact_normal"])
     assert mass @ pushed[6:12] == pytest.approx(expected, rel=1e-9, abs=1e-12)
     assert truth["force"] > 1.9
 
@@ -201,8 +195,8 @@ def test_velocity_feed_forward_removes_the_lag(share):
 def test_the_wrists_coupling_moves_the_motors_of_joints_5_and_6():
     """Motor coordinates of a turn of joint 4 alone: what the master's decoupling matrix says, in counts."""
     turn = np.array((0, 0, 0, 0.1, 0, 0))
-    counts = joints_to_counts(UPENN, turn)
-    assert motors_per_joint() @ turn * counts_per_radian(UPENN) == pytest.approx(counts, abs=1e-9)
+    counts = joints_to_units(UPENN, turn)
+    assert np.linalg.inv(joints_per_motor(UPENN)) @ turn * units_per_motor(UPENN) == pytest.approx(counts, abs=1e-9)
     assert counts[4] == pytest.approx(-9.8462 * 800 * 0.1 / (2 * np.pi))
 
 

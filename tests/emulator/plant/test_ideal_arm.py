@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from puma_arm import ELBOW_FORM
 from scipy.linalg import expm
 
 from canprobe.emulator.plant.ideal_arm import IdealArm, natural_frequency, transition
-from canprobe.robot.kinematics import ELBOW_FORM, UPENN, joints_to_counts
+from canprobe.robot.model import joints_to_units
+from canprobe.robot.puma import UPENN
 
 MS = 1_000_000
 DAMPING = pytest.mark.parametrize("z", [0.4, 0.7, 1.0, 1.0000001, 1.8])
@@ -123,13 +125,13 @@ def test_axes_are_independent_and_hold_without_a_ramp():
     a.set_ramp(3, before[3], before[3] + 50.0, 0, 2 * MS)
     a.advance(1000 * MS)
     assert a.counts - before == pytest.approx((0, 0, 0, 50.0, 0, 0), abs=1e-9)
-    assert a.q == pytest.approx(UPENN.joints_per_count @ a.counts)
+    assert a.q == pytest.approx(UPENN.q_per_unit @ a.counts)
 
 
 def test_motors_not_joints_hold_the_wrist():
     """Joint 4 turned alone by its motor drags joints 5 and 6: the master has to decouple."""
     a = arm()
-    goal = joints_to_counts(UPENN, ELBOW_FORM + np.array((0, 0, 0, 0.1, 0, 0)))
+    goal = joints_to_units(UPENN, ELBOW_FORM + np.array((0, 0, 0, 0.1, 0, 0)))
     a.set_ramp(3, a.counts[3], goal[3], 0, MS)
     a.advance(2000 * MS)
     moved = a.q - ELBOW_FORM

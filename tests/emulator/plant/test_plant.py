@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from puma_arm import ELBOW_FORM
 from scipy.spatial.transform import Rotation
 
 from canprobe.emulator.plant.config import PlantConfig, PressMotion
@@ -11,8 +12,10 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS, PITCH_M, pad_direction
 from canprobe.errors import PlanError
+from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import inverse_near, start_posture
-from canprobe.robot.kinematics import ELBOW_FORM, UPENN, forward, forward_jacobian, joints_to_counts, tool_z_offset
+from canprobe.robot.model import joints_to_units
+from canprobe.robot.puma import UPENN
 from canprobe.touch.objects import make_object
 
 MS = 1_000_000
@@ -41,17 +44,17 @@ def placed(kind, yaw_deg=-48.81, tilt_deg=0.0):
 
 def plant(kind="cylinder", *, depth=0.4e-3, tilt_deg=0.0, **settings):
     shape = placed(kind, tilt_deg=tilt_deg)
-    q0 = start_posture(UPENN, POINT, (0, 0, 1), radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
+    q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-depth)
     return Plant(PlantConfig(UPENN, q0, object=shape, **settings))
 
 
 def posture_of(T_base_probe):
-    return inverse_near(UPENN, T_base_probe @ np.linalg.inv(TOOL), ELBOW_FORM)
+    return inverse_near(UPENN, T_base_probe, TOOL, ELBOW_FORM)
 
 
 def push(p, q_to, t0, t1):
     """Ramp every motor from where it is to the counts of q_to."""
-    goal = joints_to_counts(UPENN, q_to)
+    goal = joints_to_units(UPENN, q_to)
     for axis in range(6):
         p.set_ramp(axis, p.motor_counts(axis), float(goal[axis]), t0, t1)
 
@@ -84,7 +87,7 @@ def test_contact_geometry_closes_while_the_arm_moves(kind):
     for k in range(30):
         p.advance(k * CYCLE)
         t = p.truth()
-        T = forward(UPENN, t["q"]) @ TOOL
+        T = forward(UPENN.chain, t["q"]) @ TOOL
         assert t["probe_centre"] == pytest.approx(T[:3, 3], abs=1e-14)
         assert t["pole"] == pytest.approx(T[:3, 2], abs=1e-14)
         towards = T[:3, :3] @ pad_direction(*t["pad_uv"], 0.04)
@@ -98,7 +101,7 @@ def test_contact_geometry_closes_while_the_arm_moves(kind):
 def test_a_probe_that_moves_sideways_sees_the_contact_move_to_the_other_side(axis):
     """On a ball the probe's centre shifted along its own x (y) puts the contact at -u (-v) of the pad."""
     p = plant("sphere", depth=0.2e-3)
-    T = forward(UPENN, p.truth()["q"]) @ TOOL
+    T = forward(UPENN.chain, p.truth()["q"]) @ TOOL
     T[:3, 3] += 0.003 * T[:3, axis]
     truth = Plant(PlantConfig(UPENN, posture_of(T), object=placed("sphere"))).truth()
     expected = np.zeros(2)
@@ -124,7 +127,7 @@ def test_depth_rate_is_the_derivative_of_depth(kind):
 def test_depth_grows_when_the_probe_is_pushed_down():
     p = plant("plane")
     down = p.truth()["q"].copy()
-    J = forward_jacobian(UPENN, down, TOOL)[1]
+    J = forward_jacobian(UPENN.chain, down, TOOL)[1]
     push(p, down + np.linalg.solve(J, (0, 0, -1e-4, 0, 0, 0)), 0, 10 * MS)
     p.advance(5 * MS)
     assert p.truth()["depth_rate"] > 0.0
@@ -138,7 +141,7 @@ def test_damping_raises_force_while_loading_and_lowers_it_while_leaving(sign):
     for damping in (0.0, 2.0):
         p = plant("plane", damping_s_m=damping)
         q = p.truth()["q"]
-        J = forward_jacobian(UPENN, q, TOOL)[1]
+        J = forward_jacobian(UPENN.chain, q, TOOL)[1]
         push(p, q + np.linalg.solve(J, (0, 0, -sign * 1e-4, 0, 0, 0)), 0, 10 * MS)
         p.advance(8 * MS)
         truth = p.truth()
@@ -193,7 +196,7 @@ def test_image_is_the_overlap_of_probe_and_object_in_base(kind):
     """Every taxel against the signed distance of its own point: no shared formula, any flipped axis shows."""
     shape = placed(kind, tilt_deg=3.0)
     q = ELBOW_FORM + np.array((0, 0, 0, 0.05, 0.04, 0.7))
-    z = forward(UPENN, q) @ TOOL
+    z = forward(UPENN.chain, q) @ TOOL
     gap = shape.closest(z[:3, 3]).distance
     T = z.copy()
     T[:3, 3] += (0.0396 - gap) * shape.closest(z[:3, 3]).normal
@@ -201,7 +204,7 @@ def test_image_is_the_overlap_of_probe_and_object_in_base(kind):
     config = IDEAL_TAXELS.without("threshold")
     p = Plant(PlantConfig(UPENN, q, object=shape, taxels=config, damping_s_m=0.0))
     image = p.sample_image(0) / 255.0 * config.full_scale_pa
-    T = forward(UPENN, q) @ TOOL
+    T = forward(UPENN.chain, q) @ TOOL
     expected = np.zeros((16, 16))
     for i in range(16):
         for j in range(16):
@@ -219,7 +222,9 @@ def test_a_turned_tool_turns_the_pad():
     shape = placed("sphere")
     turn = np.eye(4)
     turn[:3, :3] = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    q = start_posture(UPENN, POINT + np.array((0.002, 0.001, 0.0)), (0, 0, 1), radius_m=0.0395, T_flange_probe=TOOL)
+    q = start_posture(
+        UPENN, POINT + np.array((0.002, 0.001, 0.0)), (0, 0, 1), ELBOW_FORM, radius_m=0.0395, T_flange_probe=TOOL
+    )
     straight, turned = (Plant(PlantConfig(UPENN, q, T, object=shape, taxels=IDEAL_TAXELS)) for T in (TOOL, TOOL @ turn))
     (u, v), (u90, v90) = straight.truth()["pad_uv"], turned.truth()["pad_uv"]
     assert (u90, v90) == pytest.approx((v, -u), abs=1e-12)
@@ -242,7 +247,7 @@ def test_arm_without_an_object():
     assert {k: np.shape(v) for k, v in truth.items()} == KEYS
     assert truth["in_contact"] is False
     assert all(np.all(np.isfinite(v)) for v in truth.values())
-    assert truth["probe_centre"] == pytest.approx((forward(UPENN, ELBOW_FORM) @ TOOL)[:3, 3])
+    assert truth["probe_centre"] == pytest.approx((forward(UPENN.chain, ELBOW_FORM) @ TOOL)[:3, 3])
     assert not p.sample_image(MS).any()
 
 

@@ -1,9 +1,11 @@
 """Forces of every object as the slope of one energy; several touches; energy in closed cycles."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import make_equations
@@ -12,15 +14,10 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.emulator.plant.pushing import OneTouch, force_laws, total_force
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS, SIDE
+from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import start_posture
-from canprobe.robot.kinematics import (
-    UPENN,
-    forward,
-    forward_jacobian,
-    joints_per_motor,
-    joints_to_counts,
-    tool_z_offset,
-)
+from canprobe.robot.model import joints_per_motor, joints_to_units
+from canprobe.robot.puma import UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.touch.objects import make_object
 from canprobe.touch.shapes import LIP_M
@@ -115,7 +112,7 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
-    q0 = start_posture(UPENN, point, (0, 0, 1), radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
+    q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
     settings = Dynamics(friction=friction)
     return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, **config)
 
@@ -129,7 +126,7 @@ def equations_of(config, held=False):
 def bounced(config, steps=700, h=4e-4, speed=0.05):
     """A free arm thrown at the object: kinetic energy before, and after it has left again."""
     e = equations_of(config)
-    theta = joints_to_counts(UPENN, config.q0) / np.diag(UPENN.counts)
+    theta = joints_to_units(UPENN, config.q0) / np.diag(UPENN.units_per_q)
     e.hold(e.resting(theta))
     away = e.contact.rows[0] if isinstance(e.contact, OneTouch) else e.contact._normal.mean(axis=0)
     v = -e.mass()[1] @ away
@@ -187,17 +184,17 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
     """Each touch: elastic force, its damping against the speed there, friction against the slip there."""
     shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
     config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((2e-4, 1e-4, height)), damping_s_m=5.0)
-    e, back = make_equations(config), joints_per_motor()
+    e, back = make_equations(config), joints_per_motor(UPENN)
     theta = np.linalg.solve(back, config.q0)
     rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
     e.hold(e.resting(theta))
-    centre = (forward(UPENN, config.q0) @ TOOL)[:3, 3]
+    centre = (forward(UPENN.chain, config.q0) @ TOOL)[:3, 3]
     expected = np.zeros(6)
     for normal, elastic, depth in places(shape, centre):
-        on_flange = np.linalg.solve(forward(UPENN, config.q0), (*(centre - (R - depth) * normal), 1.0))
-        step = 1e-6 * np.eye(6)
+        on_flange = np.linalg.solve(forward(UPENN.chain, config.q0), (*(centre - (R - depth) * normal), 1.0))
+        step, flange = 1e-6 * np.eye(6), partial(forward, UPENN.chain)
         J = np.array([
-            (forward(UPENN, back @ (theta + d)) @ on_flange - forward(UPENN, back @ (theta - d)) @ on_flange)[:3] / 2e-6
+            (flange(back @ (theta + d)) @ on_flange - flange(back @ (theta - d)) @ on_flange)[:3] / 2e-6
             for d in step
         ]).T  # fmt: skip
         v = J @ rate
@@ -213,10 +210,10 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
 def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
     shape = TIGHT_BOWL if kind == "tight bowl" else make_object(kind, T_base_object=POSE, **OBJECTS[kind])
     config = arm_over(shape, 3e-4, friction=0.3, point=POINT + np.array((0.0, 0.0, height)), damping_s_m=5.0)
-    e, back = make_equations(config), joints_per_motor()
+    e, back = make_equations(config), joints_per_motor(UPENN)
     theta = np.linalg.solve(back, config.q0)
     e.hold(e.resting(theta))
-    up = np.linalg.solve(forward_jacobian(UPENN, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+    up = np.linalg.solve(forward_jacobian(UPENN.chain, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
     assert not e.contact.push(theta.tolist(), up.tolist()).any()
     assert np.abs(e.contact.push(theta.tolist(), (0.01 * up).tolist())).max() > 0.1
 
@@ -224,7 +221,7 @@ def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
 def test_slopes_of_several_touches_are_those_of_their_push():
     top = POINT + np.array((2e-4, 1e-4, RESTS_AT - R))
     e = make_equations(arm_over(TIGHT_BOWL, 3e-4, point=top, damping_s_m=5.0))
-    theta = joints_to_counts(UPENN, arm_over(TIGHT_BOWL, 3e-4, point=top).q0) / np.diag(UPENN.counts)
+    theta = joints_to_units(UPENN, arm_over(TIGHT_BOWL, 3e-4, point=top).q0) / np.diag(UPENN.units_per_q)
     rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
     e.hold(e.resting(theta))
 
@@ -245,8 +242,8 @@ def test_a_plant_on_a_lip_presses_harder_while_it_sinks(speed):
     config = arm_over(TIGHT_BOWL, 3e-4, point=POINT + np.array((0.0, 0.0, RESTS_AT - R)), damping_s_m=2.0)
     plant = Plant(config)
     still = plant.state()
-    J = forward_jacobian(UPENN, config.q0, TOOL)[1]
-    rates = joints_to_counts(UPENN, np.linalg.solve(J, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
+    J = forward_jacobian(UPENN.chain, config.q0, TOOL)[1]
+    rates = joints_to_units(UPENN, np.linalg.solve(J, (0.0, 0.0, speed, 0.0, 0.0, 0.0)))
     force = plant.truth(still._replace(rates=tuple(rates.tolist())))["force"]
     upward = TIGHT_BOWL.touches(plant.truth(still)["probe_centre"], R).normals[0, 2]
     assert force == pytest.approx(plant.truth(still)["force"] * (1.0 - 1.5 * 2.0 * upward * speed), rel=1e-9)
@@ -270,12 +267,14 @@ def test_an_image_of_two_walls_shows_two_patches():
     trough = make_object("wave", T_base_object=POSE, amplitude=0.0045, wavelength=0.07)
     bottom = POINT + np.array((0.0, 0.035, -0.009))
     ball, probe = 0.045, tool_z_offset(80.0)
-    q0 = start_posture(UPENN, bottom, (0, 0, 1), radius_m=ball, T_flange_probe=probe, clearance_m=1e-5)
+    q0 = start_posture(UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=1e-5)
     for lift in np.arange(0.0, 3e-3, 2e-5):
         centre = bottom + np.array((0.0, 0.0, ball + lift))
         if trough.closest(centre).distance > ball - 4e-4:
             break
-    q0 = start_posture(UPENN, bottom, (0, 0, 1), radius_m=ball, T_flange_probe=probe, clearance_m=float(lift))
+    q0 = start_posture(
+        UPENN, bottom, (0, 0, 1), ELBOW_FORM, radius_m=ball, T_flange_probe=probe, clearance_m=float(lift)
+    )
     plant = Plant(PlantConfig(UPENN, q0, object=trough, radius_m=ball, taxels=IDEAL_TAXELS))
     assert len(trough.touches(plant.truth()["probe_centre"], ball).points) == 2
     image = plant.sample_image(5_000_000).astype(float)

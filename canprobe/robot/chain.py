@@ -1,0 +1,393 @@
+"""A serial arm as a chain of frames: where its axes and its flange are, and how a point on the flange moves.
+
+A chain is any geometry of 1 to 8 joints, revolute or prismatic. Joint i turns about, or slides along, the z axis of its
+own frame; a fixed transform leads from the frame of joint i - 1, moved by that joint, to the frame of joint i. The
+first transform holds the mount pose of the arm, the last one leads to the flange.
+
+One evaluation (`posture`) goes through the chain once and keeps axes and origins, from which poses, Jacobians and
+velocities follow. It is a plain loop on plain floats: a 2.5 ms cycle cannot pay for small numpy calls. A frame may be
+turned about its own z axis if the angle of its joint is counted from there. With that freedom every fixed rotation
+becomes a turn about x alone, which costs half of a product of matrices (`Chain._straighten`).
+
+Joint vectors q are in rad, of prismatic joints in m. Frames are spelled in names: `T_base_flange` takes flange
+coordinates to base.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from math import atan2, cos, sin
+from typing import Literal, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from canprobe.errors import PlanError
+
+Array = npt.NDArray[np.float64]
+Vec = tuple[float, float, float]
+Convention = Literal["standard", "modified"]
+MOST_JOINTS = 8
+_RIGID = 1e-9
+"""How far a fixed transform may be from a rotation with a translation."""
+
+
+class _Link(NamedTuple):
+    """From the frame of a joint to the next one: a turn or slide by q, then a translation and a turn about x.
+
+    Attributes:
+        prismatic: the joint slides.
+        offset: angle of the joint at q = 0, rad.
+        px, py, pz: translation, m.
+        c, s: cosine and sine of the turn about x.
+    """
+
+    prismatic: bool
+    offset: float
+    px: float
+    py: float
+    pz: float
+    c: float
+    s: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Chain:
+    """Geometry of a serial arm; compared by identity.
+
+    Args:
+        name: of the arm.
+        joints: names of the n joints, from the base.
+        prismatic: which of them slide along z; the others turn about it.
+        fixed: (n, 4, 4) frame of each joint at q = 0 in the frame of the joint before, of the first one in base, m.
+        T_last_flange: (4, 4) flange in the frame of the last joint, m.
+
+    Raises:
+        PlanError: no joint, more than 8, lengths that differ, or a transform that is not rigid.
+    """
+
+    name: str
+    joints: tuple[str, ...]
+    prismatic: tuple[bool, ...]
+    fixed: Array
+    T_last_flange: Array
+    _first: tuple[float, ...] = field(init=False, repr=False)
+    _links: tuple[_Link, ...] = field(init=False, repr=False)
+    _last: tuple[float, float] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        fixed, flange = np.array(self.fixed, dtype=float), np.array(self.T_last_flange, dtype=float)
+        self._refuse_odd(fixed, flange)
+        for name, array in (("fixed", fixed), ("T_last_flange", flange)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        self._straighten()
+
+    @property
+    def n(self) -> int:
+        """Number of joints."""
+        return len(self.joints)
+
+    def _refuse_odd(self, fixed: Array, flange: Array) -> None:
+        n, where = len(self.joints), f"chain {self.name!r}"
+        if not 1 <= n <= MOST_JOINTS:
+            raise PlanError([f"{where}: expected 1 to {MOST_JOINTS} joints, got {n}"])
+        if len(set(self.joints)) < n:
+            raise PlanError([f"{where}: expected a name of its own for each joint, got {', '.join(self.joints)}"])
+        if len(self.prismatic) != n or fixed.shape != (n, 4, 4) or flange.shape != (4, 4):
+            raise PlanError(
+                [
+                    f"{where}: expected {n} joint types, {n} transforms (4, 4) and one to the flange, got "
+                    f"{len(self.prismatic)}, {fixed.shape} and {flange.shape}"
+                ]
+            )
+        for place, T in zip((*self.joints, "flange"), (*fixed, flange), strict=True):
+            R = T[:3, :3]
+            rigid = np.abs(R @ R.T - np.eye(3)).max() < _RIGID and np.linalg.det(R) > 0.0
+            if not (np.all(np.isfinite(T)) and rigid and np.array_equal(T[3], (0.0, 0.0, 0.0, 1.0))):
+                raise PlanError([f"{where}: the transform to {place} is not a rotation with a translation: {T!r}"])
+
+    def _straighten(self) -> None:
+        """Turn every frame about its own z axis until the turn to the next one is about x alone.
+
+        A rotation is Rz(b) Rx(a) Rz(c). The turn b is taken over by the joint before it, c by the joint behind it.
+        """
+        first, links, before = self.fixed[0], [], 0.0
+        for prismatic, T in zip(self.prismatic, (*self.fixed[1:], self.T_last_flange), strict=True):
+            R, p = T[:3, :3], T[:3, 3]
+            b = atan2(R[0, 2], -R[1, 2])
+            M = _turn_z(-b) @ R  # Rx(a) Rz(c), whatever b is where the axes are parallel
+            px, py, pz = (_turn_z(-b) @ p).tolist()
+            links.append(_Link(prismatic, before + b, px, py, pz, float(M[2, 2]), float(-M[1, 2])))
+            before = atan2(-M[0, 1], M[0, 0])
+        object.__setattr__(self, "_first", tuple(first[:3, :].T.ravel().tolist()))
+        object.__setattr__(self, "_links", tuple(links))
+        object.__setattr__(self, "_last", (cos(before), sin(before)))
+
+
+@dataclass(slots=True, eq=False)
+class Posture:
+    """Axes and origins of a chain at some q, and its flange, in the base frame, as plain floats.
+
+    Attributes:
+        axes: unit vector of each joint.
+        origins: a point on each joint's axis, m.
+        prismatic: which joints slide.
+        x, y, z: axes of the flange.
+        flange: its origin, m.
+    """
+
+    axes: list[Vec]
+    origins: list[Vec]
+    prismatic: tuple[bool, ...]
+    x: Vec
+    y: Vec
+    z: Vec
+    flange: Vec
+
+
+def posture(chain: Chain, q: npt.ArrayLike) -> Posture:
+    """Evaluate a chain.
+
+    Args:
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
+    """
+    values: Sequence[float] = q if isinstance(q, (list, tuple)) else np.asarray(q, dtype=float).tolist()
+    axes: list[Vec] = []
+    origins: list[Vec] = []
+    x0, x1, x2, y0, y1, y2, z0, z1, z2, p0, p1, p2 = chain._first
+    for (prismatic, offset, px, py, pz, ca, sa), value in zip(chain._links, values, strict=True):
+        axes.append((z0, z1, z2))
+        origins.append((p0, p1, p2))
+        angle, rise = (offset, pz + value) if prismatic else (offset + value, pz)
+        c, s = cos(angle), sin(angle)
+        # x and the turned y; the next frame has this x, and y and z turned about it
+        w0, w1, w2 = c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2
+        x0, x1, x2 = c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2
+        p0 += px * x0 + py * w0 + rise * z0
+        p1 += px * x1 + py * w1 + rise * z1
+        p2 += px * x2 + py * w2 + rise * z2
+        y0, y1, y2 = ca * w0 + sa * z0, ca * w1 + sa * z1, ca * w2 + sa * z2
+        z0, z1, z2 = ca * z0 - sa * w0, ca * z1 - sa * w1, ca * z2 - sa * w2
+    c, s = chain._last
+    return Posture(
+        axes,
+        origins,
+        chain.prismatic,
+        (c * x0 + s * y0, c * x1 + s * y1, c * x2 + s * y2),
+        (c * y0 - s * x0, c * y1 - s * x1, c * y2 - s * x2),
+        (z0, z1, z2),
+        (p0, p1, p2),
+    )
+
+
+def forward(chain: Chain, q: npt.ArrayLike) -> Array:
+    """Flange pose.
+
+    Args:
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
+
+    Returns:
+        (4, 4) T_base_flange, m.
+    """
+    return _pose(posture(chain, q))
+
+
+def forward_jacobian(chain: Chain, q: npt.ArrayLike, T_flange_tool: Array) -> tuple[Array, Array]:
+    """Tool pose and geometric Jacobian of the tool origin.
+
+    Args:
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
+        T_flange_tool: (4, 4) tool in the flange frame, m.
+
+    Returns:
+        (4, 4) T_base_tool and (6, n) J in the base frame: rows 0-2 velocity of the tool origin (m/s), rows 3-5 angular
+        velocity (rad/s), per rate of each joint (rad/s or m/s).
+    """
+    at = posture(chain, q)
+    T_base_tool = _pose(at) @ T_flange_tool
+    x, y, z = point_jacobian(at, tuple(T_base_tool[:3, 3].tolist()))
+    turns = at.axes
+    if True in at.prismatic:
+        turns = [(0.0, 0.0, 0.0) if slides else axis for axis, slides in zip(turns, at.prismatic, strict=True)]
+    a, b, c = zip(*turns, strict=True)
+    return T_base_tool, np.array((*x, *y, *z, *a, *b, *c)).reshape(6, -1)
+
+
+def point_jacobian(at: Posture, point: Vec) -> tuple[list[float], list[float], list[float]]:
+    """Velocity of a point fixed to the flange, per joint rate.
+
+    Args:
+        at: the evaluated chain.
+        point: the point now, base frame, m.
+
+    Returns:
+        Rows x, y and z (n,) in the base frame, m/s per rad/s or m/s.
+    """
+    px, py, pz = point
+    row_x: list[float] = []
+    row_y: list[float] = []
+    row_z: list[float] = []
+    for (ax, ay, az), (ox, oy, oz), slides in zip(at.axes, at.origins, at.prismatic, strict=True):
+        if slides:
+            row_x.append(ax)
+            row_y.append(ay)
+            row_z.append(az)
+            continue
+        dx, dy, dz = px - ox, py - oy, pz - oz
+        row_x.append(ay * dz - az * dy)
+        row_y.append(az * dx - ax * dz)
+        row_z.append(ax * dy - ay * dx)
+    return row_x, row_y, row_z
+
+
+def point_on_flange(at: Posture, offset: Vec) -> Vec:
+    """Place of a point fixed to the flange, base frame, m.
+
+    Args:
+        at: the evaluated chain.
+        offset: of the point in the flange frame, m.
+    """
+    a, b, d = offset
+    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = at.x, at.y, at.z, at.flange
+    return p0 + x0 * a + y0 * b + z0 * d, p1 + x1 * a + y1 * b + z1 * d, p2 + x2 * a + y2 * b + z2 * d
+
+
+def point_velocity(at: Posture, point: Vec, qd: npt.ArrayLike) -> Vec:
+    """Velocity of a point fixed to the flange, without building the Jacobian.
+
+    Args:
+        at: the evaluated chain.
+        point: the point now, base frame, m.
+        qd: (n,) joint rates, rad/s or m/s.
+
+    Returns:
+        Velocity in the base frame, m/s.
+    """
+    rates: Sequence[float] = qd if isinstance(qd, (list, tuple)) else np.asarray(qd, dtype=float).tolist()
+    px, py, pz = point
+    vx = vy = vz = 0.0
+    for (ax, ay, az), (ox, oy, oz), slides, rate in zip(at.axes, at.origins, at.prismatic, rates, strict=True):
+        if slides:
+            vx, vy, vz = vx + rate * ax, vy + rate * ay, vz + rate * az
+            continue
+        dx, dy, dz = px - ox, py - oy, pz - oz
+        vx += rate * (ay * dz - az * dy)
+        vy += rate * (az * dx - ax * dz)
+        vz += rate * (ax * dy - ay * dx)
+    return vx, vy, vz
+
+
+def link_transforms(chain: Chain, q: npt.ArrayLike) -> list[Array]:
+    """Frame of each link in that of the link before, (4, 4) each, m.
+
+    The frame of a link is where the next joint begins, of the last link the flange: that is the frame of a standard
+    Denavit-Hartenberg row. The first transform is from base, the product of all is the flange pose.
+
+    Args:
+        chain: the arm.
+        q: (n,) joint positions, rad or m.
+    """
+    moved = [_motion(slides, value) for slides, value in zip(chain.prismatic, np.asarray(q).tolist(), strict=True)]
+    links = [motion @ T for motion, T in zip(moved, (*chain.fixed[1:], chain.T_last_flange), strict=True)]
+    return [chain.fixed[0] @ links[0], *links[1:]]
+
+
+def _pose(at: Posture) -> Array:
+    (x0, x1, x2), (y0, y1, y2), (z0, z1, z2), (p0, p1, p2) = at.x, at.y, at.z, at.flange
+    flat = (x0, y0, z0, p0, x1, y1, z1, p1, x2, y2, z2, p2, 0.0, 0.0, 0.0, 1.0)  # nested ones take numpy longer
+    return np.array(flat).reshape(4, 4)
+
+
+def _turn_z(angle: float) -> Array:
+    c, s = cos(angle), sin(angle)
+    return np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
+
+
+def _motion(slides: bool, value: float) -> Array:
+    T = np.eye(4)
+    if slides:
+        T[2, 3] = value
+    else:
+        T[:3, :3] = _turn_z(value)
+    return T
+
+
+# Chains from Denavit-Hartenberg rows.
+
+
+def from_dh(
+    rows: npt.ArrayLike,
+    convention: Convention = "standard",
+    *,
+    name: str = "arm",
+    joints: Sequence[str] | None = None,
+    prismatic: Sequence[bool] | None = None,
+    T_base_mount: Array | None = None,
+    T_last_flange: Array | None = None,
+) -> Chain:
+    """A chain from Denavit-Hartenberg rows.
+
+    Args:
+        rows: (n, 4) a in m, alpha in rad, d in m, theta in rad; q adds to theta, of a prismatic joint to d.
+        convention: "standard": a row is Rz(theta) Tz(d) Tx(a) Rx(alpha). "modified" (Craig): a row is
+            Rx(alpha) Tx(a) Rz(theta) Tz(d), with a and alpha of the link before the joint.
+        name: of the arm.
+        joints: names; joint_1, joint_2, … by default.
+        prismatic: which joints slide; none by default.
+        T_base_mount: (4, 4) where the first row begins, in base, m; base itself by default.
+        T_last_flange: (4, 4) flange in the frame behind the last row, m; that frame by default.
+
+    Raises:
+        PlanError: another convention, rows that are not (n, 4), or what `Chain` refuses.
+
+    Source: Siciliano et al., Robotics, 2.8.2 (standard); Craig, Introduction to Robotics, 3.4 (modified).
+    """
+    table = np.asarray(rows, dtype=float)
+    if table.ndim != 2 or table.shape[1] != 4:
+        raise PlanError([f"chain {name!r}: expected DH rows (n, 4) of a, alpha, d, theta, got shape {table.shape}"])
+    if convention not in ("standard", "modified"):
+        raise PlanError([f"chain {name!r}: expected DH convention standard or modified, got {convention!r}"])
+    mount = np.eye(4) if T_base_mount is None else T_base_mount
+    flange = np.eye(4) if T_last_flange is None else T_last_flange
+    steps = [dh_step(*row, convention=convention) for row in table.tolist()]
+    n = len(steps)
+    if convention == "standard":  # what a row holds besides the motion of its joint lies behind the joint
+        fixed = [mount, *steps[:-1], steps[-1] @ flange]
+    else:
+        fixed = [mount @ steps[0], *steps[1:], flange]
+    return Chain(
+        name=name,
+        joints=tuple(joints) if joints is not None else tuple(f"joint_{i}" for i in range(1, n + 1)),
+        prismatic=tuple(prismatic) if prismatic is not None else (False,) * n,
+        fixed=np.array(fixed[:-1]),
+        T_last_flange=fixed[-1],
+    )
+
+
+def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Convention = "standard") -> Array:
+    """(4, 4) of one Denavit-Hartenberg row, m and rad, see `from_dh`."""
+    ct, st, ca, sa = cos(theta), sin(theta), cos(alpha), sin(alpha)
+    if convention == "standard":
+        rows = ((ct, -st * ca, st * sa, a * ct), (st, ct * ca, -ct * sa, a * st), (0.0, sa, ca, d))
+    else:
+        rows = ((ct, -st, 0.0, a), (st * ca, ct * ca, -sa, -d * sa), (st * sa, ct * sa, ca, d * ca))
+    return np.array((*rows, (0.0, 0.0, 0.0, 1.0)))
+
+
+def tool_z_offset(offset_mm: float) -> Array:
+    """A tool frame along the flange's z axis, axes parallel.
+
+    Args:
+        offset_mm: distance from the flange, mm.
+
+    Returns:
+        (4, 4) T_flange_tool, m.
+    """
+    T_flange_tool = np.eye(4)
+    T_flange_tool[2, 3] = 1e-3 * offset_mm
+    return T_flange_tool

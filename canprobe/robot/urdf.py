@@ -1,0 +1,303 @@
+"""A serial arm out of a URDF: its chain from a base link to a tip link, what its joints can do, its bodies.
+
+Fixed joints are folded into the transforms beside them. A joint's own frame is turned until its axis is z, as `Chain`
+has it. What hangs off the path (a gripper, a cover) stands still at its zero and counts as a body of the link that
+carries it.
+
+Source: URDF specification (wiki.ros.org/urdf/XML, joint, link, inertial).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from canprobe.errors import PlanError
+from canprobe.robot.chain import Array, Chain
+from canprobe.robot.model import Joint
+
+CONTINUOUS_RAD = 2 * math.pi
+"""Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
+_MOVING = {"revolute", "continuous", "prismatic"}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """What a joint carries up to the next one, in the frame of the joint.
+
+    Attributes:
+        mass: kg.
+        com: (3,) centre of mass, m.
+        tensor: (3, 3) inertia about it, kg m^2.
+    """
+
+    mass: float
+    com: Array
+    tensor: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class UrdfArm:
+    """What a URDF says about an arm.
+
+    Attributes:
+        chain: from base to tip.
+        joints: stops, speeds, friction; the effort limit stands for the rated torque. What the file leaves out has the
+            defaults of `Joint`, but a speed limit that is missing is 0, which an `ArmModel` refuses.
+        bodies: (n,) of the joints; None for one without any inertial.
+    """
+
+    chain: Chain
+    joints: tuple[Joint, ...]
+    bodies: tuple[Body | None, ...]
+
+
+def from_urdf(
+    source: str | Path, base: str | None = None, tip: str | None = None, *, name: str | None = None
+) -> UrdfArm:
+    """Read a serial arm out of a URDF.
+
+    Args:
+        source: path of the file, or its text.
+        base: link that is the base frame; the root by default.
+        tip: link whose frame is the flange; the only link without children by default.
+        name: of the arm; the robot's by default.
+
+    Raises:
+        PlanError: no URDF, no path from base to tip, a joint on the path that a drive cannot move, or what `Chain`
+            refuses.
+    """
+    tree = _Tree.read(source)
+    path = tree.path(base or tree.root(), tip or tree.only_end())
+    places, joints, bodies = [], [], []
+    T = np.eye(4)  # from the last joint's frame, its axis along z, to where the path has come
+    turned = np.eye(4)  # of that frame within the frame that the file gives the joint
+    for edge in path:
+        T = T @ edge.T_parent_child
+        if edge.kind == "fixed":
+            continue
+        joints.append(tree.joint(edge))
+        turned = _z_along(tree.axis(edge))
+        places.append(T @ turned)
+        bodies.append(tree.body(edge, {other.name for other in path}, turned))
+        T = turned.T  # the inverse of a rotation
+    if not joints:
+        raise PlanError([f"{tree.where}: no joint moves between {base!r} and {tip!r}; choose other links"])
+    chain = Chain(
+        name=name or tree.name,
+        joints=tuple(joint.name for joint in joints),
+        prismatic=tuple(joint.prismatic for joint in joints),
+        fixed=np.array(places),
+        T_last_flange=T,
+    )
+    return UrdfArm(chain, tuple(joints), tuple(bodies))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Edge:
+    """A joint of the file."""
+
+    element: ElementTree.Element
+    name: str
+    kind: str
+    parent: str
+    child: str
+    T_parent_child: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Tree:
+    """Links and joints of a file."""
+
+    where: str
+    name: str
+    links: dict[str, ElementTree.Element]
+    into: dict[str, _Edge]
+    """The joint that carries each link."""
+
+    @classmethod
+    def read(cls, source: str | Path) -> _Tree:
+        text = str(source)
+        where = "URDF text" if text.lstrip().startswith("<") else f"URDF {text}"
+        try:
+            root = ElementTree.fromstring(text if where == "URDF text" else Path(source).read_bytes())
+        except OSError as error:
+            raise PlanError([f"{where}: cannot be read: {error.strerror or error}"]) from error
+        except ElementTree.ParseError as error:
+            raise PlanError([f"{where}: expected XML: {error}"]) from error
+        if root.tag != "robot":
+            raise PlanError([f"{where}: expected a <robot>, got <{root.tag}>"])
+        if any("xacro" in element.tag for element in root.iter()):
+            raise PlanError([f"{where}: it is a xacro; expand it first (xacro {Path(text).name} > arm.urdf)"])
+        tree = cls(where, root.get("name", "arm"), {link.get("name", ""): link for link in root.iterfind("link")}, {})
+        for element in root.iterfind("joint"):
+            edge = tree._edge(element)
+            tree.into[edge.child] = edge
+        return tree
+
+    def _edge(self, element: ElementTree.Element) -> _Edge:
+        name = element.get("name", "?")
+        parent, child = element.find("parent"), element.find("child")
+        if parent is None or child is None:
+            raise self.wrong(name, "<parent> and <child>", "one of them is missing")
+        return _Edge(
+            element=element,
+            name=name,
+            kind=element.get("type", "?"),
+            parent=parent.get("link", "?"),
+            child=child.get("link", "?"),
+            T_parent_child=self._origin(name, element.find("origin")),
+        )
+
+    def wrong(self, joint: str, expected: str, got: str) -> PlanError:
+        """What is wrong with a joint or link."""
+        return PlanError([f"{self.where}: {joint}: expected {expected}, got {got}"])
+
+    def root(self) -> str:
+        """The link that hangs on no other."""
+        return next(iter(link for link in self.links if link not in self.into), "")
+
+    def only_end(self) -> str:
+        """The link that carries no other."""
+        parents = {edge.parent for edge in self.into.values()}
+        ends = [link for link in self.links if link not in parents]
+        if len(ends) != 1:
+            raise PlanError([f"{self.where}: name the tip: one of {', '.join(ends)}"])
+        return ends[0]
+
+    def path(self, base: str, tip: str) -> list[_Edge]:
+        """The joints from base to tip."""
+        for link in (base, tip):
+            if link not in self.links:
+                raise PlanError([f"{self.where}: no link {link!r}; it has {', '.join(sorted(self.links))}"])
+        path: list[_Edge] = []
+        link = tip
+        while link != base:
+            edge = self.into.get(link)
+            if edge is None or len(path) > len(self.into):
+                raise PlanError(
+                    [f"{self.where}: {tip!r} does not hang on {base!r}, but on {link!r}; choose a base above the tip"]
+                )
+            path.insert(0, edge)
+            link = edge.parent
+        return path
+
+    def joint(self, edge: _Edge) -> Joint:
+        """What a joint of the path can do."""
+        if edge.kind not in _MOVING:
+            kinds = "revolute, continuous, prismatic or fixed on the way to the tip"
+            raise self.wrong(edge.name, kinds, edge.kind)
+        mimic = edge.element.find("mimic")
+        if mimic is not None:
+            raise self.wrong(edge.name, "a joint with a drive of its own", f"a mimic of {mimic.get('joint')}")
+        limit, dynamics = edge.element.find("limit"), edge.element.find("dynamics")
+        low, high = -CONTINUOUS_RAD, CONTINUOUS_RAD
+        if edge.kind != "continuous":
+            if limit is None:
+                raise self.wrong(edge.name, "a <limit> with lower, upper and velocity", "none")
+            low, high = self._number(edge.name, limit, "lower", 0.0), self._number(edge.name, limit, "upper", 0.0)
+        given = {
+            "rated_torque": 0.0 if limit is None else self._number(edge.name, limit, "effort", 0.0),
+            "coulomb": 0.0 if dynamics is None else self._number(edge.name, dynamics, "friction", 0.0),
+            "viscous": 0.0 if dynamics is None else self._number(edge.name, dynamics, "damping", 0.0),
+        }
+        return Joint(
+            name=edge.name,
+            prismatic=edge.kind == "prismatic",
+            q_min=low,
+            q_max=high,
+            qd_max=0.0 if limit is None else self._number(edge.name, limit, "velocity", 0.0),
+            **{key: value for key, value in given.items() if value > 0.0},
+        )
+
+    def axis(self, edge: _Edge) -> Array:
+        """(3,) unit vector in the joint's frame."""
+        element = edge.element.find("axis")
+        axis = np.array((1.0, 0.0, 0.0) if element is None else self._three(edge.name, element, "xyz"))
+        length = float(np.linalg.norm(axis))
+        if length < 1e-6:
+            raise self.wrong(edge.name, "an axis that is not zero", str(axis.tolist()))
+        unit: Array = axis / length
+        return unit
+
+    def body(self, edge: _Edge, path: set[str], turned: Array) -> Body | None:
+        """All that a joint of the path carries up to the next one, with what hangs there, in its turned frame."""
+        found = list(self._masses(edge.child, path, turned.T))
+        mass = sum(body.mass for body in found)
+        if not mass > 0.0:
+            return None
+        com = np.sum([body.mass * body.com for body in found], axis=0) / mass
+        tensor = np.zeros((3, 3))
+        for body in found:
+            off = body.com - com
+            tensor += body.tensor + body.mass * (float(off @ off) * np.eye(3) - np.outer(off, off))
+        return Body(mass, com, tensor)
+
+    def _masses(self, link: str, path: set[str], T: Array) -> Iterator[Body]:
+        """Bodies of a link and of what it carries, seen from the frame in which the link stands at T."""
+        inertial = self.links[link].find("inertial") if link in self.links else None
+        if inertial is not None:
+            yield self._inertial(link, inertial, T)
+        for edge in self.into.values():
+            if edge.parent == link and not (edge.name in path and edge.kind != "fixed"):
+                yield from self._masses(edge.child, path, T @ edge.T_parent_child)
+
+    def _inertial(self, link: str, element: ElementTree.Element, T: Array) -> Body:
+        mass, inertia = element.find("mass"), element.find("inertia")
+        if mass is None or inertia is None:
+            raise self.wrong(f"link {link}", "<mass> and <inertia> in its <inertial>", "one of them is missing")
+        names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
+        tensor = np.array([self._number(f"link {link}", inertia, name, 0.0) for name in names]).reshape(3, 3)
+        T = T @ self._origin(f"link {link}", element.find("origin"))
+        R = T[:3, :3]
+        return Body(self._number(f"link {link}", mass, "value", 0.0), T[:3, 3], R @ tensor @ R.T)
+
+    def _origin(self, name: str, element: ElementTree.Element | None) -> Array:
+        """(4, 4) of an <origin>: roll, pitch and yaw about fixed axes, then the translation."""
+        T = np.eye(4)
+        if element is None:
+            return T
+        r, p, y = self._three(name, element, "rpy", "0 0 0")
+        cr, sr, cp, sp, cy, sy = math.cos(r), math.sin(r), math.cos(p), math.sin(p), math.cos(y), math.sin(y)
+        T[:3, :3] = (
+            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+            (-sp, cp * sr, cp * cr),
+        )
+        T[:3, 3] = self._three(name, element, "xyz", "0 0 0")
+        return T
+
+    def _three(self, name: str, element: ElementTree.Element, key: str, default: str = "") -> list[float]:
+        text = element.get(key, default)
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            values = []
+        if len(values) != 3 or not all(map(math.isfinite, values)):
+            raise self.wrong(name, f"three numbers in {key} of <{element.tag}>", repr(text))
+        return values
+
+    def _number(self, name: str, element: ElementTree.Element, key: str, default: float) -> float:
+        text = element.get(key)
+        try:
+            value = default if text is None else float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise self.wrong(name, f"a number in {key} of <{element.tag}>", repr(text))
+        return value
+
+
+def _z_along(axis: Array) -> Array:
+    """(4, 4) rotation that turns z into a unit vector by a short way; one that points down is turned over before."""
+    T = np.eye(4)
+    over = np.diag((1.0, -1.0, -1.0)) if axis[2] < 0.0 else np.eye(3)
+    x, y, z = (over @ axis).tolist()
+    k = 1.0 / (1.0 + z)
+    T[:3, :3] = over @ ((1.0 - k * x * x, -k * x * y, x), (-k * x * y, 1.0 - k * y * y, y), (-x, -y, z))
+    return T

@@ -1,0 +1,7 @@
+"""A posture of the PUMA 260 that many tests begin in."""
+
+import numpy as np
+
+ELBOW_FORM = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
+"""Well-conditioned, the flange pointing down at the scan region, rad: `arm.start_deg` of the packaged scenes."""
+ELBOW_FORM.setflags(write=False)
