@@ -29,7 +29,10 @@ LENGTH_M = 0.2
 
 
 def task_rows(model: ArmModel) -> int:
-    """How many rows of a tool's pose an arm can hold.
+    """How many rows of a tool's pose an arm can hold, by its number of joints.
+
+    It stops being true where the geometry wastes a joint: five joints of which the last one rolls about the pole cannot
+    lean it sideways. Such poses are out of reach to `inverse_near`, and the step is damped as near singular poses.
 
     Args:
         model: the arm.

@@ -42,15 +42,18 @@ def scara():
 
 
 def five():
-    """Base, shoulder, elbow, wrist, roll."""
+    """Base, shoulder, elbow, wrist up and down, wrist to the side; the tool goes on along the arm.
+
+    A roll about the tool, as many arms of five joints have it last, would turn nothing of position and pole.
+    """
     rows = [
         (0.0, RIGHT, 0.2, 0.0),
         (0.25, 0.0, 0.0, 0.0),
         (0.2, 0.0, 0.0, 0.0),
-        (0.0, RIGHT, 0.0, RIGHT),
-        (0, 0, 0.1, 0),
+        (0.06, RIGHT, 0.0, 0.0),
+        (0.1, 0, 0, 0),
     ]
-    return model_of(from_dh(rows, name="five"))
+    return model_of(from_dh(rows, name="five", T_last_flange=turned("x")))
 
 
 def seven():

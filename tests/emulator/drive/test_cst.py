@@ -6,6 +6,7 @@ import math
 from itertools import pairwise
 
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
@@ -153,7 +154,7 @@ def test_cia402_59_missing_targets_stop_it(cst):
 @pytest.mark.parametrize("axis", [0, 3, 5])
 def test_cia402_cst_the_ideal_arm_needs_the_torque_that_it_is_given(drive, axis):
     """Steady motion of a real plant: 600 permille in, and its own torque model says 600 permille."""
-    plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
     drive.node = make_drive_node(load_eds("puma260_joint", axis + 1), axis + 1, axis, plant)
     drive.node.start(0)
     for index, value, size in ((0x6060, 10, 1), (0x1006, 2500, 4), (0x607F, 10**7, 4)):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
@@ -141,7 +142,7 @@ def test_cia402_55_leaving_the_mode_gives_the_run_up(homing):
 
 def test_cia402_55_a_lagging_wrist_motor_stands_on_its_pulse():
     """Axis 5 of the ideal arm, 800 counts a turn, 8 ms behind its reference: the pulse is caught where it is."""
-    plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
     node = make_drive_node(load_eds("puma260_joint", 5), 5, 4, plant)
     node.start(0)
     t_ns = 0

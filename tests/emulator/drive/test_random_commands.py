@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 import pytest
+from puma_arm import ELBOW_FORM
 
 from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
@@ -49,7 +50,7 @@ def live(rig, rng):
 def test_random_orders(rig, seed, arm):
     if arm:
         rig.drive.node = make_drive_node(
-            load_eds("puma260_joint", 1), 1, 0, Plant(PlantConfig(model=UPENN, taxels=None))
+            load_eds("puma260_joint", 1), 1, 0, Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
         )
         rig.drive.node.start(0)
         rig.put(_1019=240, _1006=2500)
