@@ -46,12 +46,8 @@ class Target:
         return cls(bus.interface, bus.channel, bus.bitrate, sensor_channel)
 
     def applied_to(self, scene: Scene) -> Scene:
-        """The scene on this bus.
-
-        Raises:
-            UsageError: a value is none that its file could have.
-        """
-        bus = with_values(scene.bus, interface=self.interface, channel=self.channel, bitrate=self.bitrate)
+        """The scene on this bus."""
+        bus = replace(scene.bus, interface=self.interface, channel=self.channel, bitrate=self.bitrate)
         sensor = scene.sensor and with_values(scene.sensor, channel=self.sensor_channel)
         return replace(scene, bus=bus, sensor=sensor)
 

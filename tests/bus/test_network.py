@@ -10,7 +10,7 @@ import pytest
 from canopen.objectdictionary import ODVariable
 from canopen.sdo import SdoAbortedError, SdoCommunicationError
 
-from canprobe.bus.lockstep import LockstepBus
+from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.network import (
     Lss,
     LssAnswerError,
@@ -39,8 +39,10 @@ def make_od() -> canopen.ObjectDictionary:
     return od
 
 
-class LocalServer:
+class LocalServer(Participant):
     """A participant around canopen's LocalNode, whose own network only collects what it sends."""
+
+    next_deadline_ns: int | None = None
 
     def __init__(self, node_id: int) -> None:
         self._out: list[Frame] = []
@@ -48,7 +50,6 @@ class LocalServer:
         network.send_message = lambda i, data, remote=False: self._out.append((i, bytes(data)))  # type: ignore[method-assign]
         self._network = network
         self.node = network.create_node(node_id, make_od())
-        self.next_deadline_ns: int | None = None
         self.later: list[tuple[int, Frame]] = []
 
     def start(self, t_ns: int) -> Sequence[Frame]:

@@ -28,7 +28,9 @@ def open_session(tmp_path, *, faults=(), change=None, nodes=None, beside=(), sce
     """A session in lockstep; `beside` are participants besides its nodes."""
     loaded = canprobe.load_scene(scene)
     loaded = replace(loaded, cycle=replace(loaded.cycle, rate_hz=rate_hz))
-    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path)
+    said = []
+    session = Session(replace(loaded, bring_up=replace(loaded.bring_up, **bring_up)), tmp_path, say=said.append)
+    session.said = said
     world = session.world
     for node in world.nodes:
         if nodes is not None:

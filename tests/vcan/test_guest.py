@@ -12,7 +12,7 @@ import pytest
 
 from canprobe.bus.socketcan import has_socketcan
 from canprobe.vcan.guest import PROGRAM, GuestError, GuestJob, is_installed
-from canprobe.vcan.launch import Signals, supervise
+from canprobe.vcan.launch import supervise
 
 CANPROBE = (sys.executable, "-c", "import sys; from canprobe.cli import main; sys.exit(main())")
 ROOT = Path(__file__).parents[2]
@@ -99,7 +99,7 @@ def test_a_guest_that_panics_is_told_from_a_command_that_fails(tmp_path: Path) -
         GuestJob(["sh", "-c", "echo c > /proc/sysrq-trigger; sleep 600"], os.environ) as job,
         pytest.raises(GuestError, match="the guest ended before the command did: Kernel panic - not syncing") as caught,
     ):
-        supervise(job, Signals(), None)
+        supervise(job, [], None)
     assert caught.value.started
 
 
