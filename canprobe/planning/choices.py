@@ -20,7 +20,8 @@ from canprobe.planning.traffic import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.window import TOLERATED, cut_patch, measured_share, patch_across_taxels, window_choices
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.protocol.tactile import WINDOW, WINDOWS
-from canprobe.scene.setup import ArrayMode, Setup, Touch, Touching
+from canprobe.robot.inverse import FIXED_POLE, FULL_POSE, task_rows
+from canprobe.scene.setup import Arm, ArrayMode, Setup, Touch, Touching
 
 # What a scene leaves to the plan ("auto"), and in which order the plan tries it.
 
@@ -323,6 +324,15 @@ def outputs(setup: Setup, absent: Container[str]) -> tuple[str, ...]:
     return (*(file for file, is_written in written.items() if is_written), *bridge_outputs(setup))
 
 
+def _held_rows(arm: Arm) -> str:
+    name = f"the {arm.model.name} arm of {arm.model.n} joints"
+    if task_rows(arm.model) == FIXED_POLE:
+        return (
+            f"{name} keeps the orientation of the probe: task.rolling_share is 1, and the contact wanders on the array"
+        )
+    return f"{name} holds position and pole of the probe and leaves the turn about the pole free"
+
+
 # What a plan carries out and yet says first: where the numbers in it do not hold.
 
 
@@ -331,6 +341,8 @@ def warnings(setup: Setup, pdos: Sequence[PlannedPdo]) -> Iterator[str]:
     cut, bus = cut_patch(setup), setup.bus
     if cut is not None:
         yield f"{cut.text}; {' or '.join(cut.ways)} leaves less than {100 * TOLERATED:.0f} % outside"
+    if setup.arm is not None and setup.touch is not None and task_rows(setup.arm.model) < FULL_POSE:
+        yield _held_rows(setup.arm)
     if bus.bit_error_rate > 0 and pdos:
         longest = max(pdo.bits_worst for pdo in pdos)
         lost = 1.0 - (1.0 - bus.bit_error_rate) ** longest

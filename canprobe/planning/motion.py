@@ -13,8 +13,8 @@ from canprobe.errors import PlanError
 from canprobe.planning.model import JointSpeeds
 from canprobe.planning.window import PITCH_M
 from canprobe.protocol.tactile import SIDE
-from canprobe.robot.chain import forward
-from canprobe.robot.inverse import inverse_near, probe_pose
+from canprobe.robot.chain import forward, forward_jacobian
+from canprobe.robot.inverse import FIXED_POLE, LENGTH_M, in_rows, inverse_near, probe_pose, task_rows
 from canprobe.scene.setup import Approach, Arm, Calibrate, Free, Probe, SafetyLimits, Setup, Touch
 from canprobe.touch.shapes import PlacedShape
 
@@ -24,6 +24,7 @@ SAMPLES = 240
 """Points of a path."""
 _STEEPEST = math.radians(70.0)  # the servo steers in the scan plane: steeper than this it cannot follow
 _BRANCH_RAD = 0.3  # between two points of a path; farther away lies another branch
+_SINGULAR = 1e-3  # of the Jacobian in rows of a posture from which an arm cannot go on
 _TOUCH_TO_TOUCH_RAD = 1.0  # between the touches of a calibration
 
 
@@ -141,6 +142,9 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
         return None, []
     stops = _Stops(setup.arm, setup.limits)
     problems = stops.start_problems()
+    if (lacking := _lacking_rows(setup)) is not None:
+        return None, [*problems, lacking]
+    speeds: JointSpeeds | None
     try:
         match setup.task:
             case Free() as task:
@@ -157,6 +161,30 @@ def check_motion(setup: Setup) -> tuple[JointSpeeds | None, list[str]]:
     except PlanError as error:
         return None, [*problems, *error.problems]
     return speeds, problems + found
+
+
+def _lacking_rows(setup: Setup) -> str | None:
+    """What the task needs of the probe's pose and the arm cannot do, whatever the path; None where nothing."""
+    arm, task = setup.arm, setup.task
+    if arm is None or not isinstance(task, Touch | Calibrate):
+        return None
+    rows, name = task_rows(arm.model), arm.model.name
+    if isinstance(task, Calibrate) and rows < 5:
+        return (
+            f"task.kind: a calibration tilts the probe, and the {name} arm of {arm.model.n} joints holds its tilt fixed"
+        )
+    T, J = forward_jacobian(arm.model.chain, arm.q_start, task.probe.T_flange_probe)
+    held = in_rows(rows, T[:3, :3], J) * arm.model.radian
+    held[:3] /= LENGTH_M
+    weakest = float(np.linalg.svd(held, compute_uv=False)[-1]) if len(held) <= arm.model.n else 0.0
+    if weakest > _SINGULAR:
+        return None
+    what = {3: "its position", 5: "its position and pole", 6: "its pose"}[rows]
+    return (
+        f"joints: in its start posture the {name} arm of {arm.model.n} joints cannot move the probe's centre and pole "
+        f"in every direction that a touch needs ({what}; smallest singular value {weakest:.2g}, needed {_SINGULAR:g}): "
+        "start from another posture, or use an arm that can"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +243,10 @@ def _too_fast(arm: Arm, speeds: JointSpeeds, way_out: str) -> list[str]:
     ]
 
 
-def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSpeeds, list[str]]:
+def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSpeeds | None, list[str]]:
+    problems = _off_array(task, path)
+    if problems:
+        return None, problems
     joints = _follow(task.arm, task.probe, _along_path(task, path))
     problems = stops.problems(joints)
     if task.scan is None:
@@ -226,6 +257,28 @@ def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSp
     possible = 1e3 * task.scan.speed / max(speeds.worst_share, 1.0) * 0.99
     way_out = f"lower task.speed_mm_s to {possible:.3g}, turn task.heading_deg, or raise task.rolling_share"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
+
+
+def _off_array(task: Touch, path: SurfacePath) -> list[str]:
+    """That the contact leaves the array where the pole does not follow the normal."""
+    along = np.clip(np.sum(path.normals * _poles(task, path), axis=1), -1.0, 1.0)
+    most, reach = float(np.arccos(along).max()), 0.5 * SIDE * PITCH_M / task.probe.radius
+    if most <= reach:
+        return []
+    held = task_rows(task.arm.model) == FIXED_POLE
+    mend = "use an arm that tilts the probe" if held else "lower task.rolling_share"
+    return [
+        f"task: the contact would leave the array: the normal of the object is up to {math.degrees(most):.1f} deg from "
+        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or {mend}"
+    ]
+
+
+def _poles(task: Touch, path: SurfacePath) -> Array:
+    """(n, 3) pole of the probe, away from the object, at each contact."""
+    share = task.scan.rolling_share if task.scan is not None else float(task_rows(task.arm.model) == FIXED_POLE)
+    poles = (1 - share) * path.normals + share * task.approach.normal
+    unit: Array = poles / np.linalg.norm(poles, axis=1)[:, None]
+    return unit
 
 
 def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeeds, list[str]]:
@@ -265,12 +318,10 @@ class _Pose:
 
 def _along_path(task: Touch, path: SurfacePath) -> Iterator[_Pose]:
     """The lifted start, then the contacts."""
-    radius, first = task.probe.radius, task.approach.normal
-    share = task.scan.rolling_share if task.scan is not None else 1.0
+    radius, poles = task.probe.radius, _poles(task, path)
     lifted = path.points[0] + path.normals[0] * task.approach.clearance
-    for point, normal in zip((lifted, *path.points), (path.normals[0], *path.normals), strict=True):
-        pole = (1 - share) * normal + share * first
-        pole /= np.linalg.norm(pole)
+    contacts = zip((lifted, *path.points), (path.normals[0], *path.normals), (poles[0], *poles), strict=True)
+    for point, normal, pole in contacts:
         out_of_reach = (
             f"task: contact at {_mm(point)} mm out of reach: {{why}}; move the object, shorten the "
             "path, or set start_deg of the joints to another branch"

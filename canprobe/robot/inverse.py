@@ -28,6 +28,10 @@ LENGTH_M = 0.2
 """Makes linear rows comparable to angular ones: about the length of a link."""
 
 
+FULL_POSE, FIXED_POLE = 6, 3
+"""Rows of an arm that holds a whole pose, and of one that holds the position alone."""
+
+
 def task_rows(model: ArmModel) -> int:
     """How many rows of a tool's pose an arm can hold, by its number of joints.
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import PlanError
+from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.arms import Bodies, arm_model, start_posture, swing
@@ -170,18 +171,18 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     return Touch(
         **touching,
         gains=SurfaceGains(servo.surface_height_hz, servo.surface_tilt_hz),
-        scan=_scan(settings) if scanning else None,
+        scan=_scan(settings, arm) if scanning else None,
         shape=_shape(scene.shape) if scanning and scene.shape is not None else None,
     )
 
 
-def _scan(settings: TaskSettings) -> Scan:
+def _scan(settings: TaskSettings, arm: Arm) -> Scan:
     sizes = (settings.length_mm * MM, settings.width_mm * MM, settings.wavelength_mm * MM)
     return Scan(
         strategy=make_strategy(settings.strategy, *sizes),
         name=settings.strategy,
         speed=settings.speed_mm_s * MM,
-        rolling_share=settings.rolling_share,
+        rolling_share=1.0 if task_rows(arm.model) == FIXED_POLE else settings.rolling_share,
         regain=settings.regain_mm * MM,
     )
 

@@ -1,0 +1,72 @@
+"""What arms of few or many joints can be asked for, and what the plan says of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+import canprobe
+from canprobe.errors import PlanError
+from canprobe.scene.load import load_scene, parse_scene
+
+TWO_AXES = """
+[scene]
+name = "two"
+[cell]
+[arm]
+[sensor]
+[joints.a]
+min_deg = -170
+max_deg = 170
+speed_deg_s = 90
+counts_per_turn = 4096
+a_mm = 300
+[joints.b]
+min_deg = -170
+max_deg = 170
+speed_deg_s = 90
+start_deg = 45
+counts_per_turn = 4096
+a_mm = 300
+[object]
+kind = "plane"
+[task]
+kind = "press"
+"""
+
+
+def refusal(scene):
+    with pytest.raises(PlanError) as refused:
+        canprobe.plan(scene)
+    return str(refused.value)
+
+
+def test_a_gantry_keeps_its_pole_and_the_plan_says_so():
+    plan = canprobe.plan(load_scene("plane", "gantry"))
+    assert plan.setup.task.scan.rolling_share == 1.0
+    assert any("keeps the orientation of the probe" in warning for warning in plan.warnings)
+
+
+def test_a_contact_that_leaves_the_array_is_refused_with_the_angle():
+    said = refusal(load_scene("cylinder", "gantry"))
+    assert "up to 30.0 deg from the probe's pole" in said
+    assert "the array reaches 18.2 deg" in said
+
+
+def test_a_wide_cylinder_stays_on_the_array_of_a_gantry():
+    scene = load_scene("cylinder", "gantry")
+    canprobe.plan(replace(scene, object=replace(scene.object, radius_mm=100.0)))
+
+
+def test_a_calibration_without_tilt_is_refused():
+    assert "a calibration tilts the probe" in refusal(load_scene("calibrate", "gantry"))
+
+
+def test_two_joints_cannot_press():
+    assert "cannot move the probe's centre and pole in every direction" in refusal(parse_scene(TWO_AXES))
+
+
+def test_a_full_arm_is_warned_of_nothing():
+    for cell in ("puma260", "puma560"):
+        assert canprobe.plan(load_scene("cylinder", cell)).warnings == ()
