@@ -221,6 +221,7 @@ def _candidates(folder: Path) -> Iterator[str]:
     from canprobe.scene.load import parse_scene
     from canprobe.scene.resolve import resolve
 
+    plain = []
     for rate in _RATES_HZ:
         head = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
         cycle = "" if rate == _RATES_HZ[0] else f"\n[cycle]\nrate_hz = {rate!r}\n"
@@ -230,7 +231,8 @@ def _candidates(folder: Path) -> Iterator[str]:
         assert setup.arm is not None
         for speed, length in ((10, 20), (5, 10)):
             yield head + cycle + _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
-        yield free
+        plain.append(free)
+    yield from plain
 
 
 def _touch(model: ArmModel, q: NDArray[Any], T_flange_probe: NDArray[Any], speed: float, length: float) -> str:
