@@ -30,6 +30,7 @@ examples:
   canprobe run my-cell/first.toml
 """
 _RATES_HZ = (400.0, 1000 / 3, 250.0, 200.0, 125.0, 100.0, 50.0)
+_SENSOR_HZ = 200.0
 _TRIES = 400
 _GEAR, _COUNTS_PER_TURN, _COUNTS_PER_M = 100, 10_000, 1_000_000
 
@@ -225,12 +226,13 @@ def _candidates(folder: Path) -> Iterator[str]:
     for rate in _RATES_HZ:
         head = 'cell = "cell.toml"\n\n[scene]\nname = "first"\ntitle = "First run on the emulator"\n'
         cycle = "" if rate == _RATES_HZ[0] else f"\n[cycle]\nrate_hz = {rate!r}\n"
-        cycle += f"\n[sensor]\nrate_hz = {min(200.0, rate)!r}\n" if rate < 200.0 else ""
+        sensor = f"\n[sensor]\nrate_hz = {rate!r}\n" if rate < _SENSOR_HZ else ""
         free = head + cycle + '\n[task]\nkind = "free"\nduration_s = 5\n'
         setup = resolve(parse_scene(free, folder=folder))
         assert setup.arm is not None
         for speed, length in ((10, 20), (5, 10)):
-            yield head + cycle + _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
+            touch = _touch(setup.arm.model, setup.arm.q_start, setup.probe.T_flange_probe, speed, length)
+            yield head + cycle + sensor + touch
         plain.append(free)
     yield from plain
 
