@@ -23,10 +23,9 @@ from canprobe.planning.model import Plan
 from canprobe.results.files import save_surface_map
 from canprobe.results.scores import ShapeScore, bound_of_scan, score_contact, score_shape
 from canprobe.scene.geometry import FILE, calibration_lines, summarise_calibration, tool_text
-from canprobe.scene.load import dump_scene
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
-from canprobe.session.session import Session
+from canprobe.session.session import Session, write_scene
 from canprobe.session.target import LOCKSTEP
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker
 from canprobe.tasks.task import TaskRecord
@@ -419,7 +418,7 @@ def write_files(result: RunResult, out: Path) -> None:
         ResultsError: a file cannot be written; no part of it is left.
     """
     write_text(out / "summary.json", json.dumps(result.summary, indent=2, allow_nan=False, ensure_ascii=False) + "\n")
-    write_text(out / "scene.toml", dump_scene(result.plan.scene))
+    write_scene(result.plan.scene, out)
     write_npz(out / "log.npz", result.log)
     if (found := result.summary["calibration"]) is not None and (text := tool_text(found, result.plan.scene.name)):
         write_text(out / FILE, text)

@@ -27,6 +27,8 @@ from canprobe.scene.rules import SECTIONS_OF_TASK, broken_rules
 DEFAULT_CELL = "puma260"
 """Cell of a scene that names none."""
 _ALWAYS = ("scene", "task", "bus", "cycle", "limits", "bring_up")
+FILE_KEYS = {"eds", "urdf"}
+"""Keys whose files a saved scene takes along."""
 _ESCAPES = {'"': '\\"', "\\": "\\\\", "\n": "\\n", "\t": "\\t", "\r": "\\r", "\b": "\\b", "\f": "\\f"}
 
 
@@ -53,6 +55,38 @@ def _keys(section: Any) -> str:
         if value is not None and all(getattr(section, one.key) in one.values for one in only):
             lines += f"{field.name} = {toml_value(value)}\n"
     return lines
+
+
+def with_files_beside(scene: Scene) -> tuple[Scene, dict[str, Path]]:
+    """The scene with names in the place of the paths of its EDS and URDF files, and the files by these names.
+
+    A folder with `dump_scene` of it and the files loads as the scene, wherever the folder is moved. Packaged files keep
+    their names.
+    """
+    files: dict[str, Path] = {}
+
+    def beside(section: Any) -> Any:
+        annotations = typing.get_type_hints(type(section), include_extras=True)
+        names = {}
+        for key in FILE_KEYS & set(annotations):
+            value = getattr(section, key)
+            if value is None or not isfile(value):
+                continue
+            path, number = Path(value), 1
+            name = path.name
+            while files.setdefault(name, path) != path:
+                number += 1
+                name = f"{path.stem}-{number}{path.suffix}"
+            names[key] = name
+        return dataclasses.replace(section, **names) if names else section
+
+    parts = {field.name: getattr(scene, field.name) for field in dataclasses.fields(scene)}
+    moved: dict[str, Any] = {
+        name: {key: beside(section) for key, section in part.items()} if isinstance(part, Mapping) else beside(part)
+        for name, part in parts.items()
+        if part is not None
+    }
+    return dataclasses.replace(scene, **moved), files
 
 
 def toml_key(key: str) -> str:

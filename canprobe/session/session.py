@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import CandumpWriter, RecordingPort, write_npz, write_text
+from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz, write_text
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
@@ -32,7 +32,7 @@ from canprobe.planning.model import Plan
 from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene.load import dump_scene
+from canprobe.scene.load import dump_scene, with_files_beside
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
@@ -177,6 +177,20 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
     check_bridges(names)
     known = settings or BridgeSettings()
     return replace(known, use=tuple(dict.fromkeys((*known.use, *names))))  # type: ignore[arg-type]
+
+
+def write_scene(scene: Scene, folder: Path) -> None:
+    """Write `scene.toml` into a folder, with the EDS and URDF files that it names beside it.
+
+    Raises:
+        ResultsError: a file cannot be written; no part of it is left.
+    """
+    moved, files = with_files_beside(scene)
+    for name, path in files.items():
+        content = path.read_bytes()
+        with whole_file(folder / name) as part:
+            part.write_bytes(content)
+    write_text(folder / "scene.toml", dump_scene(moved))
 
 
 class Session:
@@ -344,7 +358,7 @@ class Session:
                 for name in LEFT_BY_RUNS:
                     (self.out / name).unlink(missing_ok=True)  # of an earlier run
                 with contextlib.suppress(CanprobeError):  # it is written again at the end, and a failure reported then
-                    write_text(self.out / "scene.toml", dump_scene(self.scene))
+                    write_scene(self.scene, self.out)
             write = self._candump.on(channel)
         if self.observers is not None:
             self.observers.origin_ns = self.origin_ns

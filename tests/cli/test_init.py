@@ -1,0 +1,101 @@
+"""`canprobe init`: a cell file and a first scene from files that nobody here wrote, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import tomllib
+
+import pytest
+
+from canprobe.cli import main
+from canprobe.scene.load import load_scene
+from canprobe.scene.resolve import resolve
+
+URDF = """<robot name="lab">
+  <link name="floor"/><link name="carriage"/><link name="l1"/><link name="l2"/><link name="l3"/><link name="l4"/>
+  <link name="l5"/><link name="l6"/>
+  <joint name="rail" type="prismatic"><parent link="floor"/><child link="carriage"/><axis xyz="0 1 0"/>
+    <limit lower="-0.5" upper="0.5" effort="300" velocity="0.5"/></joint>
+  <joint name="j1" type="revolute"><parent link="carriage"/><child link="l1"/><origin xyz="0 0 0.3"/>
+    <axis xyz="0 0 1"/><limit lower="-3" upper="3" effort="50" velocity="2"/></joint>
+  <joint name="j2" type="revolute"><parent link="l1"/><child link="l2"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="50" velocity="2"/></joint>
+  <joint name="j3" type="revolute"><parent link="l2"/><child link="l3"/><origin xyz="0 0 0.4"/><axis xyz="0 1 0"/>
+    <limit lower="-2.5" upper="2.5" effort="50" velocity="2"/></joint>
+  <joint name="j4" type="revolute"><parent link="l3"/><child link="l4"/><origin xyz="0 0 0.35"/><axis xyz="0 0 1"/>
+    <limit lower="-3" upper="3" effort="20" velocity="3"/></joint>
+  <joint name="j5" type="revolute"><parent link="l4"/><child link="l5"/><axis xyz="0 1 0"/>
+    <limit lower="-2" upper="2" effort="20" velocity="3"/></joint>
+  <joint name="j6" type="continuous"><parent link="l5"/><child link="l6"/><origin xyz="0 0 0.08"/>
+    <axis xyz="0 0 1"/></joint>
+</robot>
+"""
+
+
+@pytest.fixture
+def urdf(tmp_path):
+    path = tmp_path / "lab.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys):
+    folder = tmp_path / "my cell"
+    assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
+    assert "next: canprobe plan" in capsys.readouterr().out
+    out = tmp_path / "run"
+    assert main(["run", str(folder / "first.toml"), "--duration", "1", "--out", str(out), "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["completed"]
+    assert summary["contact"]["contact_fraction"] == 1.0
+    cell = tomllib.loads((folder / "cell.toml").read_text())
+    assert list(cell["joints"]) == ["rail", "j1", "j2", "j3", "j4", "j5", "j6"]
+    assert cell["joints"]["rail"]["kind"] == "prismatic"
+    assert cell["joints"]["j6"]["speed_deg_s"] > 0, "the URDF has none"
+
+
+def test_a_run_takes_the_files_of_its_cell_along(tmp_path, urdf, capsys):
+    folder, out = tmp_path / "cell", tmp_path / "run"
+    assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
+    assert main(["run", str(folder / "first.toml"), "--duration", "0.5", "--out", str(out)]) == 0
+    before = resolve(load_scene(folder / "first.toml"))
+    shutil.rmtree(folder)
+    out.rename(tmp_path / "moved")
+    again = resolve(load_scene(tmp_path / "moved" / "scene.toml"))
+    assert (again.arm.model.chain.fixed == before.arm.model.chain.fixed).all()
+    assert main(["replay", str(tmp_path / "moved")]) == 0
+
+
+def test_without_a_urdf_the_file_begins_with_rows(tmp_path, capsys):
+    assert main(["init", str(tmp_path / "cell")]) == 0
+    assert main(["plan", str(tmp_path / "cell" / "first.toml")]) == 0
+    assert "a_mm" in (tmp_path / "cell" / "cell.toml").read_text()
+
+
+def test_a_cell_alone_is_planned_as_free_motion(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    assert main(["plan", str(tmp_path / "cell" / "cell.toml")]) == 0
+    assert "free" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--tip", "l6"], "give it with --urdf FILE"),
+        (["--urdf", "nowhere.urdf"], "nowhere.urdf: no such file"),
+        (["--urdf", "URDF", "--tip", "hand"], "no link 'hand'; it has"),
+        (["--urdf", "URDF", "--eds", "URDF", "--eds", "URDF"], "one for each of the 7 joints, got 2"),
+    ],
+)
+def test_what_is_refused(tmp_path, urdf, capsys, arguments, said):
+    words = [str(urdf) if word == "URDF" else word for word in arguments]
+    assert main(["init", str(tmp_path / "cell"), *words]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "cell" / "first.toml").exists()
+
+
+def test_nothing_is_overwritten(tmp_path, urdf, capsys):
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 0
+    assert main(["init", str(tmp_path / "cell"), "--urdf", str(urdf)]) == 2
+    assert "exists already" in capsys.readouterr().err
