@@ -7,7 +7,7 @@ import dataclasses
 import inspect
 import itertools
 import typing
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,14 @@ DOCS = Path(__file__).parent
 UNITS = {  # the longest suffix that fits
     "bitrate": "bit/s",
     "n_m3": "N/m³",
+    "kg_m2": "kg m²",
+    "nm_s": "N m s",
+    "n_s_m": "N s/m",
+    "deg_s2": "°/s²",
+    "mm_s2": "mm/s²",
+    "deg_s": "°/s",
+    "nm": "N m",
+    "counts": "units of the drive",
     "mm_s": "mm/s",
     "s_m": "s/m",
     "percent": "%",
@@ -42,7 +50,7 @@ A scene is a TOML file. `canprobe scenes` lists the packaged ones and prints the
 change it. `canprobe plan FILE` checks a scene and reports every mistake at once, with the key and, where a name is
 misspelt, the name that was probably meant.
 
-A key that a scene leaves out has its default. The suffix of a key is its unit. Numbers may be written with or without
+A key that a scene leaves out has the value of its cell ([Your own arm](own-arm.md)), or else its default. The suffix of a key is its unit. Numbers may be written with or without
 a decimal point. `"auto"` leaves the choice to the plan, which prints what it chose and why.
 
 This page is generated from the definition of a scene: `python docs/generate.py`.
@@ -50,7 +58,7 @@ This page is generated from the definition of a scene: `python docs/generate.py`
 ## Sections and tasks
 
 `[scene]` and `[task]` are needed in every scene; `[bus]`, `[cycle]`, `[limits]`, `[bring_up]` and `[bridge]` may stand
-in every scene. The other sections depend on `task.kind`. *required*: the scene must have the section. *default*: a
+in every scene. `[cell]`, `[arm]`, `[joints.NAME]`, `[sensor]`, `[probe]` and `[emulate]` usually come from the cell file. The other sections depend on `task.kind`. *required*: the scene must have the section. *default*: a
 scene without the section has all its defaults. *optional*: a scene without the section does without it. *–*: the
 section is an error.
 """
@@ -58,7 +66,7 @@ section is an error.
 
 def scene_keys() -> str:
     """The page of all scene keys."""
-    sections = [(name, _class_of(hint)) for name, hint in typing.get_type_hints(Scene).items()]
+    sections = [(name, section_class(hint)) for name, hint in typing.get_type_hints(Scene).items()]
     return "\n".join([INTRODUCTION, *_needs(), "", *(line for name, cls in sections for line in _section(name, cls))])
 
 
@@ -73,8 +81,10 @@ def meanings(cls: type[Any]) -> dict[str, str]:
     }
 
 
-def _class_of(hint: Any) -> type[Any]:
-    cls: type[Any] = next(iter(typing.get_args(hint)), hint)
+def section_class(hint: Any) -> type[Any]:
+    """The dataclass of a section, from its annotation in a scene."""
+    parts = typing.get_args(hint)
+    cls: type[Any] = parts[1] if typing.get_origin(hint) is Mapping else next(iter(parts), hint)
     return cls
 
 
@@ -84,13 +94,14 @@ def _needs() -> Iterator[str]:
     yield "| --- |" + " --- |" * len(tasks)
     for section in SECTIONS_OF_TASK[tasks[0]]:
         needs = (NEEDS[SECTIONS_OF_TASK[task][section][0]] for task in tasks)
-        yield f"| [`[{section}]`](#{section}) | {' | '.join(needs)} |"
+        title = "joints.NAME" if section == "joints" else section
+        yield f"| [`[{title}]`](#{title.lower().replace('.', '')}) | {' | '.join(needs)} |"
 
 
 def _section(name: str, cls: type[Any]) -> Iterator[str]:
     head, _, rest = (inspect.getdoc(cls) or "").partition("\n\n")
     about = head.partition(": ")[2].replace("\n", " ")
-    yield f"## `[{name}]`\n"
+    yield f"## `[{'joints.NAME' if name == 'joints' else name}]`\n"
     yield about[0].upper() + about[1:]
     if rest:
         yield f"\n{rest}"

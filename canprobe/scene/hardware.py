@@ -139,21 +139,21 @@ class JointSettings:
     noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
     """Standard deviation of the emulated encoder."""
     rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
-    """Continuous torque of the drive at the joint; 6071h and 6077h count in thousandths of it. [10]"""
+    """Continuous torque of the drive at the joint; 6071h and 6077h count in thousandths of it. Left out: that of the URDF, or 10."""
     rotor_inertia_kg_m2: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
-    """Inertia of the motor at the joint. [0.02]"""
+    """Inertia of the motor at the joint. Left out: 0.05."""
     coulomb_nm: Annotated[float | None, Range(0, 1e6), TURNS] = None
-    """Coulomb friction at the joint. [a tenth of the continuous torque]"""
+    """Coulomb friction at the joint. Left out: that of the URDF, or 0.5."""
     viscous_nm_s: Annotated[float | None, Range(0, 1e6), TURNS] = None
-    """Viscous friction at the joint. [0.1]"""
+    """Viscous friction at the joint. Left out: that of the URDF, or 0.3."""
     rated_force_n: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
-    """Continuous force of the drive. [200]"""
+    """Continuous force of the drive. Left out: 200."""
     rotor_mass_kg: Annotated[float | None, Range(0, 1e6, open_low=True), SLIDES] = None
-    """Inertia of the motor, seen at the carriage. [5]"""
+    """Inertia of the motor, seen at the carriage. Left out: 5."""
     coulomb_n: Annotated[float | None, Range(0, 1e6), SLIDES] = None
-    """Coulomb friction. [a tenth of the continuous force]"""
+    """Coulomb friction. Left out: 20."""
     viscous_n_s_m: Annotated[float | None, Range(0, 1e6), SLIDES] = None
-    """Viscous friction. [20]"""
+    """Viscous friction. Left out: 20."""
     mass_kg: Annotated[float | None, Range(0, 1e5)] = None
     """Mass of the link behind the joint. Without the masses of all links an arm of rows cannot be `dynamic`."""
     com_mm: Vec3 = (0.0, 0.0, 0.0)

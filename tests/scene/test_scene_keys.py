@@ -14,7 +14,7 @@ _spec = importlib.util.spec_from_file_location("generate", DOCS / "generate.py")
 generate = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(generate)
 
-SECTIONS = {name: next(iter(typing.get_args(hint)), hint) for name, hint in typing.get_type_hints(Scene).items()}
+SECTIONS = {name: generate.section_class(hint) for name, hint in typing.get_type_hints(Scene).items()}
 
 
 @pytest.mark.parametrize("section", SECTIONS)
