@@ -71,22 +71,41 @@ class DriveLoop:
 # What a drive reports of itself: actual and demand values, brought up to date only where somebody reads them.
 #
 # Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
-# Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
+# Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h, 60FDh.
 
 _I16, _I32 = 1 << 15, 1 << 31
 _TORQUES = (0x6074, 0x6077)
+NEGATIVE_SWITCH, POSITIVE_SWITCH = 1, 2
+"""Bits of 60FDh."""
 
 
 class DriveFeedback:
     """Actual values of one axis.
+
+    Args:
+        node: the drive's.
+        axis: of the plant, 0-based.
+        plant: shared with the other drives.
+        motion: reference of the axis.
+        units: of the drive.
+        noise: what the encoder adds to a position, counts; None: nothing.
 
     Attributes:
         counts: motor position at the last `measure`.
         plant_torque: returns the torque that the plant needs for its motion now, permille.
     """
 
-    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
-        self._core, self._axis, self._plant = node.core, axis, plant
+    def __init__(
+        self,
+        node: SlaveNode,
+        axis: int,
+        plant: AxisPlant,
+        motion: Motion,
+        units: Units,
+        *,
+        noise: Callable[[], float] | None,
+    ) -> None:
+        self._core, self._axis, self._plant, self._units, self._noise = node.core, axis, plant, units, noise
         self.counts = 0.0
         self._velocity = 0.0
         self._t_ns: int | None = None
@@ -97,6 +116,7 @@ class DriveFeedback:
             0x606B: lambda: motion.speed(self._t_ns or 0) / units.speed_scale,
             0x606C: lambda: self._velocity / units.speed_scale,
             0x60F4: lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale,
+            0x60FD: self.switches,
         }
         self.show_torque(self.plant_torque)
         for index in self._sources:
@@ -116,10 +136,25 @@ class DriveFeedback:
         if t_ns != last_ns:
             self._plant.advance(t_ns)
             counts = self._plant.motor_counts(self._axis)
+            if self._noise is not None:
+                counts += self._noise()
             if last_ns is not None:
                 self._velocity = (counts - self.counts) / (t_ns - last_ns) * 1e9
             self.counts, self._t_ns = counts, t_ns
         return self.counts
+
+    def switch_positions(self) -> tuple[float, float]:
+        """Of the negative and the positive limit switch, counts: the negative one ends motion to lower positions."""
+        low, high = self._plant.limit_switches(self._axis)
+        return (low, high) if self._units.scale > 0.0 else (high, low)
+
+    def switches(self) -> int:
+        """Which limit switches are active: bits 0 (negative) and 1 (positive) of 60FDh."""
+        low, high = self._plant.limit_switches(self._axis)
+        counts = self._plant.motor_counts(self._axis)
+        below, above = counts <= low, counts >= high
+        negative, positive = (below, above) if self._units.scale > 0.0 else (above, below)
+        return NEGATIVE_SWITCH * negative | POSITIVE_SWITCH * positive
 
     def show_torque(self, source: Callable[[], float]) -> None:
         """Take the torque, permille, from `source` from now on: the plant's, or that of a mode that controls it."""
@@ -212,6 +247,7 @@ class DriveParts:
         fault: `fault(code, t_ns)` when a mode has found one.
         on_loss: `on_loss(code, t_ns)` when the master is taken for dead.
         show: the mode's part of the statusword may have changed.
+        noise: of the encoder, counts; None: it has none.
     """
 
     def __init__(
@@ -223,11 +259,12 @@ class DriveParts:
         fault: Callable[[int, int], None],
         on_loss: Callable[[int, int], None],
         show: Callable[[], None],
+        noise: Callable[[], float] | None,
     ) -> None:
         self.node, self.axis, self.plant, self.fault, self.show = node, axis, plant, fault, show
         self.parameters = DriveParameters(node.dictionary)
         self.motion = Motion(axis, plant, node.core.timers)
-        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units)
+        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units, noise=noise)
         self.supervision = Supervision(node, self.parameters, on_loss)
         self.loop = DriveLoop(axis, plant, self.parameters, node.dictionary)
 
@@ -237,7 +274,7 @@ class DriveMode:
 
     Attributes:
         number: in 6060h; bit number - 1 of 6502h.
-        needs: indices of the objects without which the EDS does not describe the mode.
+        needs: dictionary keys of the objects without which the EDS does not describe the mode.
         target: index of the object that a cyclic mode lives by; None: SYNC and RPDOs are not watched.
         limited: statusword bit 11.
         halted: controlword bit 8.

@@ -285,7 +285,7 @@ def test_cia402_54_handshake_of_profile_position(drive, plant):
 
 def test_cia402_55_homing_bits(drive, plant):
     power(drive, plant, 6)
-    assert drive.write(0x6098, 0, 17, 1) == 0x06090030  # needs a limit switch, which this drive has not
+    assert drive.write(0x6098, 0, 19, 1) == 0x06090030  # needs a home switch, which this drive has not
     drive.set((0x6098, 0, 37, 1), (0x607C, 0, 90, 4))
     assert bits(drive, 12, 13) == (0, 0)
     drive.set((0x6040, 0, 0x1F, 2))
