@@ -179,10 +179,15 @@ class DriveFeedback:
 
 
 class Supervision:
-    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error."""
+    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error.
+
+    Attributes:
+        watching: between `start` and `stop`, in a mode that lives by SYNC.
+    """
 
     def __init__(self, node: SlaveNode, parameters: DriveParameters, on_loss: Callable[[int, int], None]) -> None:
         """`on_loss(code, t_ns)` is called when the master is taken for dead."""
+        self.watching = False
         self._node, self._parameters, self._on_loss = node, parameters, on_loss
         self._timer = node.core.timers.new(self._sync_missing)
         self._misses = 0
@@ -194,24 +199,25 @@ class Supervision:
         self._misses = 0
         self._outside_ns = None
         self._timer.cancel()
+        self.watching = target is not None
         if target is not None:
             self._by_rpdo = self._node.pdos.receives(target)
-            self._timer.arm(t_ns + self._parameters.patience_ns)
+            self._wait(t_ns)
 
     def stop(self) -> None:
         """Operation is no longer enabled."""
+        self.watching = False
         self._timer.cancel()
 
-    @property
-    def watching(self) -> bool:
-        """Between `start` and `stop`."""
-        return self._timer.due_ns is not None
+    def _wait(self, t_ns: int) -> None:
+        if self._parameters.patience_ns:
+            self._timer.arm(t_ns + self._parameters.patience_ns)
 
     def sync(self, fresh: bool, t_ns: int) -> None:
         """A SYNC came, with a target since the last one (fresh) or without."""
-        self._timer.arm(t_ns + self._parameters.patience_ns)
+        self._wait(t_ns)
         self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
-        if self._misses >= self._parameters.misses:
+        if 0 < self._parameters.misses <= self._misses:
             self._lose(RPDO_TIMEOUT, t_ns)
 
     def following_error(self, error_counts: float, t_ns: int) -> bool:
