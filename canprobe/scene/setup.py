@@ -71,6 +71,7 @@ class Quirks:
         tpdo_delay_ns: from SYNC to the TPDOs that it triggers.
         noise_counts: standard deviation of the encoder, counts.
         keep_bit30: a COB-ID of a TPDO that is written must have bit 30 (no RTR) as it is, else 06090030h.
+        brake_early_ns: from the brake's opening to torque in the motor; a vertical axis of a dynamic arm falls.
     """
 
     refuse: tuple[int, ...] = ()
@@ -80,6 +81,7 @@ class Quirks:
     tpdo_delay_ns: int = 0
     noise_counts: float = 0.0
     keep_bit30: bool = False
+    brake_early_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -105,6 +105,7 @@ class DriveApplication(Application):
         self._forget_faults()
         self._standstill = self._word_waits = False
         self._parameters.read()
+        self.parts.loop.close_brake()
         self.parts.loop.release()
         self.parts.feedback.reset(t_ns)
         here = self._motion.hold(t_ns)
@@ -221,8 +222,10 @@ class DriveApplication(Application):
         self._standstill = False
         if old is _ENABLED:
             self._mode.leave(t_ns)
+            self.parts.loop.close_brake()
         if new is _ENABLED:
             here = self._motion.hold(t_ns)
+            self.parts.loop.open_brake(t_ns)
             self._node.dictionary.put(0x607A, 0, round(self._parameters.units.position(here)))
             self._start_mode(t_ns)
         elif new is DriveState.QUICK_STOP_ACTIVE:
