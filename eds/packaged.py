@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 MISSED_SYNCS = 0x2000
 """Manufacturer's object of our drives: how many SYNCs a drive misses before it takes its master for dead."""
 MISSED_SYNCS_NAME = "Missed SYNCs tolerated"
+SYNC_FACTOR = 0x200E
+"""The same of PRBT joints, and of others with these drives: SYNC periods without a SYNC."""
+SYNC_FACTOR_NAME = "SYNC time-out factor"
 LONG_PDOS = 0x2007
 """Manufacturer's object of our CAN FD array: 1 lets its TPDOs map up to 64 bytes; SDO stays classical."""
 LONG_PDOS_NAME = "Long PDOs (CAN FD)"

@@ -130,7 +130,17 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
     if planned.kind == "drive":
         assert setup.arm is not None
         axis = setup.arm.node_ids.index(planned.node_id)
-        node = make_drive_node(dictionary, node_id, axis, plant, od_of)
+        drive = setup.arm.drives[axis]
+        node = make_drive_node(
+            dictionary,
+            node_id,
+            axis,
+            plant,
+            od_of,
+            quirks=drive.quirks,
+            incremental=drive.incremental,
+            seed=setup.seed,
+        )
     else:
         assert setup.array is not None
         node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)

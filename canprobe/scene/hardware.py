@@ -137,9 +137,10 @@ class JointSettings:
     coupling: Mapping[str, float] | None = None
     """Turns of this motor per turn of other joints, by their names: a wrist whose motors stand in the forearm."""
     noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
-    """Standard deviation of the emulated encoder."""
+    """Standard deviation of the emulated encoder, besides `emulate.noise_counts`."""
     rated_torque_nm: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
-    """Continuous torque of the drive at the joint; 6071h and 6077h count in thousandths of it. Left out: that of the URDF, or 10."""
+    """Continuous torque of the drive at the joint; 6071h and 6077h are thousandths of it. Left out: that of the URDF,
+    or 10."""
     rotor_inertia_kg_m2: Annotated[float | None, Range(0, 1e6, open_low=True), TURNS] = None
     """Inertia of the motor at the joint. Left out: 0.05."""
     coulomb_nm: Annotated[float | None, Range(0, 1e6), TURNS] = None
@@ -202,3 +203,7 @@ class EmulateSettings:
     """Time from SYNC to the TPDOs."""
     cob_id_bit30: Literal["free", "keep"] = "free"
     """keep: a write that changes bit 30 of a COB-ID of a TPDO is refused."""
+    brake_early_ms: Annotated[float, Range(0, 10_000)] = 0.0
+    """Time from the opening of the brakes to torque in the motors: a vertical axis of a dynamic arm falls."""
+    noise_counts: Annotated[float, Range(0, 10_000)] = 0.0
+    """Standard deviation of the encoders."""

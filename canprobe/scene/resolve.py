@@ -13,6 +13,7 @@ from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.arms import Bodies, arm_model, start_posture, swing
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
+from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
 from canprobe.scene.model import (
     BridgeSettings,
@@ -36,6 +37,7 @@ from canprobe.scene.setup import (
     Free,
     Listen,
     Probe,
+    Quirks,
     SafetyLimits,
     Scan,
     Setup,
@@ -98,10 +100,29 @@ def _arm(scene: Scene) -> Arm | None:
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
+            incremental=joint.zero == "homing",
+            quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
         for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
     ]
     return Arm(model, tuple(drives), start_posture(joints), settings.missed_syncs, settings.grouped_rpdo)
+
+
+def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:
+    """What makes one emulated drive difficult; None where nothing does."""
+    if settings is None or (settings.nodes and node_id not in settings.nodes):
+        settings = EmulateSettings()
+    quirks = Quirks(
+        refuse=tuple(int(index[:4], 16) for index in settings.refuse),
+        boot_ns=round(settings.boot_s * 1e9),
+        sdo_ns=round(settings.sdo_ms * 1e6),
+        fixed_mapping=settings.fixed_mapping,
+        tpdo_delay_ns=round(settings.tpdo_delay_us * 1e3),
+        noise_counts=math.hypot(settings.noise_counts, noise),
+        keep_bit30=settings.cob_id_bit30 == "keep",
+        brake_early_ns=round(settings.brake_early_ms * 1e6),
+    )
+    return None if quirks == Quirks() else quirks
 
 
 def _array(settings: SensorSettings) -> Array:

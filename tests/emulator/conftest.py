@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -147,6 +148,7 @@ class FakePlant:
     t_ns: int = 0
     stuck: bool = False
     torque: int = 0
+    switches: tuple[float, float] = (-math.inf, math.inf)
     dynamics: MotorDynamics = field(default_factory=lambda: MotorDynamics(gain=100.0, coulomb=50.0, damping=4.0))
 
     def advance(self, t_ns: int) -> None:
@@ -162,6 +164,9 @@ class FakePlant:
 
     def torque_permille(self, axis: int) -> int:
         return self.torque
+
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        return self.switches
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         return self.dynamics

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import pytest
 
@@ -17,6 +18,7 @@ from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.world import TruthRecorder
 from canprobe.errors import BusError
 from canprobe.scene.load import load_scene
+from canprobe.scene.setup import Quirks
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -282,3 +284,17 @@ def test_nobody_records_what_nobody_wants_to_know():
     world = build.make_world(plan, plan.node_ids, truth=False)
     assert world.recorder is None
     assert world.participants == list(world.nodes)
+
+
+def test_quirks_and_encoders_of_the_setup_are_those_of_its_drives():
+    plan = canprobe.plan(load_scene("free"))
+    assert plan.setup.arm is not None
+    first, second, *others = plan.setup.arm.drives
+    drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), replace(second, incremental=True), *others)
+    quirky = replace(plan, setup=plan.setup.changed("arm", drives=drives))
+    nodes = build.make_world(quirky, plan.node_ids).nodes
+    assert [node.start(0) for node in nodes[:3]] == [[], [(0x702, b"\0")], [(0x703, b"\0")]]
+    assert nodes[0].advance(5) == [(0x701, b"\0")]
+    assert nodes[0].receive(0x601, bytes.fromhex("2b5a600006000000"), 6)[0][1].hex() == "805a600000000106"
+    positions = [node.receive(0x600 + node.node_id, bytes.fromhex("4064600000000000"), 7)[0][1] for node in nodes[:3]]
+    assert [data[4:] == bytes(4) for data in positions] == [False, True, False]

@@ -8,6 +8,8 @@ Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, modes of operation.
 
 from __future__ import annotations
 
+import random
+from collections.abc import Callable
 from functools import partial
 
 from canopen.objectdictionary import ObjectDictionary
@@ -30,9 +32,10 @@ from canprobe.protocol.cia402 import (
     command_of,
 )
 from canprobe.protocol.frames import FOLLOWING_ERROR, HEARTBEAT_LOST, NmtState
+from canprobe.scene.setup import Quirks
 
-_TARGET, _STATUSWORD = key_of(0x607A), key_of(0x6041)
-_VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60FF})
+_STATUSWORD = key_of(0x6041)
+_VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60C1, 0x60FF})
 _ABORT_COMMANDS = {2: Command.DISABLE_VOLTAGE, 3: Command.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
 _ENABLED = DriveState.OPERATION_ENABLED
 
@@ -48,14 +51,18 @@ class DriveApplication(Application):
         parts: motion, feedback, supervision and parameters, from `attach` on.
     """
 
-    def __init__(self, axis: int, plant: AxisPlant) -> None:
+    def __init__(
+        self, axis: int, plant: AxisPlant, *, incremental: bool = False, noise: Callable[[], float] | None = None
+    ) -> None:
         """Make the drive of one axis.
 
         Args:
             axis: of the plant, 0-based.
             plant: shared with the other nodes.
+            incremental: its encoder counts from 0 at every power on and node reset, wherever the motor is.
+            noise: what the encoder adds to a position, counts; None: nothing.
         """
-        self._axis, self._plant = axis, plant
+        self._axis, self._plant, self._incremental, self._noise = axis, plant, incremental, noise
         self.state = INITIAL_STATE
         self._command: Command | None = None  # the one that stands
         self._word = 0  # the last controlword
@@ -69,7 +76,13 @@ class DriveApplication(Application):
         """Hang the drive's objects on the node."""
         self._node, self._core, self._values = node, node.core, node.dictionary.values
         self.parts = parts = DriveParts(
-            node, self._axis, self._plant, fault=self._find_fault, on_loss=self._abort_connection, show=self._show
+            node,
+            self._axis,
+            self._plant,
+            fault=self._find_fault,
+            on_loss=self._abort_connection,
+            show=self._show,
+            noise=self._noise,
         )
         self._parameters, self._motion = parts.parameters, parts.motion
         self._modes = make_modes(parts)
@@ -92,9 +105,11 @@ class DriveApplication(Application):
         self._forget_faults()
         self._standstill = self._word_waits = False
         self._parameters.read()
+        self.parts.loop.close_brake()
         self.parts.loop.release()
         self.parts.feedback.reset(t_ns)
-        self._motion.hold(t_ns)
+        here = self._motion.hold(t_ns)
+        self._parameters.units.origin = here if self._incremental else 0.0
         for mode in self._modes.values():
             mode.reset()
         self._node.dictionary.put(0x6502, 0, sum(1 << mode - 1 for mode in self._modes if mode))
@@ -207,9 +222,11 @@ class DriveApplication(Application):
         self._standstill = False
         if old is _ENABLED:
             self._mode.leave(t_ns)
+            self.parts.loop.close_brake()
         if new is _ENABLED:
             here = self._motion.hold(t_ns)
-            self._values[_TARGET] = round(self._parameters.units.position(here))
+            self.parts.loop.open_brake(t_ns)
+            self._node.dictionary.put(0x607A, 0, round(self._parameters.units.position(here)))
             self._start_mode(t_ns)
         elif new is DriveState.QUICK_STOP_ACTIVE:
             self._motion.decelerate(t_ns, self._parameters.quick_stop_rate, self._stopped)
@@ -290,15 +307,29 @@ class DriveApplication(Application):
 
 
 def make_drive_node(
-    od: ObjectDictionary, node_id: int, axis: int, plant: AxisPlant, od_of: OdOf | None = None
+    od: ObjectDictionary,
+    node_id: int,
+    axis: int,
+    plant: AxisPlant,
+    od_of: OdOf | None = None,
+    *,
+    quirks: Quirks | None = None,
+    incremental: bool = False,
+    seed: int = 0,
 ) -> SlaveNode:
     """A drive node on one axis of the plant.
 
     Args:
-        od: of `puma260_joint.eds` or another CiA 402 EDS, for this node id.
+        od: of any CiA 402 EDS, for this node id.
         node_id: 1–127, or 255 for none.
         axis: of the plant, 0-based.
         plant: shared by all nodes.
         od_of: the EDS for another node id, where LSS may give the node one.
+        quirks: what makes it difficult; None: nothing.
+        incremental: it forgets its zero with the power and has to be homed.
+        seed: of the encoder's noise.
     """
-    return SlaveNode(od, node_id, DriveApplication(axis, plant), od_of=od_of)
+    sigma = quirks.noise_counts if quirks is not None else 0.0
+    noise = partial(random.Random(f"{seed} {axis}").gauss, 0.0, sigma) if sigma else None
+    application = DriveApplication(axis, plant, incremental=incremental, noise=noise)
+    return SlaveNode(od, node_id, application, od_of=od_of, quirks=quirks)

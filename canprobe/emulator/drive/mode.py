@@ -12,7 +12,7 @@ from functools import partial
 
 from canprobe.emulator.drive.parameters import PEAK_PERMILLE, DriveParameters, Units
 from canprobe.emulator.drive.reference import STEP_NS, AxisPlant, Motion
-from canprobe.emulator.node.dictionary import Dictionary, Value
+from canprobe.emulator.node.dictionary import Value
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.protocol import cia402
 from canprobe.protocol.cia402 import OperationMode
@@ -21,7 +21,9 @@ from canprobe.protocol.frames import FOLLOWING_ERROR, RPDO_TIMEOUT, SYNC_LOST
 # What a drive gives to the plant's position loop: the torque limit 6072h and the feed-forwards 60B1h and 60B2h.
 #
 # The feed-forwards act in the mode that gives them; leaving it takes them back. In cyclic synchronous velocity 60B1h is
-# part of the target already, and in cyclic synchronous torque both are: there the loop gets none.
+# part of the target already, and in cyclic synchronous torque both are: there the loop gets none. Outside operation
+# enabled the loop stands for the closed brake. A brake that opens before the motor has torque (`Quirks`) is a loop
+# without torque for that time: a vertical axis of a dynamic arm falls.
 # Source: CiA 402-2, objects 6072h, 60B1h, 60B2h.
 
 _LIMIT, _SPEED, _TORQUE = 0x6072, 0x60B1, 0x60B2
@@ -34,18 +36,33 @@ class DriveLoop:
         axis: of the plant, 0-based.
         plant: shared with the other drives.
         parameters: of the drive.
-        dictionary: of the drive.
+        node: of the drive.
 
     Attributes:
         changed: a position mode has to `feed_forward` in this cycle.
     """
 
-    def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, dictionary: Dictionary) -> None:
+    def __init__(self, axis: int, plant: AxisPlant, parameters: DriveParameters, node: SlaveNode) -> None:
+        dictionary = node.dictionary
         self._axis, self._plant, self._parameters, self._number = axis, plant, parameters, dictionary.number
+        self._early_ns = node.core.quirks.brake_early_ns
+        self._torque_comes = node.core.timers.new(lambda _due_ns: self._give(*self._given[1:]))
         self._given: tuple[int, float, float] = (PEAK_PERMILLE, 0.0, 0.0)
         self.changed = True
         for index in (_LIMIT, _SPEED, _TORQUE):
             dictionary.on_write(index, lambda _sub, _value: self._give(*self._given[1:]))
+
+    def open_brake(self, t_ns: int) -> None:
+        """Operation is enabled."""
+        if self._early_ns:
+            self._torque_comes.arm(t_ns + self._early_ns)
+            self._give(*self._given[1:])
+
+    def close_brake(self) -> None:
+        """Operation is no longer enabled, or is stopping by torque."""
+        if self._torque_comes.due_ns is not None:
+            self._torque_comes.cancel()
+            self._give(*self._given[1:])
 
     def feed_forward(self) -> None:
         """Take limit and offsets as they are now."""
@@ -62,7 +79,8 @@ class DriveLoop:
 
     def _give(self, speed: float, torque: float) -> None:
         self.changed = True
-        wanted = (self._parameters.max_torque, speed, torque)
+        limit = self._parameters.max_torque if self._torque_comes.due_ns is None else 0
+        wanted = (limit, speed, torque)
         if wanted != self._given:
             self._given = wanted
             self._plant.set_loop(self._axis, *wanted)
@@ -71,22 +89,41 @@ class DriveLoop:
 # What a drive reports of itself: actual and demand values, brought up to date only where somebody reads them.
 #
 # Positions and velocities are in the units of the factor group, torques in 1/1000 of the rated torque.
-# Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h.
+# Source: CiA 402-2, objects 6062h, 6064h, 606Bh, 606Ch, 6074h, 6077h, 60F4h, 60FDh.
 
 _I16, _I32 = 1 << 15, 1 << 31
 _TORQUES = (0x6074, 0x6077)
+NEGATIVE_SWITCH, POSITIVE_SWITCH = 1, 2
+"""Bits of 60FDh."""
 
 
 class DriveFeedback:
     """Actual values of one axis.
+
+    Args:
+        node: the drive's.
+        axis: of the plant, 0-based.
+        plant: shared with the other drives.
+        motion: reference of the axis.
+        units: of the drive.
+        noise: what the encoder adds to a position, counts; None: nothing.
 
     Attributes:
         counts: motor position at the last `measure`.
         plant_torque: returns the torque that the plant needs for its motion now, permille.
     """
 
-    def __init__(self, node: SlaveNode, axis: int, plant: AxisPlant, motion: Motion, units: Units) -> None:
-        self._core, self._axis, self._plant = node.core, axis, plant
+    def __init__(
+        self,
+        node: SlaveNode,
+        axis: int,
+        plant: AxisPlant,
+        motion: Motion,
+        units: Units,
+        *,
+        noise: Callable[[], float] | None,
+    ) -> None:
+        self._core, self._axis, self._plant, self._units, self._noise = node.core, axis, plant, units, noise
         self.counts = 0.0
         self._velocity = 0.0
         self._t_ns: int | None = None
@@ -97,6 +134,7 @@ class DriveFeedback:
             0x606B: lambda: motion.speed(self._t_ns or 0) / units.speed_scale,
             0x606C: lambda: self._velocity / units.speed_scale,
             0x60F4: lambda: (motion.demand(self._t_ns or 0) - self.counts) / units.scale,
+            0x60FD: self.switches,
         }
         self.show_torque(self.plant_torque)
         for index in self._sources:
@@ -116,10 +154,25 @@ class DriveFeedback:
         if t_ns != last_ns:
             self._plant.advance(t_ns)
             counts = self._plant.motor_counts(self._axis)
+            if self._noise is not None:
+                counts += self._noise()
             if last_ns is not None:
                 self._velocity = (counts - self.counts) / (t_ns - last_ns) * 1e9
             self.counts, self._t_ns = counts, t_ns
         return self.counts
+
+    def switch_positions(self) -> tuple[float, float]:
+        """Of the negative and the positive limit switch, counts: the negative one ends motion to lower positions."""
+        low, high = self._plant.limit_switches(self._axis)
+        return (low, high) if self._units.scale > 0.0 else (high, low)
+
+    def switches(self) -> int:
+        """Which limit switches are active: bits 0 (negative) and 1 (positive) of 60FDh."""
+        low, high = self._plant.limit_switches(self._axis)
+        counts = self._plant.motor_counts(self._axis)
+        below, above = counts <= low, counts >= high
+        negative, positive = (below, above) if self._units.scale > 0.0 else (above, below)
+        return NEGATIVE_SWITCH * negative | POSITIVE_SWITCH * positive
 
     def show_torque(self, source: Callable[[], float]) -> None:
         """Take the torque, permille, from `source` from now on: the plant's, or that of a mode that controls it."""
@@ -144,10 +197,15 @@ class DriveFeedback:
 
 
 class Supervision:
-    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error."""
+    """Counts missed SYNCs and targets between `start` and `stop`, and times the following error.
+
+    Attributes:
+        watching: between `start` and `stop`, in a mode that lives by SYNC.
+    """
 
     def __init__(self, node: SlaveNode, parameters: DriveParameters, on_loss: Callable[[int, int], None]) -> None:
         """`on_loss(code, t_ns)` is called when the master is taken for dead."""
+        self.watching = False
         self._node, self._parameters, self._on_loss = node, parameters, on_loss
         self._timer = node.core.timers.new(self._sync_missing)
         self._misses = 0
@@ -159,24 +217,25 @@ class Supervision:
         self._misses = 0
         self._outside_ns = None
         self._timer.cancel()
+        self.watching = target is not None
         if target is not None:
             self._by_rpdo = self._node.pdos.receives(target)
-            self._timer.arm(t_ns + self._parameters.patience_ns)
+            self._wait(t_ns)
 
     def stop(self) -> None:
         """Operation is no longer enabled."""
+        self.watching = False
         self._timer.cancel()
 
-    @property
-    def watching(self) -> bool:
-        """Between `start` and `stop`."""
-        return self._timer.due_ns is not None
+    def _wait(self, t_ns: int) -> None:
+        if self._parameters.patience_ns:
+            self._timer.arm(t_ns + self._parameters.patience_ns)
 
     def sync(self, fresh: bool, t_ns: int) -> None:
         """A SYNC came, with a target since the last one (fresh) or without."""
-        self._timer.arm(t_ns + self._parameters.patience_ns)
+        self._wait(t_ns)
         self._misses = 0 if fresh or not self._by_rpdo else self._misses + 1
-        if self._misses >= self._parameters.misses:
+        if 0 < self._parameters.misses <= self._misses:
             self._lose(RPDO_TIMEOUT, t_ns)
 
     def following_error(self, error_counts: float, t_ns: int) -> bool:
@@ -212,6 +271,7 @@ class DriveParts:
         fault: `fault(code, t_ns)` when a mode has found one.
         on_loss: `on_loss(code, t_ns)` when the master is taken for dead.
         show: the mode's part of the statusword may have changed.
+        noise: of the encoder, counts; None: it has none.
     """
 
     def __init__(
@@ -223,13 +283,14 @@ class DriveParts:
         fault: Callable[[int, int], None],
         on_loss: Callable[[int, int], None],
         show: Callable[[], None],
+        noise: Callable[[], float] | None,
     ) -> None:
         self.node, self.axis, self.plant, self.fault, self.show = node, axis, plant, fault, show
         self.parameters = DriveParameters(node.dictionary)
         self.motion = Motion(axis, plant, node.core.timers)
-        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units)
+        self.feedback = DriveFeedback(node, axis, plant, self.motion, self.parameters.units, noise=noise)
         self.supervision = Supervision(node, self.parameters, on_loss)
-        self.loop = DriveLoop(axis, plant, self.parameters, node.dictionary)
+        self.loop = DriveLoop(axis, plant, self.parameters, node)
 
 
 class DriveMode:
@@ -237,7 +298,7 @@ class DriveMode:
 
     Attributes:
         number: in 6060h; bit number - 1 of 6502h.
-        needs: indices of the objects without which the EDS does not describe the mode.
+        needs: dictionary keys of the objects without which the EDS does not describe the mode.
         target: index of the object that a cyclic mode lives by; None: SYNC and RPDOs are not watched.
         limited: statusword bit 11.
         halted: controlword bit 8.

@@ -1,4 +1,4 @@
-"""The modes of operation: cyclic synchronous position, velocity and torque, profile position, homing.
+"""The modes of operation: cyclic synchronous position, velocity and torque, interpolated and profile position.
 
 A target that is further from the one before than 607Fh and 6080h let the motor go in the time between them is not
 followed: reference limit, a fault. A target that was corrupted on its way is one, unless it is off by less.
@@ -9,18 +9,16 @@ Source: CiA 402-2, "Cyclic synchronous position mode", objects 607Ah, 607Dh, 607
 
 from __future__ import annotations
 
-from enum import Enum, auto
-from math import ceil, floor
 from typing import NamedTuple
 
+from canprobe.emulator.drive.homing import Homing
 from canprobe.emulator.drive.mode import REACHED, CyclicMode, DriveMode, DriveParts, ProfiledMode
 from canprobe.emulator.drive.reference import STEP_NS, Rates, torque_run, uniform
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.protocol.cia402 import (
     CHANGE_IMMEDIATELY,
-    HOMING_ATTAINED,
-    HOMING_ERROR,
-    HOMING_START,
+    ENABLE_INTERPOLATION,
+    INTERPOLATION_ACTIVE,
     NEW_SETPOINT,
     RELATIVE,
     SETPOINT_ACKNOWLEDGE,
@@ -40,12 +38,16 @@ class CyclicPosition(CyclicMode):
 
     number = OperationMode.CYCLIC_SYNC_POSITION
     target = 0x607A
-    needs = (target,)
+    needs = (key_of(target),)
     repeats = False
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
         self._latched_ns = 0
+
+    def wanted(self) -> int:
+        """The target, position units."""
+        return int(self._values[_POSITION_TARGET]) + int(self._values.get(_POSITION_OFFSET, 0))
 
     def start(self, word: int, t_ns: int) -> None:
         """The first target is as far away as the time since now allows."""
@@ -59,8 +61,8 @@ class CyclicPosition(CyclicMode):
 
     def latch(self, t_ns: int) -> None:
         """Follow the target from where the reference is."""
-        values, parameters, units, loop = self._values, self._parameters, self._units, self.parts.loop
-        target: int = values[_POSITION_TARGET] + values.get(_POSITION_OFFSET, 0)  # type: ignore[assignment, operator]
+        parameters, units, loop = self._parameters, self._units, self.parts.loop
+        target = self.wanted()
         allowed = parameters.clamp(target)
         counts = allowed * units.scale + units.origin
         passed_ns = max(parameters.interpolation_ns, t_ns - self._latched_ns)
@@ -72,6 +74,63 @@ class CyclicPosition(CyclicMode):
             loop.feed_forward()
         self._motion.reach(counts, t_ns, parameters.interpolation_ns)
         self._limit(allowed != target or self._strains())
+
+
+# Interpolated position: 60C1h:01 is the target of the next SYNC, as 607Ah is in mode 8, while controlword bit 4 is set.
+#
+# With bit 4 the interpolation becomes active and statusword bit 12 set; without it the reference slows down by 6084h
+# and stands. The target that stands when bit 4 comes is followed even if it is an old one, as drives do: the master
+# has to write the present position first. 60C0h is linear interpolation (0) or what a maker calls so (below 0); there
+# is no buffer (60C4h): the last target written counts.
+# Source: CiA 402-2, "Interpolated position mode", objects 60C0h, 60C1h, 60C2h.
+
+_RECORD = key_of(0x60C1, 1)
+
+
+class InterpolatedPosition(CyclicPosition):
+    """Mode 7."""
+
+    number = OperationMode.INTERPOLATED_POSITION
+    target = 0x60C1
+    needs = (_RECORD,)
+
+    def __init__(self, parts: DriveParts) -> None:
+        super().__init__(parts)
+        self._active = False
+        parts.node.dictionary.on_check(0x60C0, _check_submode)
+
+    def start(self, word: int, t_ns: int) -> None:
+        """Active at once where bit 4 is set already."""
+        super().start(word, t_ns)
+        self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION & 1)
+
+    def wanted(self) -> int:
+        """The data record, position units."""
+        return int(self._values[_RECORD])
+
+    def status(self) -> int:
+        """Interpolation active; with halt, or without bit 4, at rest."""
+        return 1 << INTERPOLATION_ACTIVE if self._active and not self.halted else REACHED * self._standstill
+
+    def bits(self, word: int, changed: int, t_ns: int) -> None:
+        """Bit 4 starts the interpolation, and stops it when it is taken away."""
+        if changed >> ENABLE_INTERPOLATION & 1:
+            self._active = self._fresh = bool(word >> ENABLE_INTERPOLATION & 1)
+            if self._active:
+                self._latched_ns = t_ns
+            elif not self.halted:
+                self._standstill = False
+                self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
+
+    def latch(self, t_ns: int) -> None:
+        """Follow the record, where the interpolation is active."""
+        if self._active:
+            super().latch(t_ns)
+
+
+def _check_submode(subindex: int, value: Value) -> None:
+    if int(value) > 0:
+        raise SdoAbort(Abort.VALUE)
 
 
 # Cyclic synchronous velocity: 60FFh + 60B1h is the velocity from one SYNC to the next.
@@ -88,7 +147,7 @@ class CyclicVelocity(CyclicMode):
 
     number = OperationMode.CYCLIC_SYNC_VELOCITY
     target = 0x60FF
-    needs = (target,)
+    needs = (key_of(target),)
 
     def latch(self, t_ns: int) -> None:
         """Go on from where the reference is, with the new velocity."""
@@ -119,7 +178,7 @@ class CyclicTorque(CyclicMode):
 
     number = OperationMode.CYCLIC_SYNC_TORQUE
     target = 0x6071
-    needs = (target,)
+    needs = (key_of(target),)
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -187,7 +246,7 @@ class ProfilePosition(ProfiledMode):
     """Mode 1."""
 
     number = OperationMode.PROFILE_POSITION
-    needs = (0x607A, 0x6081)
+    needs = (key_of(0x607A), key_of(0x6081))
 
     def __init__(self, parts: DriveParts) -> None:
         super().__init__(parts)
@@ -270,165 +329,11 @@ class ProfilePosition(ProfiledMode):
         self._limit((point is not None and point.limited) or self._strains())
 
 
-# Homing: the present position (methods 35, 37), or the first index pulse in one direction (33 negative, 34 positive).
-#
-# The plant has no limit and no home switches, so methods 1–30 are refused with 06090030h. The encoder gives one index
-# pulse a motor turn, where the counter is a multiple of 608Fh; it is caught by hardware, at its exact place, while the
-# motor searches at 6099h:02 with 609Ah, and then driven back to. Bits 13, 12, 10 of the statusword:
-# 000 under way, 001 not started or interrupted, 011 done, 100 error and moving, 101 error and at rest.
-# Zero is the home position *plus* the home offset, by the clause: at home the actual position is then -607Ch.
-# An error is: no such method, a search speed of 0, no pulse within two turns. Software limits do not act meanwhile.
-# Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah.
-
-HERE = frozenset({35, 37})
-INDEX_DIRECTIONS = {33: -1, 34: 1}
-METHODS = frozenset({0, *HERE, *INDEX_DIRECTIONS})
-SEARCH_TURNS = 2.0
-_METHOD = key_of(0x6098)
-
-
-class Phase(Enum):
-    """Where a homing run is."""
-
-    IDLE = auto()
-    SEARCHING = auto()
-    RETURNING = auto()
-    DONE = auto()
-    FAILED = auto()
-
-
-_BITS = {Phase.DONE: REACHED | 1 << HOMING_ATTAINED, Phase.FAILED: 1 << HOMING_ERROR}
-_UNDER_WAY = frozenset({Phase.SEARCHING, Phase.RETURNING})
-
-
-class Homing(ProfiledMode):
-    """Mode 6."""
-
-    number = OperationMode.HOMING
-    needs = (0x6098,)
-
-    def __init__(self, parts: DriveParts) -> None:
-        super().__init__(parts)
-        self._phase = Phase.IDLE
-        self._direction = 1
-        self._home = self._was = 0.0
-        parts.node.dictionary.on_check(0x6098, _check_method)
-
-    def reset(self) -> None:
-        """Power on: not homed, the zero is the counter's."""
-        self._phase, self._units.origin = Phase.IDLE, 0.0
-
-    def start(self, word: int, t_ns: int) -> None:
-        """A drive that was homed stays so."""
-        if self._phase is not Phase.DONE:
-            self._phase = Phase.IDLE
-        super().start(word, t_ns)
-        if not self.halted:
-            self._motion.decelerate(t_ns, self._parameters.deceleration, self._at_standstill)
-
-    def leave(self, t_ns: int) -> None:
-        """A run under way is given up."""
-        self._give_up()
-
-    def status(self) -> int:
-        """Homing attained, error, and target reached (when at rest)."""
-        rests = self._standstill and self._phase in (Phase.IDLE, Phase.FAILED)
-        return _BITS.get(self._phase, 0) | REACHED * rests
-
-    def bits(self, word: int, changed: int, t_ns: int) -> None:
-        """Bit 4 starts, and interrupts when it is taken away."""
-        starts = word >> HOMING_START & 1
-        if changed >> HOMING_START & 1 and not self.halted:
-            if starts:
-                self._begin(t_ns)
-            elif self._phase in _UNDER_WAY:
-                self._stop(Phase.IDLE, t_ns)
-
-    def resume(self, t_ns: int) -> None:
-        """With bit 4 still set, homing starts again."""
-        if self._word >> HOMING_START & 1:
-            self._begin(t_ns)
-
-    def _halt(self, t_ns: int) -> None:
-        self._give_up()
-        super()._halt(t_ns)
-
-    def _give_up(self) -> None:
-        self._timer.cancel()
-        if self._phase in _UNDER_WAY:
-            self._phase = Phase.IDLE
-
-    def _begin(self, t_ns: int) -> None:
-        method, self._standstill = int(self._values.get(_METHOD, 0)), False
-        speed = self._speed()
-        if method in HERE:
-            self._motion.decelerate(t_ns, self._parameters.homing_acceleration)
-            self._home = self.parts.feedback.measure(t_ns)
-            self._attain(t_ns)
-        elif method in INDEX_DIRECTIONS and speed > 0.0:
-            self._direction = INDEX_DIRECTIONS[method] if self._units.scale > 0 else -INDEX_DIRECTIONS[method]
-            self._search(t_ns)
-        else:
-            self._stop(Phase.FAILED, t_ns)
-
-    def _search(self, t_ns: int) -> None:
-        self._phase = Phase.SEARCHING
-        self._was = self.parts.feedback.measure(t_ns)
-        self._drive_to(self._was + self._direction * SEARCH_TURNS * self._units.turn, t_ns)
-        self._timer.arm(t_ns + STEP_NS)
-
-    def _drive_to(self, counts: float, t_ns: int) -> None:
-        rate = self._parameters.homing_acceleration
-        self._motion.move(counts, t_ns, Rates(self._speed(), rate, rate), self._arrived)
-
-    def _speed(self) -> float:
-        wanted = self.parts.node.dictionary.number(0x6099, 2) * self._units.magnitude
-        return min(wanted, self._parameters.max_speed)
-
-    def watch(self, t_ns: int, counts: float) -> None:
-        """Catch the index pulse."""
-        if self._phase is Phase.SEARCHING:
-            pulse = next_pulse(self._was, self._direction, self._units.turn)
-            if (counts - pulse) * self._direction >= 0.0:
-                self._home, self._phase = pulse, Phase.RETURNING
-                self._drive_to(pulse, t_ns)
-
-    def _arrived(self, t_ns: int) -> None:
-        if self._phase is Phase.RETURNING:
-            self._attain(t_ns)
-        else:
-            self._timer.cancel()
-            self._phase, self._standstill = Phase.FAILED, True
-        self.parts.show()
-
-    def _attain(self, t_ns: int) -> None:
-        self._timer.cancel()
-        units = self._units
-        units.origin = self._home + self.parts.node.dictionary.number(0x607C) * units.scale
-        self._values[_POSITION_TARGET] = round(units.position(self._motion.demand(t_ns)))
-        self._phase = Phase.DONE
-
-    def _stop(self, phase: Phase, t_ns: int) -> None:
-        self._timer.cancel()
-        self._phase = phase
-        self._motion.decelerate(t_ns, self._parameters.homing_acceleration, self._at_standstill)
-
-
-def next_pulse(counts: float, direction: int, turn: float) -> float:
-    """The next index pulse behind `counts`, in a direction; one that lies right there has been passed."""
-    turns = counts / turn
-    return (floor(turns) + 1 if direction > 0 else ceil(turns) - 1) * turn
-
-
-def _check_method(subindex: int, value: Value) -> None:
-    if value not in METHODS:
-        raise SdoAbort(Abort.VALUE)
-
-
 MODES: tuple[type[DriveMode], ...] = (
     DriveMode,
     ProfilePosition,
     Homing,
+    InterpolatedPosition,
     CyclicPosition,
     CyclicVelocity,
     CyclicTorque,
@@ -442,5 +347,5 @@ def make_modes(parts: DriveParts) -> dict[int, DriveMode]:
     return {
         int(mode.number): mode(parts)
         for mode in MODES
-        if not mode.number or (claimed >> mode.number - 1 & 1 and all(map(dictionary.has_index, mode.needs)))
+        if not mode.number or (claimed >> mode.number - 1 & 1 and all(key in dictionary for key in mode.needs))
     }

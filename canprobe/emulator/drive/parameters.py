@@ -5,26 +5,34 @@ Source: CiA 402-2, objects 6007h, 605Ah–605Eh, 6065h–6068h, 6072h, 607Dh, 60
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from math import inf
 
-from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME
+from canprobe.eds.packaged import MISSED_SYNCS, MISSED_SYNCS_NAME, SYNC_FACTOR, SYNC_FACTOR_NAME
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value
 
-# Factor group: the master's position units ↔ motor counts, polarity, and where the zero is.
+# Factor group: the master's position units ↔ units of the plant's axis, polarity, and where the zero is.
 #
 #     position = (counts - origin) · 6092h / (608Fh · 6091h),   each a quotient :01 / :02
 #
-# As delivered the quotients cancel: a unit is a count. Of an EDS without one of the objects it counts as 1.
+# A count is the position unit of the drive as delivered, whatever factors its EDS has: a cell states the units of its
+# drives, not the lines of their encoders. An object that the EDS lacks counts as 1.
 # Source: CiA 402-2, "Factor group", objects 607Eh (bit 7 position, bit 6 velocity), 608Fh, 6091h, 6092h.
 
 FACTORS = (0x607E, 0x608F, 0x6091, 0x6092)
 _RESOLUTION, _GEAR, _FEED = FACTORS[1:]
 _POSITION, _VELOCITY = 7, 6  # bits of 607Eh
+DEFAULT_TURN = 4096.0
+"""Counts of a motor turn, of a drive whose EDS has no 608Fh."""
+_Number = Callable[[int, int], int]
 
 
 class Units:
     """Conversions of one drive.
+
+    Args:
+        dictionary: of the drive; its defaults are the factors as delivered.
 
     Attributes:
         scale: counts per position unit; negative where 607Eh turns positions round.
@@ -34,19 +42,23 @@ class Units:
         origin: counts at position 0; homing sets it.
     """
 
-    __slots__ = ("magnitude", "origin", "scale", "speed_scale", "turn")
+    __slots__ = ("_delivered", "_dictionary", "magnitude", "origin", "scale", "speed_scale", "turn")
 
-    def __init__(self) -> None:
-        self.scale = self.speed_scale = self.magnitude = self.turn = 1.0
+    def __init__(self, dictionary: Dictionary) -> None:
+        self._dictionary = dictionary
+        self._delivered = _encoder_counts(dictionary.delivered)
         self.origin = 0.0
+        self.read()
 
-    def read(self, dictionary: Dictionary) -> None:
+    def read(self) -> None:
         """Take the present factors."""
-        self.turn = _quotient(dictionary, _RESOLUTION)
-        self.magnitude = self.turn * _quotient(dictionary, _GEAR) / _quotient(dictionary, _FEED)
-        polarity = dictionary.number(0x607E)
-        self.scale = -self.magnitude if polarity >> _POSITION & 1 else self.magnitude
-        self.speed_scale = -self.magnitude if polarity >> _VELOCITY & 1 else self.magnitude
+        dictionary = self._dictionary
+        resolution = dictionary.number(_RESOLUTION, 1)
+        self.turn = _quotient(dictionary.number, _RESOLUTION) / self._delivered if resolution else DEFAULT_TURN
+        self.magnitude = _encoder_counts(dictionary.number) / self._delivered
+        turned = dictionary.number(0x607E) ^ dictionary.delivered(0x607E)
+        self.scale = -self.magnitude if turned >> _POSITION & 1 else self.magnitude
+        self.speed_scale = -self.magnitude if turned >> _VELOCITY & 1 else self.magnitude
 
     def position(self, counts: float) -> float:
         """Motor counts → position units."""
@@ -57,21 +69,32 @@ class Units:
         return position * self.scale + self.origin
 
 
-def _quotient(dictionary: Dictionary, index: int) -> float:
-    return (dictionary.number(index, 1) or 1) / (dictionary.number(index, 2) or 1)
+def _encoder_counts(number: _Number) -> float:
+    """Lines of the encoder in one position unit; without 6092h the unit is a line."""
+    if not number(_FEED, 1):
+        return 1.0
+    return _quotient(number, _RESOLUTION) * _quotient(number, _GEAR) / _quotient(number, _FEED)
+
+
+def _quotient(number: _Number, index: int) -> float:
+    return (number(index, 1) or 1) / (number(index, 2) or 1)
 
 
 STAYS_STOPPED = frozenset({5, 6})  # of 605Ah: remain in QUICK_STOP_ACTIVE
 NO_WINDOW = 0xFFFFFFFF
 DEFAULT_MISSES = 5
-"""Of a drive whose EDS has no 2000h."""
+"""Of a drive whose EDS has no object for it."""
 DEFAULT_ACCELERATION = 100_000
 """Position units/s², of a drive whose EDS has no profile acceleration."""
+DEFAULT_WINDOW = 10
+"""Position units, of a drive whose EDS has no 6067h."""
+CONTROL_NS = 1_000_000
+"""Of the drive's own position loop: a target is reached after it where 60C2h is 0."""
 PEAK_PERMILLE = 2000
 """What the plant's motors can do at most."""
 _OPTIONS = {0x605A: frozenset({1, 2, 5, 6}), 0x605D: frozenset({1, 2}), 0x6086: frozenset({0})}
 _INDICES = (
-    *(0x1006, MISSED_SYNCS, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
+    *(0x1006, MISSED_SYNCS, SYNC_FACTOR, 0x6007, 0x605A, 0x605B, 0x605C, 0x605D, 0x605E),
     *(0x6065, 0x6066, 0x6067, 0x6068, 0x6072, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085, 0x609A, 0x60C2),
     *FACTORS,
 )
@@ -82,11 +105,12 @@ class DriveParameters:
 
     Attributes:
         units: the factor group.
-        interpolation_ns: 60C2h, time to reach a latched target.
+        interpolation_ns: 60C2h, time to reach a latched target; never 0.
         following_window, following_timeout_ns: 6065h (counts, infinite for none), 6066h.
         position_window, position_time_ns: 6067h (counts, infinite for none), 6068h.
-        misses: 2000h, SYNCs missed before the master is taken for dead.
-        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half.
+        misses: SYNCs missed before the master is taken for dead: 2000h or 200Eh, whichever the make has; 0: any number.
+        patience_ns: time without a SYNC before it is: so many periods of 1006h, or else of 60C2h, and a half; 0: for
+            ever, as where neither is set.
         low, high: 607Dh, position units; low >= high means no limits.
         abort_connection, quick_stop, shutdown, disable: option codes.
         acceleration, deceleration, homing_acceleration: 6083h, 6084h, 609Ah, counts/s².
@@ -98,8 +122,9 @@ class DriveParameters:
 
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
-        self._has_misses = dictionary.has_named(MISSED_SYNCS, MISSED_SYNCS_NAME)
-        self.units = Units()
+        named = ((MISSED_SYNCS, MISSED_SYNCS_NAME), (SYNC_FACTOR, SYNC_FACTOR_NAME))
+        self._misses = [index for index, name in named if dictionary.has_named(index, name)]
+        self.units = Units(dictionary)
         self.read()
         dictionary.on_change(self.read, *_INDICES)
         for index, allowed in _OPTIONS.items():
@@ -109,13 +134,15 @@ class DriveParameters:
     def read(self) -> None:
         """Take the present values of the dictionary."""
         number = self._dictionary.number
-        self.units.read(self._dictionary)
-        self.interpolation_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        self.units.read()
+        period_ns = number(0x60C2, 1, 25) * 10 ** max(0, 9 + number(0x60C2, 2, -4))
+        self.interpolation_ns = period_ns or CONTROL_NS
         self.following_window, self.following_timeout_ns = self._window(0x6065), number(0x6066) * 1_000_000
-        self.position_window, self.position_time_ns = self._window(0x6067), number(0x6068) * 1_000_000
-        self.misses = number(MISSED_SYNCS, 0, DEFAULT_MISSES) if self._has_misses else DEFAULT_MISSES
-        cycle_ns = number(0x1006) * 1000 or self.interpolation_ns
-        self.patience_ns = self.misses * cycle_ns + cycle_ns // 2
+        self.position_window = self._window(0x6067, DEFAULT_WINDOW)
+        self.position_time_ns = number(0x6068) * 1_000_000
+        self.misses = number(self._misses[0]) if self._misses else DEFAULT_MISSES
+        cycle_ns = number(0x1006) * 1000 or period_ns
+        self.patience_ns = self.misses * cycle_ns + cycle_ns // 2 if self.misses else 0
         self.low, self.high = number(0x607D, 1), number(0x607D, 2)
         self.abort_connection, self.quick_stop = number(0x6007, 0, 3), number(0x605A, 0, 2)
         self.shutdown, self.disable = number(0x605B, 0, 0), number(0x605C, 0, 1)
@@ -131,8 +158,8 @@ class DriveParameters:
         self.max_speed = min(number(0x607F) * magnitude or inf, turns_per_s * self.units.turn or inf)
         self.max_torque = min(number(0x6072, 0, PEAK_PERMILLE), PEAK_PERMILLE)
 
-    def _window(self, index: int) -> float:
-        value = self._dictionary.number(index, 0, NO_WINDOW)
+    def _window(self, index: int, absent: int = NO_WINDOW) -> float:
+        value = self._dictionary.number(index, 0, absent)
         return inf if value == NO_WINDOW else value * self.units.magnitude
 
     @property

@@ -187,6 +187,12 @@ class AxisPlant(Protocol):
     def torque_permille(self, axis: int) -> int:
         """Motor torque, 1/1000 of the rated torque."""
 
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        """Motor positions (counts) at and beyond which the limit switches are active, lower first; infinite for none.
+
+        Where motors are coupled they follow from where the other motors are now.
+        """
+
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How the motor answers to torque."""
 
@@ -349,6 +355,10 @@ class IdealAxis(AxisPlant):
     def torque_permille(self, axis: int) -> int:
         """Always 0."""
         return 0
+
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        """None."""
+        return -inf, inf
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """From rest 100 permille give 10⁵ counts/s², in the end 10⁵ counts/s."""

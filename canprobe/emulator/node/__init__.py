@@ -2,7 +2,7 @@
 
 `slave_node.SlaveNode` has one method for what comes in (`receive(can_id, data, t)`) and one for time (`advance(t)`);
 both return frames to send, and `next_deadline_ns` is when `advance` has to be called. It puts the services together;
-they share `core`: identity, NMT state, time, timers, dictionary.
+they share `core`: identity, NMT state, time, timers, dictionary, and the quirks that make a node difficult.
 
 - `dictionary` keeps values and makes every check that an access over the bus must pass, with the abort codes of CiA
   301.

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Value, nothing
 from canprobe.protocol.frames import Frame, NmtCommand, NmtState, is_restricted
+from canprobe.scene.setup import Quirks
 
 # Deadlines of one node. Few of them are armed at once, and most are armed again before they fire, at every SYNC: the
 # first is looked for among those that are armed.
@@ -102,6 +103,7 @@ class NodeCore:
         node_id: 1–127, or 255 for none.
         dictionary: the node's.
         holder: shows the next deadline of the timers.
+        quirks: what makes the node difficult.
 
     Attributes:
         state: NMT state.
@@ -110,9 +112,11 @@ class NodeCore:
         reroute: to be called when the routes of a service have changed.
     """
 
-    def __init__(self, node_id: int, dictionary: Dictionary, holder: Holder) -> None:
+    def __init__(self, node_id: int, dictionary: Dictionary, holder: Holder, quirks: Quirks) -> None:
         self.node_id = node_id
         self.dictionary = dictionary
+        self.quirks = quirks
+        _refuse(dictionary, quirks)
         self.timers = Timers(holder)
         self.state = NmtState.INITIALISING
         self.now_ns = 0
@@ -122,6 +126,32 @@ class NodeCore:
     def send(self, can_id: int, data: bytes) -> None:
         """Queue a frame behind those the node already sends."""
         self.out.append((can_id, data))
+
+
+def _refuse(dictionary: Dictionary, quirks: Quirks) -> None:
+    """Hang the checks of a node that refuses writes, before any other."""
+
+    def refuse(subindex: int, value: Value) -> None:
+        raise SdoAbort(Abort.UNSUPPORTED_ACCESS)
+
+    def refuse_cob_id(subindex: int, value: Value) -> None:
+        if subindex == 1:
+            raise SdoAbort(Abort.READ_ONLY)
+
+    def refuse_mapping(subindex: int, value: Value) -> None:
+        raise SdoAbort(Abort.READ_ONLY)
+
+    for index in quirks.refuse:
+        dictionary.on_check(index, refuse)
+    for index in dictionary.indices_in(range(0x1400, 0x1C00)) if quirks.fixed_mapping else ():
+        dictionary.on_check(index, refuse_mapping if index & 0x200 else refuse_cob_id)
+    for index in dictionary.indices_in(range(0x1800, 0x1A00)) if quirks.keep_bit30 else ():
+
+        def keep_bit30(subindex: int, value: Value, index: int = index) -> None:
+            if subindex == 1 and (int(value) ^ dictionary.number(index, 1)) & NO_RTR:
+                raise SdoAbort(Abort.VALUE)
+
+        dictionary.on_check(index, keep_bit30)
 
 
 class Service:
@@ -140,6 +170,8 @@ class Service:
 
 INVALID = 1 << 31
 """Of a COB-ID: the object does not exist."""
+NO_RTR = 1 << 30
+"""Of the COB-ID of a TPDO: a remote request is not answered."""
 
 
 def check_cob_id(new: Value, old: int, reserved: int = 0x3FFFF800) -> None:

@@ -12,8 +12,11 @@ from dataclasses import dataclass, replace
 from enum import IntEnum
 from math import inf
 
-from canopen.objectdictionary import ObjectDictionary, ODVariable, datatypes
+from canopen.objectdictionary import ObjectDictionary, datatypes
 
+from canprobe.eds.description import LAST_DUMMY, Description
+from canprobe.eds.description import Entry as Described
+from canprobe.eds.variables import REALS, SIGNED, UNSIGNED
 from canprobe.errors import ProtocolError
 
 # SDO abort codes, and the exception that carries one from an access to the server.
@@ -72,10 +75,6 @@ def nothing(*_: object) -> None:
 # Source: CiA 301, "Data type entry usage" and "Object dictionary", EDS keywords of CiA 306.
 
 Value = int | float | bytes
-
-_UNSIGNED = {0x01: 8, 0x05: 8, 0x06: 16, 0x07: 32, 0x16: 24, 0x18: 40, 0x19: 48, 0x1A: 56, 0x1B: 64}
-_SIGNED = {0x02: 8, 0x03: 16, 0x04: 32, 0x10: 24, 0x12: 40, 0x13: 48, 0x14: 56, 0x15: 64}
-_FLOAT = {datatypes.REAL32: "<f", datatypes.REAL64: "<d"}
 
 
 def key_of(index: int, subindex: int = 0) -> int:
@@ -146,41 +145,37 @@ class Entry:
 
 def read_entries(od: ObjectDictionary) -> Iterator[Entry]:
     """Every entry of a parsed EDS, the dummy types 0001h–0007h that DummyUsage allows included."""
-    for item in od.indices.values():
-        members = (item,) if isinstance(item, ODVariable) else item.subindices.values()
-        for variable in members:
-            yield _entry(variable)
+    return map(_entry, Description(od).entries())
 
 
-def _entry(variable: ODVariable) -> Entry:
-    data_type = variable.data_type or 0
-    bits = _UNSIGNED.get(data_type) or _SIGNED.get(data_type) or {0x08: 32, 0x11: 64}.get(data_type, 0)
-    access = variable.access_type
-    dummy = variable.index <= 0x0007
+def _entry(described: Described) -> Entry:
+    data_type = described.data_type
+    number = data_type in SIGNED or data_type in UNSIGNED or data_type in REALS
+    bits = 8 if data_type == datatypes.BOOLEAN else described.bits if number else 0
     return Entry(
-        key=key_of(variable.index, variable.subindex),
-        name=variable.qualname,
+        key=key_of(described.index, described.subindex),
+        name=described.name,
         bits=bits,
-        signed=data_type in _SIGNED,
-        real=_FLOAT.get(data_type, ""),
-        readable="r" in access or access == "const",
-        writable="w" in access,
-        in_tpdo=variable.pdo_mappable and not dummy and access not in {"wo", "rww"},
-        in_rpdo=dummy or (variable.pdo_mappable and access in {"rw", "wo", "rww"}),
-        low=variable.min,
-        high=variable.max,
-        default=_default(variable, bits),
+        signed=described.signed,
+        real=REALS[data_type][0] if data_type in REALS else "",
+        readable=described.readable,
+        writable=described.writable,
+        in_tpdo=described.in_tpdo and described.index > LAST_DUMMY,
+        in_rpdo=described.in_rpdo,
+        low=described.low,
+        high=described.high,
+        default=_default(described, bits),
     )
 
 
-def _default(variable: ODVariable, bits: int) -> Value:
-    value = variable.value if variable.value is not None else variable.default
+def _default(described: Described, bits: int) -> Value:
+    value = described.initial
     if value is None:
         return 0 if bits else b""
     if isinstance(value, str):
-        unicode = variable.data_type == datatypes.UNICODE_STRING
+        unicode = described.data_type == datatypes.UNICODE_STRING
         return value.encode("utf-16-le") if unicode else value.encode("latin-1", "replace")
-    return bytes(value) if isinstance(value, (bytes, bytearray)) else value
+    return value
 
 
 # Values of a node's object dictionary, with the checks an access over the bus must pass.
@@ -240,6 +235,10 @@ class Dictionary:
         """Whether any entry of that index exists."""
         return index in self._indices
 
+    def indices_in(self, area: range) -> list[int]:
+        """The indices there, ascending."""
+        return sorted(index for index in self._indices if index in area)
+
     def has_named(self, index: int, name: str) -> bool:
         """Whether the EDS has an object with this name there; of another maker a manufacturer's index is another's."""
         entry = self.entries.get(key_of(index))
@@ -249,6 +248,11 @@ class Dictionary:
         """An integer value, or `default` where the EDS has no such entry."""
         value = self.values.get(key_of(index, subindex), default)
         return int(value) if not isinstance(value, bytes) else default
+
+    def delivered(self, index: int, subindex: int = 0) -> int:
+        """The integer value that an entry has after a reset with nothing stored; 0 where the EDS has no such entry."""
+        entry = self.entries.get(key_of(index, subindex))
+        return 0 if entry is None or isinstance(entry.default, bytes) else int(entry.default)
 
     def put(self, index: int, subindex: int, value: Value) -> None:
         """Store a value of the device's own; nothing happens where the EDS has no such entry."""

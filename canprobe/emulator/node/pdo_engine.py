@@ -8,13 +8,14 @@ Source: CiA 301, "Process data object (PDO)", objects 1007h, 1019h, 18xxh:06.
 from __future__ import annotations
 
 import struct
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
 from canprobe.emulator.node.core import NO_ROUTES, NodeCore, Route, Service
 from canprobe.emulator.node.dictionary import Abort, SdoAbort, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
 from canprobe.emulator.node.rpdo_tpdo import BUFFERED, Packing, PdoRules, Rpdo, Sampler, Tpdo
-from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, NmtState, is_restricted
+from canprobe.protocol.frames import SYNC_ID, SYNC_LENGTH, SYNC_LOST, Frame, NmtState, is_restricted
 
 
 class _Group:
@@ -52,6 +53,8 @@ class PdoEngine(Service):
         self._groups: list[_Group] = []
         self._on_event: list[Tpdo] = []
         self._buffered: list[Tpdo] = []
+        self._late: deque[tuple[int, list[Frame]]] = deque()  # when, and what
+        self._late_timer = core.timers.new(self._send_late)
         self._count = self._sync_ns = self._window_ns = 0
         for rules in _discover(core, 0x1400, transmits=False):
             self._rpdos.append(rpdo := Rpdo(core, emcy, rules))
@@ -91,6 +94,8 @@ class PdoEngine(Service):
         """Count SYNCs anew in operational; be silent elsewhere."""
         for pdo in self._all:
             pdo.stop()
+        self._late.clear()
+        self._late_timer.cancel()
         if self._core.state is NmtState.OPERATIONAL:
             self._groups = []
             self._rebuild()
@@ -163,19 +168,35 @@ class PdoEngine(Service):
             if group.first is None and counter == group.start:
                 group.first = count
             if group.first is not None and (count - group.first) % group.every == 0:
-                for sampler in group.samplers:
-                    sampler(t_ns)
-                values = core.dictionary.values
-                try:
-                    core.out += [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
-                except (struct.error, TypeError):
-                    for tpdo in group.tpdos:
-                        tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
+                frames = self._packed(group, t_ns)
+                if core.quirks.tpdo_delay_ns:
+                    self._late.append((t_ns + core.quirks.tpdo_delay_ns, frames))
+                    self._late_timer.arm(self._late[0][0])
+                else:
+                    core.out += frames
         for tpdo in self._buffered:
             tpdo.sample(t_ns)
         for tpdo in self._on_event:
             if tpdo.requested:
                 tpdo.send(t_ns)
+
+    def _packed(self, group: _Group, t_ns: int) -> list[Frame]:
+        for sampler in group.samplers:
+            sampler(t_ns)
+        values = self._core.dictionary.values
+        try:
+            return [(cob_id, pack(*fetch(values))) for cob_id, pack, fetch in group.packing]
+        except (struct.error, TypeError):
+            for tpdo in group.tpdos:
+                tpdo.send(t_ns)  # the one with the value that does not fit raises, with its name
+            raise
+
+    def _send_late(self, due_ns: int) -> None:
+        """Frames of a node that is slow after SYNC: what they carry is as old as the SYNC."""
+        while self._late and self._late[0][0] <= due_ns:
+            self._core.out += self._late.popleft()[1]
+        if self._late:
+            self._late_timer.arm(self._late[0][0])
 
     def _rebuild(self) -> None:
         dictionary = self._core.dictionary

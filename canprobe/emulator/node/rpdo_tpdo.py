@@ -11,7 +11,7 @@ from operator import itemgetter
 from typing import Any
 
 from canprobe.eds.packaged import LONG_PDOS, LONG_PDOS_NAME
-from canprobe.emulator.node.core import INVALID, NodeCore, check_cob_id
+from canprobe.emulator.node.core import INVALID, NO_RTR, NodeCore, check_cob_id
 from canprobe.emulator.node.dictionary import Abort, Dictionary, SdoAbort, Slot, Value, key_of
 from canprobe.emulator.node.error_control import Emergency
 from canprobe.protocol.frames import PDO_TOO_LONG, PDO_TOO_SHORT, RPDO_TIMEOUT, RTR_FLAG
@@ -75,12 +75,12 @@ class PdoRules:
         elif new:
             self.entry(new)
 
-    def entries(self, count: int | None = None) -> tuple[PdoEntry, ...]:
+    def entries(self, count: int | None = None, fixed: bool = False) -> tuple[PdoEntry, ...]:
         """The first `count` mapped entries (all: None). Raises SdoAbort when they do not make a PDO."""
         total = self.dictionary.number(self.mapping, 0) if count is None else count
         if total and key_of(self.mapping, total) not in self.dictionary:
             raise SdoAbort(Abort.MAPPING_LENGTH)
-        found = tuple(self.entry(self.dictionary.number(self.mapping, sub)) for sub in range(1, total + 1))
+        found = tuple(self.entry(self.dictionary.number(self.mapping, sub), fixed) for sub in range(1, total + 1))
         if sum(entry.bits for entry in found) > (FD_MAX_BITS if self.long else MAX_BITS):
             raise SdoAbort(Abort.MAPPING_LENGTH)
         return found
@@ -88,14 +88,17 @@ class PdoRules:
     def present(self) -> tuple[PdoEntry, ...]:
         """All mapped entries; none where the mapping makes no sense."""
         try:
-            return self.entries()
+            return self.entries(fixed=True)
         except SdoAbort:
             return ()
 
-    def entry(self, word: int) -> PdoEntry:
-        """One mapping word. Raises SdoAbort when its object does not exist, may not be mapped or has another length."""
+    def entry(self, word: int, fixed: bool = False) -> PdoEntry:
+        """One mapping word. Raises SdoAbort when its object does not exist, may not be mapped or has another length.
+
+        What is there already may map anything: an EDS often does not list as mappable what a fixed mapping holds.
+        """
         target = self.dictionary.entries.get(word >> 8)
-        mappable = target is not None and (target.in_tpdo if self.transmits else target.in_rpdo)
+        mappable = target is not None and (fixed or (target.in_tpdo if self.transmits else target.in_rpdo))
         if target is None or not mappable or target.real or not target.bits or target.bits != word & 0xFF:
             raise SdoAbort(Abort.NOT_MAPPABLE)
         return PdoEntry.from_word(word, target.signed, target.name)
@@ -205,7 +208,6 @@ class Rpdo:
 # Source: CiA 301, "TPDO", objects 1800h and 1A00h.
 
 BUFFERED, ON_REQUEST = 252, 253
-_NO_RTR = 1 << 30  # of the COB-ID
 
 Sampler = Callable[[int], None]
 Fetch = Callable[[Mapping[int, Any]], tuple[int, ...]]
@@ -255,7 +257,7 @@ class Tpdo:
         cob_id = number(index, COB_ID)
         self._cob_id = cob_id & 0x7FF
         self.active = self._rules.valid and bool(entries)
-        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & _NO_RTR else None
+        self.remote_id = self._cob_id | RTR_FLAG if self.active and not cob_id & NO_RTR else None
         self.keys = tuple(key_of(entry.index, entry.subindex) for entry in entries)
         self.type, self.start = number(index, TYPE), number(index, START)
         self._inhibit_ns = number(index, INHIBIT) * 100_000

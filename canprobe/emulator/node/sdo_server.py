@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import struct
 from binascii import crc_hqx
+from collections import deque
 from collections.abc import Callable, Mapping
 from enum import IntEnum, auto
 from functools import partial
@@ -134,6 +135,9 @@ class SdoServer(Service):
         self._multiplexer = (0, 0)
         self._answer_id = 0
         self._timer = core.timers.new(self._timed_out)
+        self._slow_ns = core.quirks.sdo_ns
+        self._slow_timer = core.timers.new(self._send_late)
+        self._late: deque[tuple[int, bytes]] = deque()  # when, and what
         self.state = SdoState.IDLE
         self._data = bytearray()  # what was received so far, or what is sent
         self._announced: int | None = None
@@ -162,12 +166,17 @@ class SdoServer(Service):
 
     def reset(self, t_ns: int) -> None:
         """Drop what is open."""
-        self._drop()
+        self._forget()
 
     def entered(self, t_ns: int) -> None:
         """A transfer does not survive the stopped state."""
         if self._core.state not in _SERVED:
-            self._drop()
+            self._forget()
+
+    def _forget(self) -> None:
+        self._drop()
+        self._late.clear()
+        self._slow_timer.cancel()
 
     def routes(self) -> Mapping[int, Route]:
         """The request identifier, in pre-operational and operational."""
@@ -194,11 +203,24 @@ class SdoServer(Service):
             self._abort(abort.code)
             return
         for answer in answers:
-            self._core.out.append((self._answer_id, answer))
+            self._send(answer)
         if self.state is not SdoState.IDLE:
-            self._timer.arm(t_ns + TIMEOUT_NS)
+            self._timer.arm(t_ns + self._slow_ns + TIMEOUT_NS)
         elif self._timer.due_ns is not None:
             self._drop()
+
+    def _send(self, answer: bytes) -> None:
+        if not self._slow_ns:
+            self._core.out.append((self._answer_id, answer))
+            return
+        self._late.append((self._core.now_ns + self._slow_ns, answer))
+        self._slow_timer.arm(self._late[0][0])
+
+    def _send_late(self, due_ns: int) -> None:
+        while self._late and self._late[0][0] <= due_ns:
+            self._core.out.append((self._answer_id, self._late.popleft()[1]))
+        if self._late:
+            self._slow_timer.arm(self._late[0][0])
 
     def _answer(self, data: bytes) -> list[bytes]:
         request = request_of(self.state, data[0])
@@ -371,7 +393,7 @@ class SdoServer(Service):
 
     def _abort(self, code: Abort) -> None:
         self._drop()
-        self._core.send(self._answer_id, _HEAD.pack(0x80, *self._multiplexer, code))
+        self._send(_HEAD.pack(0x80, *self._multiplexer, code))
 
     def _timed_out(self, due_ns: int) -> None:
         self._abort(Abort.TIMED_OUT)

@@ -23,6 +23,7 @@ from canprobe.emulator.node.lss_slave import LssSlave, Store
 from canprobe.emulator.node.pdo_engine import PdoEngine, SyncConsumer
 from canprobe.emulator.node.sdo_server import SdoServer
 from canprobe.protocol.frames import NMT_ID, UNCONFIGURED, Frame, NmtCommand, NmtState
+from canprobe.scene.setup import Quirks
 
 OdOf = Callable[[int], ObjectDictionary]
 """Parses a node's EDS for a node id."""
@@ -76,8 +77,8 @@ class SlaveNode(Participant):
         od: ObjectDictionary,
         node_id: int,
         application: Application | None = None,
-        boot_ns: int = 0,
         od_of: OdOf | None = None,
+        quirks: Quirks | None = None,
     ) -> None:
         """Make the node; it is silent until `start`.
 
@@ -85,12 +86,11 @@ class SlaveNode(Participant):
             od: parsed EDS, with $NODEID already put in.
             node_id: 1–127; or 255 (`UNCONFIGURED`): it waits for LSS to give it one.
             application: what the device does; none by default.
-            boot_ns: time spent in initialisation, in which nothing is served.
             od_of: the same EDS for another node id. Where it is given, the node speaks LSS.
+            quirks: what makes it difficult, such as a slow boot, during which nothing is served; None: nothing.
         """
         self.application = application if application is not None else Application()
-        self.core = core = NodeCore(node_id, Dictionary(od), self)
-        self._boot_ns = boot_ns
+        self.core = core = NodeCore(node_id, Dictionary(od), self, quirks if quirks is not None else Quirks())
         self._boot_timer = core.timers.new(self._boot)
         self._routes: dict[int, Route] = {}
         self._rerouted: Callable[[], None] = nothing
@@ -214,8 +214,8 @@ class SlaveNode(Participant):
         self._reroute()
         if self.core.node_id == UNCONFIGURED:
             return
-        if self._boot_ns:
-            self._boot_timer.arm(t_ns + self._boot_ns)
+        if boot_ns := self.core.quirks.boot_ns:
+            self._boot_timer.arm(t_ns + boot_ns)
         else:
             self._boot(t_ns)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,8 @@ from canprobe.robot.straight_line import matrix_product
 from canprobe.touch.shapes import Nearest, Touches
 
 Truth = dict[str, float | bool | Array]
+SWITCH_BEYOND = 0.01
+"""How far outside of a joint's range its limit switches are, of the range."""
 
 
 class PlantState(NamedTuple):
@@ -132,6 +135,24 @@ class Plant:
             RuntimeError: without an arm.
         """
         return self._need_arm().motor_dynamics(axis)
+
+    def limit_switches(self, axis: int) -> tuple[float, float]:
+        """Positions of one motor (counts) at and beyond which its joint's limit switches are active, lower first.
+
+        The joint is where it really is, whatever zero its drive believes in; where motors are coupled the positions
+        follow from where the others are now. Infinite without an arm.
+
+        Args:
+            axis: from 0.
+        """
+        arm = self.arm
+        if arm is None:
+            return -inf, inf
+        model, q, here = arm.model, float(arm.q[axis]), arm.motor_counts(axis)
+        beyond = SWITCH_BEYOND * (model.q_max[axis] - model.q_min[axis])
+        per_count = float(model.q_per_unit[axis, axis])
+        ends = [here + (end - q) / per_count for end in (model.q_min[axis] - beyond, model.q_max[axis] + beyond)]
+        return min(ends), max(ends)
 
     def _need_arm(self) -> IdealArm | DynamicArm:
         if self.arm is None:

@@ -1,8 +1,11 @@
-"""Points 48–60: the drive, by raw frames. Source: CiA 402-2. Modes in depth: tests/emulator/test_drive_*.py."""
+"""Points 48–60 and 74: the drive, by raw frames. Source: CiA 402-2. Modes in depth: tests/emulator/test_drive_*.py."""
 
 from __future__ import annotations
 
 import pytest
+
+from canprobe.eds.packaged import load_eds
+from canprobe.emulator.drive.drive import make_drive_node
 
 CYCLE_MS = 100  # 60C2h as the bench sets it
 SHUTDOWN, SWITCH_ON, ENABLE, VOLTAGE, QUICK, RESET = 0x06, 0x07, 0x0F, 0x00, 0x02, 0x80
@@ -285,7 +288,7 @@ def test_cia402_54_handshake_of_profile_position(drive, plant):
 
 def test_cia402_55_homing_bits(drive, plant):
     power(drive, plant, 6)
-    assert drive.write(0x6098, 0, 17, 1) == 0x06090030  # needs a limit switch, which this drive has not
+    assert drive.write(0x6098, 0, 19, 1) == 0x06090030  # needs a home switch, which this drive has not
     drive.set((0x6098, 0, 37, 1), (0x607C, 0, 90, 4))
     assert bits(drive, 12, 13) == (0, 0)
     drive.set((0x6040, 0, 0x1F, 2))
@@ -294,6 +297,49 @@ def test_cia402_55_homing_bits(drive, plant):
     assert signed(drive, 0x6064) == -90
     drive.set((0x6040, 0, 0x0F, 2), (0x6098, 0, 0, 1), (0x6040, 0, 0x1F, 2))  # no method
     assert waits_for(drive, 13)
+    assert bits(drive, 12) == (0,)
+
+
+@pytest.mark.parametrize(("method", "home"), [(17, -300), (18, 300)])
+def test_cia402_55_homing_to_a_limit_switch(drive, plant, method, home):
+    power(drive, plant, 6)
+    plant.switches = (-300.0, 300.0)
+    drive.set((0x6099, 1, 5000, 4), (0x6099, 2, 1000, 4), (0x609A, 0, 100_000, 4))
+    drive.set((0x6098, 0, method, 1), (0x607C, 0, 0, 4), (0x6040, 0, 0x1F, 2))
+    assert bits(drive, 10, 12, 13) == (0, 0, 0)
+    assert waits_for(drive, 12)
+    assert bits(drive, 10, 13) == (1, 0)
+    assert signed(drive, 0x6064) == 0
+    assert plant.counts[0] == pytest.approx(home)
+
+
+def test_cia402_74_interpolated_position(connect, plant):
+    drive = connect(make_drive_node(load_eds("prbt_joint", 1), 1, 0, plant)).boot()
+    drive.set(*((0x1800 + n, 1, 0x80000181 + 0x100 * n, 4) for n in range(4)))
+    drive.set((0x60C2, 1, CYCLE_MS, 1), (0x200E, 0, 100, 2), (0x6060, 0, 7, 1))
+    assert drive.read(0x6061) == 7
+    drive.nmt(0x01)
+    for word in (SHUTDOWN, SWITCH_ON, ENABLE):
+        drive.set((0x6040, 0, word, 2))
+    assert reaches(drive, "operation enabled")
+    drive.set((0x60C1, 1, 500, 4))
+    drive.send(0x80)
+    drive.silence(2 * CYCLE_MS)
+    assert (bits(drive, 12), signed(drive, 0x6064)) == ((0,), 0)
+    drive.set((0x60C1, 1, 0, 4), (0x6040, 0, ENABLE | 0x10, 2))
+    assert bits(drive, 12) == (1,)
+    for target in (1000, -200):
+        start = signed(drive, 0x6064)
+        drive.set((0x60C1, 1, target, 4))
+        drive.send(0x80)
+        drive.silence(CYCLE_MS / 2)
+        half = signed(drive, 0x6064)
+        if not drive.real_time:
+            assert half == (start + target) / 2
+        assert comes_to(drive, target)
+    drive.set((0x6040, 0, ENABLE | 0x110, 2))  # halt
+    assert waits_for(drive, 10)
+    drive.set((0x6040, 0, ENABLE, 2))
     assert bits(drive, 12) == (0,)
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from canprobe.scene.setup import Quirks
+
 PRE, OP, STOPPED = 0x7F, 0x05, 0x04
 TO = {PRE: 0x80, OP: 0x01, STOPPED: 0x02}
 READ = "4000100000000000"
@@ -46,7 +48,7 @@ def test_cia301_nmt_03_commands_to_all(tiny):
 
 
 def test_cia301_nmt_04_nothing_is_served_in_initialisation(connect, make_bench):
-    bench = connect(make_bench(boot_ns=400_000_000).node)
+    bench = connect(make_bench(quirks=Quirks(boot_ns=400_000_000)).node)
     bench.power_on()
     for can_id, text in ((0x605, READ), (0, "0105"), (0x80, ""), (0x40000705, "")):
         bench.send(can_id, text)

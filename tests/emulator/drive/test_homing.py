@@ -1,8 +1,11 @@
-"""Homing, CiA 402-2: methods 33, 34, 35, 37, the three bits, home offset, errors."""
+"""Homing, CiA 402-2: limit switches, index pulses, the present position, the three bits, home offset, errors."""
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import pytest
+from canopen.objectdictionary import ODVariable
 from puma_arm import ELBOW_FORM
 
 from canprobe.eds.packaged import load_eds
@@ -71,8 +74,8 @@ def test_cia402_55_it_overshoots_the_pulse_and_comes_back(homing):
     assert 1000 + 4000**2 / 2e5 <= max(counts for _, counts in homing.trace) <= 1000 + 4000**2 / 2e5 + 4000 * 2.5e-3
 
 
-@pytest.mark.parametrize("method", [1, 2, 17, 18, 19, 30, 36])
-def test_cia402_55_methods_that_need_switches_are_refused(homing, method):
+@pytest.mark.parametrize("method", [3, 7, 19, 30, 36])
+def test_cia402_55_methods_that_need_a_home_switch_are_refused(homing, method):
     assert homing.drive.write(0x6098, 0, method, 1) == 0x06090030
 
 
@@ -111,6 +114,95 @@ def test_cia402_55_60_with_bit_4_kept_homing_starts_again_after_halt(homing):
     homing.put(_6098=34).word(START).run(60).word(HALT | 0x10).run(100).word(START)
     assert bits(homing) == UNDER_WAY
     assert homing.run(600).counts == 1000
+
+
+@pytest.fixture
+def switched(homing):
+    """Limit switches at -1500.5 and 2600.25, speeds of 8000 and 800."""
+    homing.plant.switches = (-1500.5, 2600.25)
+    return homing.put(_6099_1=8000, _6099_2=800)
+
+
+@pytest.mark.parametrize(
+    ("method", "home"),
+    [(17, -1500.5), (18, 2600.25), (1, -1000), (2, 2000)],
+)
+@pytest.mark.parametrize("start", [250.25, -1600.0, 2700.0])
+def test_cia402_55_limit_switches_and_the_pulse_behind_them(switched, method, home, start):
+    switched.plant.ramps.clear()
+    switched.plant.counts[0] = start
+    switched.word(0x06).word(0x07).word(0x0F).run(5).put(_6098=method, _607C=40).word(START)
+    assert bits(switched) == UNDER_WAY
+    switched.run(4000)
+    assert bits(switched) == DONE
+    assert switched.counts == pytest.approx(home, abs=1e-6)
+    assert switched.signed(0x6064) == -40
+
+
+def test_cia402_55_switch_at_6099_01_and_back_at_02(switched):
+    switched.put(_6098=18).word(START).run(2000)
+    speeds = [(b - a) / 0.5e-3 for (_, a), (_, b) in zip(switched.trace, switched.trace[1:], strict=False)]
+    assert max(speeds) == pytest.approx(8000)
+    assert min(speeds) == pytest.approx(-800)
+    reached = max(counts for _, counts in switched.trace)
+    assert 2600.25 <= reached <= 2600.25 + 8000 * 2.5e-3 + 8000**2 / 2e5
+
+
+def test_cia402_55_607e_turns_the_switches_round(switched):
+    switched.drive.node.application.parts.parameters.units.scale = -1.0
+    switched.put(_6098=17).word(START).run(4000)
+    assert (switched.counts, bits(switched)) == (pytest.approx(2600.25), DONE)
+
+
+@pytest.mark.parametrize("method", [1, 2, 17, 18])
+def test_cia402_55_a_switch_that_is_never_found_is_an_error(homing, method):
+    homing.put(_6098=method, _6099_1=100_000, _6065=0xFFFFFFFF).word(START)
+    homing.run(179_000, step_us=20_000)
+    assert bits(homing) == UNDER_WAY
+    homing.run(5_000, step_us=20_000)
+    assert bits(homing) == ERROR_AT_REST
+
+
+def test_cia402_55_a_switch_that_is_never_left_is_an_error(switched):
+    switched.plant.switches = (1e9, 1e10)
+    switched.put(_6098=17).word(START).run(185_000, step_us=20_000)
+    assert bits(switched) == ERROR_AT_REST
+
+
+@pytest.mark.parametrize("speed", [{"_6099_1": 0}, {"_6099_2": 0}])
+def test_cia402_55_switches_need_both_speeds(switched, speed):
+    switched.put(_6098=17, **speed).word(START).run(5)
+    assert bits(switched) == ERROR_AT_REST
+
+
+def test_cia402_55_an_incremental_drive_counts_from_0_at_every_node_reset(rig):
+    rig.plant.counts[0] = 777.0
+    rig.drive.node = make_drive_node(load_eds("puma260_joint", 1), 1, 0, rig.plant, incremental=True)
+    rig.drive.node.start(0)
+    assert rig.signed(0x6064) == 0
+    rig.put(_1019=240, _1006=2500, _6098=35, _607C=-55).enable(6).run(10).word(START)
+    assert (bits(rig), rig.signed(0x6064)) == (DONE, 55)
+    rig.word(0x06).drive.nmt(0x82)
+    assert rig.signed(0x6064) == 55
+    rig.put(_6060=6, _1019=240, _1006=2500).enable(6).run(10)
+    assert bits(rig) == DONE, "reset communication keeps the zero"
+    rig.word(0x06).drive.nmt(0x81)
+    assert rig.signed(0x6064) == 0
+    rig.put(_1019=240, _1006=2500).enable(6).run(10)
+    assert bits(rig) == NOT_STARTED
+
+
+def test_cia402_60fd_shows_the_limit_switches(rig):
+    od = deepcopy(load_eds("puma260_joint", 1))
+    inputs = ODVariable("Digital inputs", 0x60FD)
+    inputs.data_type, inputs.access_type, inputs.default, inputs.pdo_mappable = 0x7, "ro", 0, True
+    od.add_object(inputs)
+    rig.drive.node = make_drive_node(od, 1, 0, rig.plant)
+    rig.drive.node.start(0)
+    rig.plant.switches = (-10.0, 10.0)
+    for counts, shown in ((0.0, 0), (-10.0, 1), (10.5, 2)):
+        rig.plant.counts[0] = counts
+        assert rig.drive.read(0x60FD) == shown
 
 
 def test_cia402_55_moves_and_limits_refer_to_the_new_zero(homing):

@@ -9,6 +9,7 @@ from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
 from canprobe.robot.puma import UPENN
+from canprobe.scene.setup import Quirks
 
 CSP, CSV, CST = 8, 9, 10
 HOLD = "0f0000000000"
@@ -110,3 +111,24 @@ def test_torque_fed_forward_pushes_at_once(dynamic):
     assert dynamic.motor_counts(0) > still + 0.1
     dynamic.advance(1_000_000_000)  # the integrator has taken it over
     assert dynamic.motor_counts(0) == pytest.approx(still, abs=3.0)
+
+
+@pytest.mark.parametrize(("early_ms", "falls"), [(0, False), (60, True)])
+def test_a_brake_that_opens_before_the_torque_comes_lets_a_vertical_axis_fall(rig, early_ms, falls):
+    stretched = Plant(PlantConfig(UPENN, np.zeros(6), taxels=None, fidelity="dynamic"))
+    quirks = Quirks(brake_early_ns=early_ms * 1_000_000)
+    node = make_drive_node(load_eds("puma260_joint", 1), 1, 1, stretched, quirks=quirks)
+    rig.drive.node, rig.plant = node, stretched
+    node.start(0)
+    stretched.advance(200_000_000)
+    rig.drive.t_ns = 200_000_000
+    before = stretched.motor_counts(1)
+    rig.put(_6060=1, _6065=0xFFFFFFFF)
+    for word in (0x06, 0x07, 0x0F):
+        rig.word(word)
+    lost = []
+    for t_ms in range(205, 700, 5):
+        rig.drive.advance(t_ms * 1_000_000)
+        lost.append(abs(stretched.motor_counts(1) - before))
+    assert (max(lost) > 5.0) is falls, max(lost)
+    assert lost[-1] < 5.0, "it is caught"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from canprobe.protocol.frames import NmtState
+from canprobe.scene.setup import Quirks
 
 PRE, OP, STOPPED = NmtState.PRE_OPERATIONAL, NmtState.OPERATIONAL, NmtState.STOPPED
 TO = {PRE: [0x80], OP: [0x01], STOPPED: [0x02]}
@@ -49,7 +50,7 @@ def test_cia301_nmt_03_wrong_length_id_or_command_is_ignored(bench, frame):
 
 
 def test_cia301_nmt_04_nothing_is_served_in_initialisation(make_bench):
-    bench = make_bench(boot_ns=1_000)
+    bench = make_bench(quirks=Quirks(boot_ns=1_000))
     assert bench.send(0x605, READ_1000) == []
     assert bench.node.start(0) == []
     for can_id, text in ((0x605, READ_1000), (0, "0105"), (0x80, "")):

@@ -14,7 +14,7 @@ from canprobe.emulator.plant.taxels import IDEAL_TAXELS, PITCH_M, pad_direction
 from canprobe.errors import PlanError
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import inverse_near, start_posture
-from canprobe.robot.model import joints_to_units
+from canprobe.robot.model import joints_to_units, units_to_joints
 from canprobe.robot.puma import UPENN
 from canprobe.touch.objects import make_object
 
@@ -325,3 +325,22 @@ def test_real_centroid_follows_the_true_contact_point():
         errors.append(np.linalg.norm(centroid - p.truth()["pad_uv"]))
     assert len(errors) > 10
     assert np.median(errors) < 0.2e-3
+
+
+@pytest.mark.parametrize("fidelity", ["ideal", "dynamic"])
+def test_limit_switches_stand_just_outside_of_the_joints_range_where_the_other_motors_are(fidelity):
+    p = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity=fidelity))
+    push(p, ELBOW_FORM + 0.05, 0, 100 * MS)
+    p.advance(300 * MS)
+    for axis in range(6):
+        ends = []
+        for counts in p.limit_switches(axis):
+            motors = np.array([p.motor_counts(other) for other in range(6)])
+            motors[axis] = counts
+            ends.append(units_to_joints(UPENN, motors)[axis])
+        margin = 0.01 * (UPENN.q_max[axis] - UPENN.q_min[axis])
+        assert sorted(ends) == pytest.approx([UPENN.q_min[axis] - margin, UPENN.q_max[axis] + margin])
+
+
+def test_without_an_arm_there_are_no_limit_switches():
+    assert Plant(PlantConfig(None, taxels=None)).limit_switches(0) == (-math.inf, math.inf)
