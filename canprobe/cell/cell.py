@@ -13,7 +13,6 @@ from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock
 from canprobe.bus.scheduling import Interrupts
 from canprobe.cell.array import make_tactile, patch_from
 from canprobe.cell.bringup import BringUp
-from canprobe.cell.configuration import make_setups
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
@@ -22,6 +21,7 @@ from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.planning.configuration import make_setups
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE

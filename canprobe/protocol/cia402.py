@@ -22,12 +22,14 @@ INTERNAL_LIMIT = 11
 DRIVE_FOLLOWS = 12  # CSP, CSV, CST: the drive follows the command value
 SETPOINT_ACKNOWLEDGE = 12  # PP
 HOMING_ATTAINED = 12  # homing
+INTERPOLATION_ACTIVE = 12  # interpolated position
 FOLLOWING_ERROR = 13  # PP, CSP
 HOMING_ERROR = 13  # homing
 
 # Controlword bit numbers (6040h) outside the command bits 0..3.
 NEW_SETPOINT = 4  # PP
 HOMING_START = 4  # homing
+ENABLE_INTERPOLATION = 4  # interpolated position
 CHANGE_IMMEDIATELY = 5  # PP
 RELATIVE = 6  # PP
 FAULT_RESET_BIT = 7
@@ -40,6 +42,7 @@ class OperationMode(IntEnum):
     NONE = 0
     PROFILE_POSITION = 1
     HOMING = 6
+    INTERPOLATED_POSITION = 7
     CYCLIC_SYNC_POSITION = 8
     CYCLIC_SYNC_VELOCITY = 9
     CYCLIC_SYNC_TORQUE = 10

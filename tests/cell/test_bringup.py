@@ -14,7 +14,7 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.bus.lockstep import Participant
 from canprobe.bus.network import upload
-from canprobe.cell.configuration import make_setups
+from canprobe.planning.configuration import make_setups
 from canprobe.eds.packaged import eds_path
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
 from canprobe.emulator.world import make_world

@@ -9,7 +9,7 @@ import pytest
 
 import canprobe
 import canprobe.eds.packaged
-from canprobe.cell.configuration import make_setups
+from canprobe.planning.configuration import make_setups
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
 from canprobe.planning.devices import tactile_objects
