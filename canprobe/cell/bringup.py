@@ -7,7 +7,7 @@
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
 
-The drives are enabled afterwards, in the cycle: see `canprobe.cell.cell.Cell.run`.
+The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see `canprobe.cell.cell.Cell.run`.
 
 Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
 """
@@ -23,6 +23,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import (
     UPLOAD_DEVICE_TYPE,
+    Dialogues,
     PumpedNetwork,
     SdoTimeoutError,
     download,
@@ -41,6 +42,7 @@ ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
+MODE_DISPLAY = 0x6061
 REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 SECOND_S = 0.05
@@ -316,6 +318,29 @@ class BringUp:
                 raise self._error(
                     f"({setup.name}) booted again after it was configured: check its power, and that no other node has"
                     " its id",
+                    setup,
+                )
+
+    # in the cycle, before the drives are enabled
+
+    def confirm_modes(self, timeout_s: float) -> Dialogues:
+        """Ask every drive for the mode that it is in (6061h), until it is the planned one: to be served while cycling.
+
+        A drive may change its mode only once it is operational and SYNC runs.
+
+        Raises:
+            NodeError: from the dialogues: a drive is in another mode when the time is over.
+        """
+        until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
+        asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
+        return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+
+    def _confirm_mode(self, setup: NodeSetup, mode: int, until_ns: int) -> Dialogue:
+        while (got := (yield from self._read(setup, MODE_DISPLAY, 0))) != mode:
+            if self._network.port.clock.now_ns() >= until_ns:
+                raise self._error(
+                    f"({setup.name}) is in mode {got} (6061h) after 6060h = {mode} was written: it is not enabled;"
+                    " it may not have this mode, or need another setting for it",
                     setup,
                 )
 
