@@ -34,8 +34,8 @@ REST_NS = 12_500_000
 """Time without a motion after which a drive is at rest."""
 REST_RAD = 1e-3
 """Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
-REST_COUNTS_LEAST = 2
-"""Rounding and the last bit of an encoder."""
+REST_COUNTS_LEAST = 8
+"""The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
 CARRIED_CYCLES = 3
 """Cycles for which a motion is carried on without a report."""
 _FORGET = 0.9

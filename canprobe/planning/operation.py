@@ -87,7 +87,7 @@ class _Offer:
 
     def __str__(self) -> str:
         values = f"{self.values[0]} to {self.values[-1]}" if len(self.values) > 1 else ", ".join(map(str, self.values))
-        return f"60C2h takes {values} · 10^{' or '.join(map(str, self.indices))} s"
+        return f"60C2h takes {values} · 10^{' or '.join(map(str, sorted(self.indices)))} s"
 
 
 def _offer(device: Abilities) -> _Offer:
