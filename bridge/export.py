@@ -11,10 +11,11 @@ from typing import Any
 
 from canprobe.bridge.database import need, write_database
 from canprobe.bus.disk import whole_file, write_text
-from canprobe.cell.configuration import INVALID, MAPPING, SYNC_START_VALUE, NodeSetup, Write, make_setups
 from canprobe.eds.packaged import eds_file
 from canprobe.eds.sections import LINE_END, Faults, Section, Sections, decode, split_sections
 from canprobe.errors import UsageError
+from canprobe.planning.configuration import SYNC_START_VALUE, NodeSetup, Write, make_setups
+from canprobe.planning.devices import INVALID, MAPPING
 from canprobe.planning.model import (
     HEARTBEAT_CONSUMED_MS,
     HEARTBEAT_PRODUCED_MS,

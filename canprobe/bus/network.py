@@ -256,6 +256,56 @@ class _Talk:
         self._network.send_message(SDO_RX_BASE + self.node_id, data)
 
 
+class Dialogues:
+    """Dialogues with several nodes at once, served by whoever receives the frames meanwhile: see `hold_dialogues`.
+
+    A context manager: the first requests go out on entering.
+
+    Args:
+        network: it is pumped, or fed, by the caller.
+        dialogues: by node id; each catches the errors that it can go on after, any other ends them all.
+        timeout_s: for an answer.
+        retries: how often a request without an answer is sent again.
+    """
+
+    def __init__(
+        self, network: PumpedNetwork, dialogues: Mapping[int, Dialogue], *, timeout_s: float, retries: int = 0
+    ) -> None:
+        self._network = network
+        self._dialogues = dialogues
+        self._settings = round(timeout_s * 1e9), retries
+        self._talks: list[_Talk] = []
+
+    def __enter__(self) -> Dialogues:
+        try:
+            for node_id, dialogue in self._dialogues.items():
+                self._talks.append(_Talk(self._network, node_id, dialogue, *self._settings))
+                self._network.subscribe(SDO_TX_BASE + node_id, self._talks[-1].take)
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for talk in self._talks:
+            self._network.unsubscribe(SDO_TX_BASE + talk.node_id, talk.take)
+
+    @property
+    def waiting(self) -> list[_Talk]:
+        """Those that are not over."""
+        return [talk for talk in self._talks if not talk.over]
+
+    def serve(self) -> None:
+        """Hand each dialogue the answers that have come; where none came in time, ask again or give up."""
+        for talk in self.waiting:
+            talk.serve()
+
+    @property
+    def repeated(self) -> dict[int, int]:
+        """Requests that were sent again, by node id."""
+        return {talk.node_id: talk.repeated for talk in self._talks}
+
+
 def hold_dialogues(
     network: PumpedNetwork, dialogues: Mapping[int, Dialogue], *, timeout_s: float, retries: int = 0
 ) -> dict[int, int]:
@@ -270,20 +320,12 @@ def hold_dialogues(
     Returns:
         Requests that were sent again, by node id.
     """
-    talks: list[_Talk] = []
-    try:
-        for node_id, dialogue in dialogues.items():
-            talks.append(_Talk(network, node_id, dialogue, round(timeout_s * 1e9), retries))
-            network.subscribe(SDO_TX_BASE + node_id, talks[-1].take)
-        while waiting := [talk for talk in talks if not talk.over]:
+    with Dialogues(network, dialogues, timeout_s=timeout_s, retries=retries) as held:
+        while waiting := held.waiting:
             left_s = max(0, min(talk.due_ns for talk in waiting) - network.port.clock.now_ns()) * 1e-9
             network.pump_until(lambda: all(talk.inbox for talk in waiting), min(left_s, ROUND_S))
-            for talk in waiting:
-                talk.serve()
-    finally:
-        for talk in talks:
-            network.unsubscribe(SDO_TX_BASE + talk.node_id, talk.take)
-    return {talk.node_id: talk.repeated for talk in talks}
+            held.serve()
+    return held.repeated
 
 
 # LSS: finds nodes without an id, one after another, and gives them one.

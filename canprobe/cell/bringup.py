@@ -7,7 +7,7 @@
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
 
-The drives are enabled afterwards, in the cycle: see `canprobe.cell.cell.Cell.run`.
+The drives are enabled afterwards, in the cycle, once each has confirmed its mode: see `canprobe.cell.cell.Cell.run`.
 
 Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100Ah.
 """
@@ -15,7 +15,7 @@ Source: CiA 302-2 (boot-up procedure); CiA 301, objects 1010h, 1018h, 1020h, 100
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from canopen.objectdictionary import ODVariable
@@ -23,6 +23,7 @@ from canopen.sdo.exceptions import SdoAbortedError, SdoCommunicationError
 
 from canprobe.bus.network import (
     UPLOAD_DEVICE_TYPE,
+    Dialogues,
     PumpedNetwork,
     SdoTimeoutError,
     download,
@@ -30,9 +31,10 @@ from canprobe.bus.network import (
     read_value,
     upload,
 )
-from canprobe.cell.configuration import NodeSetup, Write
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import BusError, NodeError
+from canprobe.planning.configuration import NodeSetup, Write
+from canprobe.planning.operation import INTERPOLATION_TIME
 from canprobe.protocol.frames import NO_ERROR, SDO_RX_BASE, SDO_TX_BASE, NmtCommand, NmtState, describe, pack_nmt
 from canprobe.scene.setup import BringUpTimes as Settings
 
@@ -40,6 +42,8 @@ ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
+MODE_DISPLAY = 0x6061
+REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
 SECOND_S = 0.05
 """In which a second boot-up, or a second answer to one request, is waited for."""
@@ -57,6 +61,7 @@ class NodeReport:
         software: its version by 100Ah; None where the node does not report it.
         kept: its configuration was there already, by 1020h.
         repeated: requests that were sent again.
+        remarks: how the device differs from its EDS or from what was wished, and was taken all the same.
         failure: what went wrong; None where nothing did.
     """
 
@@ -64,6 +69,7 @@ class NodeReport:
     software: str | None = None
     kept: bool = False
     repeated: int = 0
+    remarks: list[str] = field(default_factory=list)
     failure: NodeError | None = None
 
     def __str__(self) -> str:
@@ -210,9 +216,11 @@ class BringUp:
             raise NodeError(first.node_id, "; ".join([first.reason, *map(str, others)]))
         for report in reports.values():
             self._say(str(report))
-            if lacks := ", ".join(f"{index:04X}h" for index in report.setup.lacks):
-                node = f"node {report.setup.node_id}: ({report.setup.name})"
-                self._say(f"{node} has no {lacks}: left as the device has it")
+            node = f"node {report.setup.node_id}: ({report.setup.name})"
+            for remark in report.remarks:
+                self._say(f"{node} {remark}")
+            if left := ", ".join(dict.fromkeys(f"{one.write.index:04X}h" for one in report.setup.left_out)):
+                self._say(f"{node} cannot take {left} by its EDS: left as the device has it")
 
     def _configure(self, report: NodeReport) -> Dialogue:
         """All that is said to one node."""
@@ -221,9 +229,7 @@ class BringUp:
             yield from self._identify(report)
             yield from self._check_given(setup)
             report.kept = self._settings.store and (yield from self._is_kept(setup))
-            for write in setup.writes:
-                if not (report.kept and write.read_back):
-                    yield from self._write(setup, write)
+            yield from self._write_all(report)
             if self._settings.store and not report.kept:
                 yield from self._keep(setup)
         except NodeError as error:
@@ -237,7 +243,11 @@ class BringUp:
         setup = report.setup
         for subindex, expected in setup.identity.items():
             got = yield from self._read(setup, 0x1018, subindex)
-            if got != expected:
+            if subindex == REVISION and got != expected and _same_major(got, expected):
+                report.remarks.append(
+                    f"has revision {got:08X}h, {setup.eds} describes {expected:08X}h: the same major revision, taken"
+                )
+            elif got != expected:
                 raise NodeError(
                     setup.node_id,
                     f"({setup.name}) is not the device of {setup.eds}: 1018h:{subindex:02X}"
@@ -311,6 +321,29 @@ class BringUp:
                     setup,
                 )
 
+    # in the cycle, before the drives are enabled
+
+    def confirm_modes(self, timeout_s: float) -> Dialogues:
+        """Ask every drive for the mode that it is in (6061h), until it is the planned one: to be served while cycling.
+
+        A drive may change its mode only once it is operational and SYNC runs.
+
+        Raises:
+            NodeError: from the dialogues: a drive is in another mode when the time is over.
+        """
+        until_ns = self._network.port.clock.now_ns() + round(timeout_s * 1e9)
+        asked = {s.node_id: self._confirm_mode(s, s.mode, until_ns) for s in self._setups if s.mode is not None}
+        return Dialogues(self._network, asked, timeout_s=self._settings.sdo_s, retries=self._settings.retries)
+
+    def _confirm_mode(self, setup: NodeSetup, mode: int, until_ns: int) -> Dialogue:
+        while (got := (yield from self._read(setup, MODE_DISPLAY, 0))) != mode:
+            if self._network.port.clock.now_ns() >= until_ns:
+                raise self._error(
+                    f"({setup.name}) is in mode {got} (6061h) after 6060h = {mode} was written: it is not enabled;"
+                    " it may not have this mode, or need another setting for it",
+                    setup,
+                )
+
     # the way out
 
     def release(self) -> None:
@@ -346,18 +379,62 @@ class BringUp:
                 setup.node_id, f"({setup.name}) read of {index:04X}h:{subindex:02X} failed: {error}"
             ) from error
 
+    def _write_all(self, report: NodeReport) -> Dialogue:
+        """The configuration; what is wished and refused is left out with a remark."""
+        setup = report.setup
+        times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
+        for write in setup.writes:
+            if report.kept and write.read_back:
+                continue
+            if write.index != INTERPOLATION_TIME:
+                try:
+                    yield from self._write(setup, write)
+                except RefusedError as refused:
+                    if write.absence is None:
+                        raise
+                    reason = refused.reason.removeprefix(f"({setup.name}) ")
+                    report.remarks.append(f"{reason}: {write.purpose} is left as the device has it: {write.absence}")
+            elif write is times[0][0]:
+                yield from self._write_one_of(report, times)
+
+    def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
+        """The first of several sets of writes that mean the same and that the device takes."""
+        for i, writes in enumerate(options):
+            try:
+                for write in writes:
+                    yield from self._write(report.setup, write)
+            except RefusedError:
+                if i == len(options) - 1:
+                    raise
+            else:
+                if i:
+                    values = ", ".join(f"{write.place} = {write.value}" for write in writes)
+                    report.remarks.append(f"takes {values}, which means the same as what it refused")
+                return
+
     def _write(self, setup: NodeSetup, write: Write) -> Dialogue:
         variable = _variable(setup, write.index, write.subindex)
-        where = f"{write.index:04X}h:{write.subindex:02X}"
+        value = write.value
         try:
-            yield from download(write.index, write.subindex, variable.encode_raw(write.value))
-        except (SdoAbortedError, SdoCommunicationError) as error:
-            raise NodeError(
-                setup.node_id, f"({setup.name}) write of {where} = {write.value:#x} failed: {error}"
-            ) from error
-        if write.read_back and (got := (yield from self._read(setup, write.index, write.subindex))) != write.value:
-            raise NodeError(
-                setup.node_id, f"({setup.name}) {where} reads back {got:#x} after {write.value:#x} was written"
+            yield from download(write.index, write.subindex, variable.encode_raw(value))
+        except SdoAbortedError as error:
+            if not write.own_bits:
+                raise _refused(setup, write, error) from error
+            value = _with_own_bits(write, (yield from self._read(setup, write.index, write.subindex)))
+            if value == write.value:
+                raise _refused(setup, write, error) from error
+            try:
+                yield from download(write.index, write.subindex, variable.encode_raw(value))
+            except SdoAbortedError as again:
+                raise _refused(setup, write, again) from again
+        except SdoCommunicationError as error:
+            raise NodeError(setup.node_id, _failed(setup, write, error)) from error
+        if not write.read_back:
+            return
+        got = yield from self._read(setup, write.index, write.subindex)
+        if got not in (value, _with_own_bits(write, got)):
+            raise RefusedError(
+                setup.node_id, f"({setup.name}) {write.place} reads back {got:#x} after {write.value:#x} was written"
             )
 
     def _recall(self, setup: NodeSetup) -> Dialogue:
@@ -376,6 +453,28 @@ class BringUp:
         """What these nodes failed in, with the last EMCY of each of them."""
         ids = [setup.node_id for setup in setups]
         return NodeError(ids[0], reason + "".join([self._watch.last_words(i) or self._history.get(i, "") for i in ids]))
+
+
+class RefusedError(NodeError):
+    """A device refused a value, or holds another one."""
+
+
+def _refused(setup: NodeSetup, write: Write, error: Exception) -> RefusedError:
+    return RefusedError(setup.node_id, _failed(setup, write, error))
+
+
+def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:
+    return f"({setup.name}) write of {write.place} = {write.value:#x} failed: {error}"
+
+
+def _with_own_bits(write: Write, held: int) -> int:
+    """The value with the bits that are the device's as it holds them."""
+    return write.value & ~write.own_bits | held & write.own_bits
+
+
+def _same_major(got: int, expected: int) -> bool:
+    """Whether a revision is at or above another of the same major number. Source: CiA 301, object 1018h:03."""
+    return got >> 16 == expected >> 16 and got >= expected
 
 
 def _others(words: str, setups: Sequence[NodeSetup]) -> str:

@@ -13,7 +13,6 @@ from canprobe.bus.port import Port, PortCounters, TimedFrame, VirtualClock
 from canprobe.bus.scheduling import Interrupts
 from canprobe.cell.array import make_tactile, patch_from
 from canprobe.cell.bringup import BringUp
-from canprobe.cell.configuration import make_setups
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
@@ -22,6 +21,7 @@ from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
 from canprobe.errors import CanprobeError, NodeError, SafetyStop, UsageError
+from canprobe.planning.configuration import make_setups
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import POWERED_STATES, DriveState
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE
@@ -30,8 +30,7 @@ Result = TypeVar("Result")
 
 WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
-ENABLE_TIMEOUT_S = 2.0
-STOP_TIMEOUT_S = 0.5
+REST_TIMEOUT_S = 2.0
 FREE_IT = "free it; a run does not begin while the array measures a force"
 OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
 """Of the log; a controller's `Command.columns` have other names."""
@@ -258,33 +257,42 @@ class Cell:
             return
         self._say("enable the drives")
         self.drives.goal = DriveState.SWITCH_ON_DISABLED
-        self._cycle_until((), WARM_UP_S)
+        times = self._plan.setup.bring_up
+        with self._bring_up.confirm_modes(times.enable_s) as modes:
+            self._cycle_until((), WARM_UP_S, check=modes.serve)
+            while modes.waiting:
+                self._cycle_until((), self._one_cycle_s, check=modes.serve)
         self._await_rest()
         if (reason := self._controller.inspect(self.drives.joints())) is not None:
             raise SafetyStop(reason)
         self.drives.goal = DriveState.OPERATION_ENABLED
-        if not self._cycle_until((DriveState.OPERATION_ENABLED,), ENABLE_TIMEOUT_S, check=self._supervise_enabling):
+        if not self._cycle_until((DriveState.OPERATION_ENABLED,), times.enable_s, check=self._supervise_enabling):
             i, instead = self.drives.first_not_in(DriveState.OPERATION_ENABLED)
             node_id = self.drives.axes[i].node_id
             raise NodeError(
                 node_id,
-                f"(joint {i + 1}) is {instead} {ENABLE_TIMEOUT_S:g} s after the command to enable operation"
-                + self.watch.last_words(node_id),
+                f"(joint {i + 1}) is {instead} {times.enable_s:g} s after the command to enable operation"
+                " (bring_up.enable_s)" + self.watch.last_words(node_id),
             )
 
     def _await_rest(self) -> None:
         """Enable nothing that is not known to stand still: the first target of a drive is its reported position."""
         assert self.drives is not None
-        for _ in range(int(ENABLE_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
+        for _ in range(int(REST_TIMEOUT_S * 1e9 / self._plan.sync.period_ns)):
             if all(self.drives.rests):
                 return
-            self._cycle_until((), 1.5e-9 * self._plan.sync.period_ns)
+            self._cycle_until((), self._one_cycle_s)
         axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
         raise NodeError(
             axis.node_id,
-            f"reports no position that stays for {ENABLE_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+            f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
             + self.watch.last_words(axis.node_id),
         )
+
+    @property
+    def _one_cycle_s(self) -> float:
+        """A time in which `_cycle_until` makes one cycle."""
+        return 1.5e-9 * self._plan.sync.period_ns
 
     def _cycle_until(
         self,
@@ -430,7 +438,7 @@ class Cell:
     def _stop_until(self, states: tuple[DriveState, ...]) -> bool:
         """As `_cycle_until`, for a bus that may come and go: what fails is tried again in the next cycle."""
         assert self.cycle is not None
-        end_ns = self._port.clock.now_ns() + int(STOP_TIMEOUT_S * 1e9)
+        end_ns = self._port.clock.now_ns() + int(self._plan.setup.bring_up.stop_s * 1e9)
         failure: CanprobeError | None = None
         while (left_ns := end_ns - self._port.clock.now_ns()) > 0:
             try:

@@ -6,8 +6,8 @@ The drives hold *motor* positions; gears and couplings are undone here and nowhe
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from math import copysign
 
 import numpy as np
@@ -15,17 +15,27 @@ from numpy.typing import NDArray
 
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import Plan
-from canprobe.protocol.cia402 import DriveState, controlword_toward, describe_state, known_state
+from canprobe.planning.operation import TARGETS, Place
+from canprobe.protocol.cia402 import (
+    ENABLE_INTERPOLATION,
+    DriveState,
+    OperationMode,
+    controlword_toward,
+    describe_state,
+    known_state,
+)
 from canprobe.protocol.frames import Frame
-from canprobe.protocol.pdo import PdoLayout
-from canprobe.robot.model import ArmModel, joints_to_units, units_to_joints
+from canprobe.protocol.pdo import PdoEntry, PdoLayout
+from canprobe.robot.model import ArmModel, joints_to_units, units_per_motor, units_to_joints
 
 # The position of one motor as its TPDOs report it: what it can have reached, and where it is when one is missing.
 
-STEADY = 5
-"""Equal reports after which a motor is at rest."""
-BASE_COUNTS = 8
-"""A millirad of a joint: what a report may be off by, whatever the motion."""
+REST_NS = 12_500_000
+"""Time without a motion after which a drive is at rest."""
+REST_RAD = 1e-3
+"""Of a joint: what a report may be off by, whatever the motion, and within which a drive at rest stays."""
+REST_COUNTS_LEAST = 8
+"""The same of a coarse encoder, which has a count or two a milliradian: it dithers, and its drive starts in steps."""
 CARRIED_CYCLES = 3
 """Cycles for which a motion is carried on without a report."""
 _FORGET = 0.9
@@ -39,19 +49,24 @@ class PositionTrack:
     an enabled one is no faster than its target. Without the second, wrong reports, each believed for the last, would
     make up a motion that grows from nothing.
 
+    Args:
+        base: what a report may be off by, whatever the motion, counts: see `rest_counts`.
+
     Attributes:
         counts: the last position that was believed.
         cycle: of that position; −1 before the first.
-        steady: reports in a row that differed by no more than ``BASE_COUNTS``.
+        rested_ns: how long the reports have stayed within ``base`` of the first of them.
     """
 
-    __slots__ = ("_asked", "_last", "_rate", "_t_ns", "counts", "cycle", "steady")
+    __slots__ = ("_asked", "_base", "_rate", "_still", "_still_ns", "_t_ns", "counts", "cycle", "rested_ns")
 
-    def __init__(self) -> None:
+    def __init__(self, base: float) -> None:
         self.counts = 0
         self.cycle = -1
-        self.steady = 0
-        self._last = 0
+        self.rested_ns = 0
+        self._base = base
+        self._still: int | None = None
+        self._still_ns = 0
         self._t_ns = 0
         self._rate = 0.0  # counts per ns
         self._asked = 0.0  # counts per cycle
@@ -73,15 +88,16 @@ class PositionTrack:
         Returns:
             Whether it is believed.
         """
-        self.steady = self.steady + 1 if abs(counts - self._last) <= BASE_COUNTS else 0
-        self._last = counts
+        if self._still is None or abs(counts - self._still) > self._base:
+            self._still, self._still_ns = counts, t_ns
+        self.rested_ns = t_ns - self._still_ns
         if self.cycle >= 0:
             step, passed_ns = counts - self.counts, t_ns - self._t_ns
             moved: float = step
             if guarded:
                 carried = self._rate * passed_ns
                 asked = (cycle - self.cycle) * self._asked
-                if abs(step - carried) > BASE_COUNTS + abs(carried) + asked:
+                if abs(step - carried) > self._base + abs(carried) + asked:
                     return False
                 moved = step if abs(step) <= asked else copysign(asked, step)
             if passed_ns > 0:
@@ -98,13 +114,22 @@ class PositionTrack:
         return self.counts + self._rate * passed_ns
 
 
+def rest_counts(model: ArmModel) -> list[float]:
+    """A milliradian (0.2 mm) of each drive's joint in its units: more than encoders are noisy, less than a motion."""
+    counts = np.abs(units_per_motor(model)) * model.radian * REST_RAD
+    return np.maximum(counts, REST_COUNTS_LEAST).tolist()  # type: ignore[no-any-return]
+
+
 # The drives as one thing: TPDOs in, joint positions out; joint targets in, RPDOs out.
 
 Vector = NDArray[np.float64]
 SYNCHRONOUS_MAX = 240
 """Highest transmission type that follows SYNC; above it an RPDO is sent on change and again every so often."""
 COMMAND_REPEAT_NS = 100_000_000
-_COMMAND_OBJECTS = (0x6040, 0x607A)
+_FEEDBACK: tuple[Place, ...] = ((0x6041, 0), (0x6064, 0), (0x6077, 0))
+_TARGETS = frozenset(TARGETS.values())
+CONTROLWORD, TARGET, CONSTANT = range(3)
+"""What a value of a command is."""
 _QUICK_STOP, _DISABLE_VOLTAGE = 0x0002, 0x0000
 _STATE_BITS, _ENABLED = 0x6F, DriveState.OPERATION_ENABLED.value
 """Of a statusword of operation enabled; see `known_state` for the other states."""
@@ -116,14 +141,58 @@ class DriveAxis:
 
     Attributes:
         node_id: the node.
-        feedback: layout of its TPDO: statusword, position (counts) and, where the drive can map it, torque (permille).
-        commands: layouts of its RPDOs, which between them map controlword and target position (counts) once. Drives
-            whose RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
+        feedback: layouts of its TPDOs, which between them have statusword, position (counts) and, where the drive can
+            send it, torque (permille). What else they have is not read.
+        commands: layouts of its RPDOs, which between them map controlword and target position (counts). Drives whose
+            RPDOs share a COB-ID (the foreign half a dummy) get one frame together.
+        mode: of operation.
+        constants: what entries of the RPDOs hold that are neither, by (index, sub-index).
     """
 
     node_id: int
-    feedback: PdoLayout
+    feedback: tuple[PdoLayout, ...]
     commands: tuple[PdoLayout, ...]
+    mode: int = OperationMode.CYCLIC_SYNC_POSITION
+    constants: Mapping[Place, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class FeedbackFrame:
+    """One TPDO frame of a drive.
+
+    Attributes:
+        axis: of the drive, from 0.
+        layout: of the frame; longer ones are taken too.
+        word, counts, torque: which of its values statusword, position and torque are; None: another TPDO has them.
+    """
+
+    axis: int
+    layout: PdoLayout
+    word: int | None
+    counts: int | None
+    torque: int | None
+
+    def unpack(self, data: bytes) -> tuple[int, ...]:
+        """Its values; what is beyond the mapping is not read.
+
+        Raises:
+            ProtocolError: it is too short.
+        """
+        length = self.layout.length
+        return self.layout.unpack(data if len(data) <= length else data[:length])
+
+
+def feedback_frames(axes: Sequence[DriveAxis]) -> tuple[FeedbackFrame, ...]:
+    """The TPDO frames that the drives send between them."""
+    frames = []
+    for i, axis in enumerate(axes):
+        taken: set[Place] = set()
+        for layout in axis.feedback:
+            places = [(entry.index, entry.subindex) for entry in layout.signals]
+            own = [None if p in taken or p not in places else places.index(p) for p in _FEEDBACK]
+            taken.update(places)
+            frames.append(FeedbackFrame(i, layout, *own))
+    return tuple(frames)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,7 +202,7 @@ class CommandFrame:
     Attributes:
         cob_id: of the frame.
         every_cycle: it goes in every cycle; False: on change.
-        parts: who has a part in it: axis, layout, and which of (controlword, target position) each of its values is.
+        parts: who has a part in it: axis, layout, and what each of its values is: `CONTROLWORD`, `TARGET`, `CONSTANT`.
     """
 
     cob_id: int
@@ -146,7 +215,7 @@ def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
     parts: dict[int, list[tuple[int, PdoLayout, tuple[int, ...]]]] = {}
     for i, axis in enumerate(axes):
         for layout in axis.commands:
-            picks = tuple(_COMMAND_OBJECTS.index(entry.index) for entry in layout.entries if not entry.is_dummy)
+            picks = tuple(map(_pick, layout.signals))
             parts.setdefault(layout.cob_id, []).append((i, layout, picks))
     return tuple(
         CommandFrame(cob_id, group[0][1].transmission_type <= SYNCHRONOUS_MAX, tuple(group))
@@ -154,8 +223,15 @@ def command_frames(axes: tuple[DriveAxis, ...]) -> tuple[CommandFrame, ...]:
     )
 
 
+def _pick(entry: PdoEntry) -> int:
+    place = entry.index, entry.subindex
+    return CONTROLWORD if place == (0x6040, 0) else TARGET if place in _TARGETS else CONSTANT
+
+
 class DriveGroup:
-    """State of the arm's CiA 402 drives in cyclic synchronous position mode.
+    """State of the arm's CiA 402 drives in cyclic synchronous or interpolated position mode.
+
+    No RPDO goes to a drive before its position is known: the first target is where it is.
 
     Args:
         axes: the drives, joint 1 first.
@@ -173,7 +249,8 @@ class DriveGroup:
         self.axes = axes
         self.goal = DriveState.OPERATION_ENABLED
         self.statuswords = [0] * len(axes)
-        with_torque = [len(axis.feedback.entries) > 2 for axis in axes]
+        sources = feedback_frames(axes)
+        with_torque = [any(one.torque is not None for one in sources if one.axis == i) for i in range(len(axes))]
         self.torque_permille = [0 if sent else math.nan for sent in with_torque] if any(with_torque) else []
         self.late = 0
         self.missed = 0
@@ -182,19 +259,23 @@ class DriveGroup:
         self.implausible = 0
         self.stopped: frozenset[int] = frozenset()
         self._model = model
-        self._axis_of = {axis.feedback.cob_id: i for i, axis in enumerate(axes)}
-        self._tracks = tuple(PositionTrack() for _ in axes)
+        self._sources = {one.layout.cob_id: (k, one) for k, one in enumerate(sources)}
+        self._tracks = tuple(map(PositionTrack, rest_counts(model)))
         self._deadline_ns = 0
-        self._heard = [-1] * len(axes)
+        self._heard = [-1] * len(sources)
+        self._all_heard = False
         self._targets: list[int] | None = None
         self._aimed: tuple[int, ...] | None = None
         self._words = [0] * len(axes)
+        self._constants: list[int] = []
+        self._interpolated = [axis.mode == OperationMode.INTERPOLATED_POSITION for axis in axes]
         self._steady: tuple[object, ...] | None = None
         self._plan = [
             (
                 frame.cob_id,
                 frame.every_cycle,
-                [(layout.pack, [axis + pick * len(axes) for pick in picks]) for axis, layout, picks in frame.parts],
+                [(layout.pack, self._places_of(axis, layout, picks)) for axis, layout, picks in frame.parts],
+                tuple(axis for axis, _, _ in frame.parts),
             )
             for frame in command_frames(axes)
         ]
@@ -205,17 +286,28 @@ class DriveGroup:
         self._cycle = -1
         self._sync_ns = 0
 
+    def _places_of(self, axis: int, layout: PdoLayout, picks: tuple[int, ...]) -> list[int]:
+        """Where each value of a part stands in controlwords, targets and constants, one after another."""
+        places, n = [], len(self.axes)
+        for entry, pick in zip(layout.signals, picks, strict=True):
+            if pick == CONSTANT:
+                places.append(2 * n + len(self._constants))
+                self._constants.append(self.axes[axis].constants[entry.index, entry.subindex])
+            else:
+                places.append(axis + pick * n)
+        return places
+
     @property
     def feedback_ids(self) -> frozenset[int]:
         """COB-IDs of the TPDOs that belong to the group."""
-        return frozenset(self._axis_of)
+        return frozenset(self._sources)
 
     def begin(self, cycle: int, t_ns: int = 0, deadline_ns: int | None = None) -> None:
         """A new SYNC is out, at ``t_ns``, meant for ``deadline_ns``: every TPDO is expected once more."""
         self._cycle = cycle
         self._deadline_ns = t_ns if deadline_ns is None else deadline_ns
         self._sync_ns = t_ns
-        self._pending = len(self.axes)
+        self._pending = len(self._heard)
         self._open = True
 
     @property
@@ -227,25 +319,30 @@ class DriveGroup:
         """Take one TPDO that arrived at ``t_ns``.
 
         One from before the SYNC or after the collection window, or a second one for a SYNC, is late and not used; nor
-        is one of another length. The position of one that an enabled drive cannot have reached is not used.
+        is a shorter one. The position of one that an enabled drive cannot have reached is not used.
         """
-        i = self._axis_of[can_id]
-        if not self._open or t_ns < self._sync_ns or self._heard[i] == self._cycle:
+        k, source = self._sources[can_id]
+        if not self._open or t_ns < self._sync_ns or self._heard[k] == self._cycle:
             self.late += 1
             return
         try:
-            values = self.axes[i].feedback.unpack(data)
+            values = source.unpack(data)
         except ProtocolError:
             self.malformed += 1  # and missed, unless another one comes
             return
-        word, counts, *torque = values
-        if torque:
-            self.torque_permille[i] = torque[0]
-        enabled = word & _STATE_BITS == _ENABLED and self.statuswords[i] & _STATE_BITS == _ENABLED
-        self.statuswords[i] = word
-        self._heard[i] = self._cycle
+        i = source.axis
+        self._heard[k] = self._cycle
         self._pending -= 1
         self.answer_ns = t_ns - self._sync_ns
+        if source.torque is not None:
+            self.torque_permille[i] = values[source.torque]
+        enabled = self.statuswords[i] & _STATE_BITS == _ENABLED
+        if source.word is not None:
+            word = self.statuswords[i] = values[source.word]
+            enabled = enabled and word & _STATE_BITS == _ENABLED
+        if source.counts is None:
+            return
+        counts = values[source.counts]
         guarded = enabled and self._aimed is not None  # a log without targets does not say where it was to go
         if not self._tracks[i].take(counts, self._cycle, self._deadline_ns, guarded=guarded):
             self.implausible += 1
@@ -267,7 +364,7 @@ class DriveGroup:
     @property
     def rests(self) -> tuple[bool, ...]:
         """Whether each drive has reported the same position for a while."""
-        return tuple([track.steady >= STEADY for track in self._tracks])
+        return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
     def joints(self) -> Vector:
         """Joint angles (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
@@ -300,7 +397,8 @@ class DriveGroup:
     @property
     def disbelieved(self) -> bool:
         """A drive reported last a position that it cannot have reached."""
-        return any(heard > track.cycle for heard, track in zip(self._heard, self._tracks, strict=True))
+        positions = [(k, source.axis) for k, source in self._sources.values() if source.counts is not None]
+        return any(self._heard[k] > self._tracks[axis].cycle for k, axis in positions)
 
     def all_in(self, *states: DriveState) -> bool:
         """Every drive is in one of ``states``."""
@@ -324,18 +422,24 @@ class DriveGroup:
         self._aimed = tuple(targets)
 
     def frames(self) -> list[Frame]:
-        """The RPDOs of this cycle; until a target is set, the target of a drive is its reported position."""
+        """The RPDOs of this cycle; until a target is set, the target of a drive is its reported position.
+
+        A drive that was never heard gets none.
+        """
         targets = self._targets if self._targets is not None else [track.counts for track in self._tracks]
         self.aim(targets)
         key = (self.goal, self.stopped, *self.statuswords)
         if key != self._steady:  # in operation neither goal nor statuswords change, so neither do the controlwords
             goals = [self._goal_of(axis.node_id) for axis in self.axes]
-            words = list(map(_controlword, self.states, goals, self._words))
+            words = list(map(_controlword, self.states, goals, self._words, self._interpolated))
             self._steady = key if words == self._words else None
             self._words = words
-        values = [*self._words, *targets]  # an axis and its pick name the place
+        values = [*self._words, *targets, *self._constants]  # an axis and its pick name the place
+        self._all_heard = self._all_heard or min(self._heard) >= 0
         frames = []
-        for cob_id, every_cycle, parts in self._plan:
+        for cob_id, every_cycle, parts, axes in self._plan:
+            if not self._all_heard and any(self._tracks[axis].cycle < 0 for axis in axes):
+                continue
             data = b""
             for pack, places in parts:
                 part = pack(*[values[place] for place in places])
@@ -357,11 +461,16 @@ class DriveGroup:
         return True
 
 
-def _controlword(state: DriveState | None, goal: DriveState, previous: int) -> int:
-    """The controlword for a drive; one in an unknown state is stopped, which is right in every state."""
+def _controlword(state: DriveState | None, goal: DriveState, previous: int, interpolated: bool) -> int:
+    """The controlword for a drive; one in an unknown state is stopped, which is right in every state.
+
+    In interpolated position bit 4 lets an enabled drive follow its targets.
+    """
     if state is None:
         return _QUICK_STOP if goal is not DriveState.SWITCH_ON_DISABLED else _DISABLE_VOLTAGE
-    return controlword_toward(state, goal, previous)
+    word = controlword_toward(state, goal, previous)
+    follows = interpolated and state is goal is DriveState.OPERATION_ENABLED
+    return word | 1 << ENABLE_INTERPOLATION if follows else word
 
 
 def _overlaid(data: bytes, part: bytes) -> bytes:
@@ -374,8 +483,23 @@ def make_drives(plan: Plan) -> DriveGroup | None:
     arm = plan.setup.arm
     if arm is None:
         return None
-    axes = tuple(
-        DriveAxis(n, plan.pdos_of(n, "tpdo")[0].layout, tuple(pdo.layout for pdo in plan.pdos_of(n, "rpdo")))
-        for n in arm.node_ids
-    )
-    return DriveGroup(axes, arm.model, max(1, COMMAND_REPEAT_NS // plan.sync.period_ns))
+    return DriveGroup(drive_axes(plan), arm.model, max(1, COMMAND_REPEAT_NS // plan.sync.period_ns))
+
+
+def drive_axes(plan: Plan) -> tuple[DriveAxis, ...]:
+    """The places of the plan's drives on the bus, joint by joint; none without an arm."""
+    modes = {node.node_id: node.mode for node in plan.nodes}
+    axes = []
+    for node_id in plan.setup.arm.node_ids if plan.setup.arm is not None else ():
+        rpdos, mode = plan.pdos_of(node_id, "rpdo"), modes[node_id]
+        assert mode is not None
+        axes.append(
+            DriveAxis(
+                node_id,
+                feedback=tuple(pdo.layout for pdo in plan.pdos_of(node_id, "tpdo")),
+                commands=tuple(pdo.layout for pdo in rpdos),
+                mode=mode,
+                constants={place: value for pdo in rpdos for place, value in pdo.constants},
+            )
+        )
+    return tuple(axes)

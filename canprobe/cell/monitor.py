@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from canprobe.bus.port import TimedFrame
 from canprobe.cell.array import make_tactile, patch_from
 from canprobe.cell.controller import TactileSample
+from canprobe.cell.drives import drive_axes, feedback_frames
 from canprobe.errors import ProtocolError
 from canprobe.planning.model import MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import describe_state
@@ -97,9 +98,9 @@ class Monitor:
         self._nodes = {node_id: NodeView(node_id, role) for node_id, role in roles.items()}
         arm = plan.setup.arm
         self._model = arm.model if arm is not None else None
-        axes = enumerate(arm.node_ids if arm is not None else ())
-        self._feedback = {plan.pdos_of(n, "tpdo")[0].cob_id: (i, n, plan.pdos_of(n, "tpdo")[0].layout) for i, n in axes}
-        self._counts: list[int | None] = [None] * 6
+        axes = drive_axes(plan)
+        self._feedback = {one.layout.cob_id: (axes[one.axis].node_id, one) for one in feedback_frames(axes)}
+        self._counts: list[int | None] = [None] * len(axes)
         self._tactile = make_tactile(plan)
         self._patch_from = patch_from(plan.setup)
         self._heard: dict[int, int] = {}
@@ -141,13 +142,15 @@ class Monitor:
             node.emcy = None if emcy.code == NO_ERROR else f"{emcy.code:04X}h, {describe(emcy.code)}"
 
     def _take_feedback(self, can_id: int, data: bytes) -> None:
-        axis, node_id, layout = self._feedback[can_id]
+        node_id, frame = self._feedback[can_id]
         try:
-            word, counts, *_ = layout.unpack(data)
+            values = frame.unpack(data)
         except ProtocolError:
             return
-        self._nodes[node_id].drive = describe_state(word)
-        self._counts[axis] = counts
+        if frame.word is not None:
+            self._nodes[node_id].drive = describe_state(values[frame.word])
+        if frame.counts is not None:
+            self._counts[frame.axis] = values[frame.counts]
 
     def _take_taxels(self, can_id: int, data: bytes, t_ns: int) -> None:
         assert self._tactile is not None

@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 from canprobe.planning.bridges import bridge_outputs
 from canprobe.planning.model import Choice, PlannedPdo, Traffic
-from canprobe.planning.traffic import INTERPOLATION_MAX, INTERPOLATION_US
 from canprobe.planning.window import TOLERATED, cut_patch, measured_share, patch_across_taxels, window_choices
 from canprobe.protocol.frame_bits import WORST_ERROR_BITS
 from canprobe.protocol.tactile import WINDOW, WINDOWS
@@ -96,19 +95,28 @@ _KEYS = (  # the last is varied first
 
 
 def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
-    """Every setup that the open keys allow, the best first; the setup itself where nothing is open."""
+    """Every setup that the open keys allow, the best first; the setup itself where nothing is open.
+
+    Whatever is open, the motor torque is given up before anything that the task works with: it is only recorded.
+    """
     keys = [key for key in _KEYS if key.value(setup) == AUTO]
     window_open = any(key.field == "window" for key in keys)
-    for options in itertools.product(*(key.options(setup) for key in keys)):
-        candidate, choices = setup, []
-        for key, (value, why) in zip(keys, options, strict=True):
-            candidate = candidate.changed(key.part, **{key.field: value})
-            choices.append(Choice(key.key, _written(value), why))
-        array = candidate.array
-        if not window_open or array is None or array.mode == "window":
-            yield candidate, tuple(choices)
-        elif array.window == window_choices(setup)[0][0]:  # a frame without a window is tried once
-            yield candidate, tuple(choice for choice in choices if choice.key != "sensor.window")
+    sensing = [key for key in keys if key.part == "array" and key.field != "channel"]
+    wiring = [key for key in keys if key not in sensing]
+    for chosen in itertools.product(*(key.options(setup) for key in sensing)):
+        for torque in (True, False) if setup.arm is not None else (True,):
+            for others in itertools.product(*(key.options(setup) for key in wiring)):
+                candidate, choices = setup, []
+                for key, (value, why) in zip((*sensing, *wiring), (*chosen, *others), strict=True):
+                    candidate = candidate.changed(key.part, **{key.field: value})
+                    choices.append(Choice(key.key, _written(value), why))
+                if not torque:
+                    candidate = candidate.changed("arm", torque=False)
+                array = candidate.array
+                if not window_open or array is None or array.mode == "window":
+                    yield candidate, tuple(choices)
+                elif array.window == window_choices(setup)[0][0]:  # a frame without a window is tried once
+                    yield candidate, tuple(choice for choice in choices if choice.key != "sensor.window")
 
 
 def opened(setup: Setup) -> Setup:
@@ -188,12 +196,16 @@ def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
         yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
 
 
+_SLOWEST_US = 25_500
+_DIVISORS_US = [us for us in range(500, 1_000_000, 100) if 1_000_000 % us == 0]
+
+
 def _slower(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
-    """The fastest cycle of whole hertz that fits, at the same number of cycles a tactile frame."""
-    per_second = 1_000_000 // INTERPOLATION_US
-    whole = [per_second // units for units in range(1, INTERPOLATION_MAX + 1) if per_second % units == 0]
-    for rate in (rate for rate in whole if rate < setup.rate_hz):
-        changed, text = replace(setup, rate_hz=float(rate)), f"cycle.rate_hz = {rate}"
+    """The fastest cycle of whole hertz, or of whole milliseconds, that fits, at as many cycles a tactile frame."""
+    periods_us = {us for us in range(1000, _SLOWEST_US, 1000)} | {us for us in _DIVISORS_US if us < _SLOWEST_US}
+    rates = sorted((float(f"{1e6 / us:.6g}") for us in periods_us), reverse=True)
+    for rate in (rate for rate in rates if rate < setup.rate_hz):
+        changed, text = replace(setup, rate_hz=rate), f"cycle.rate_hz = {rate:.6g}"
         if setup.array is not None:
             tactile = rate * setup.array.rate_hz / setup.rate_hz
             changed = changed.changed("array", rate_hz=tactile)
@@ -242,6 +254,8 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     array, kind = setup.array, setup.kind
     if setup.arm is None:
         yield "six drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
+    elif not setup.arm.torque:
+        yield "motor torque (6077h)", "the bus has no room for it beside what the task needs"
     if array is None:
         yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" feels nothing'
     elif array.mode == "window":

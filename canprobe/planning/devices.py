@@ -1,37 +1,42 @@
-"""What the devices can, read from their EDS files, and the PDOs that a scene maps on them."""
+"""What the devices can, read from their EDS files, and the identifiers of their PDOs."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
-from canprobe.eds.packaged import has_long_pdos, has_window_size, load_eds
-from canprobe.planning.model import Direction, Identity, NodeKind, PlannedPdo, SyncPlan
-from canprobe.planning.traffic import frame_bits
+from canprobe.eds.description import Description
+from canprobe.eds.packaged import load_eds
+from canprobe.planning.model import EVERY_SYNC, Direction, Identity, NodeKind, PlannedPdo
 from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
-from canprobe.protocol.tactile import WINDOW, window_words
-from canprobe.scene.setup import Array, Setup
+from canprobe.scene.setup import Setup
 
 # What a device can, read from its EDS: objects, PDOs, mapping, dummies, identity.
 
-_COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
-_MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
-_SIGNED_TYPES = (0x02, 0x03, 0x04, 0x10, 0x12, 0x13, 0x14, 0x15)
+COMMUNICATION: dict[Direction, int] = {"rpdo": 0x1400, "tpdo": 0x1800}
+MAPPING: dict[Direction, int] = {"rpdo": 0x1600, "tpdo": 0x1A00}
+INVALID = 1 << 31
+"""Of a COB-ID: the PDO is off."""
+OWN_BITS = 0x6000_0000
+"""Bits 29 and 30 of a COB-ID, which are the device's: its frame format, and that it sends nothing on request (RTR)."""
+MOST_ENTRIES = 64
+_IDENTIFIER = 0x7FF
 
 
 @dataclass(frozen=True, slots=True)
 class Abilities:
-    """One device as its EDS describes it.
+    """What one device can as a node of the cell, by its description.
 
     Attributes:
         eds: name or path, for messages.
-        od: canopen's object dictionary.
+        description: what its EDS states.
     """
 
     eds: str
-    od: Any
+    description: Description
 
     @classmethod
     def of(cls, eds: str, node_id: int) -> Abilities:
@@ -40,79 +45,82 @@ class Abilities:
         Raises:
             EdsError: when it is missing or not usable.
         """
-        return cls(eds, load_eds(eds, node_id))
+        return cls(eds, Description(load_eds(eds, node_id)))
+
+    @property
+    def od(self) -> Any:
+        """canopen's object dictionary."""
+        return self.description.od
 
     @property
     def identity(self) -> Identity:
         """Vendor, product and revision of 1018h."""
-        return Identity(*(self._default(0x1018, subindex) for subindex in (1, 2, 3)))
-
-    @property
-    def bitrates(self) -> tuple[int, ...]:
-        """Bit rates that it has, bit/s; empty where its EDS lists none."""
-        return tuple(sorted(self.od.device_information.allowed_baudrates))
+        return Identity(*(self.number(0x1018, subindex) for subindex in (1, 2, 3)))
 
     def has(self, index: int, subindex: int = 0) -> bool:
         """Whether the object exists."""
-        return self._variable(index, subindex) is not None
+        return self.description.entry(index, subindex) is not None
+
+    def number(self, index: int, subindex: int = 0) -> int | None:
+        """The integer that the entry holds at boot; None where it is missing or not stated."""
+        entry = self.description.entry(index, subindex)
+        return entry.initial if entry is not None and isinstance(entry.initial, int) else None
 
     def entry(self, index: int, subindex: int, direction: Direction) -> PdoEntry | None:
         """The object as a mapping entry, None where the device cannot map it in this direction."""
-        variable = self._variable(index, subindex)
-        if variable is None or not variable.pdo_mappable:
+        entry = self.description.entry(index, subindex)
+        if entry is None or not (entry.in_tpdo if direction == "tpdo" else entry.in_rpdo):
             return None
-        allowed = ("ro", "rw", "rwr", "const") if direction == "tpdo" else ("wo", "rw", "rww")
-        if variable.access_type not in allowed:
-            return None
-        return PdoEntry(index, subindex, len(variable), variable.data_type in _SIGNED_TYPES, variable.name)
+        return PdoEntry(index, subindex, entry.bits, entry.signed, entry.name)
 
     def dummy(self, data_type: int, bits: int) -> PdoEntry | None:
         """A dummy entry, None where DummyUsage does not allow it."""
-        return PdoEntry(data_type, 0, bits, name="dummy") if data_type in self.od else None
+        return PdoEntry(data_type, 0, bits, name="dummy") if data_type in self.description.dummies else None
 
     def pdo_numbers(self, direction: Direction) -> tuple[int, ...]:
         """Numbers of the PDOs that the device has, 1 for 1400h or 1800h."""
-        base = _COMMUNICATION[direction]
-        return tuple(number for number in range(1, 513) if base + number - 1 in self.od)
+        numbers = self.description.rpdos if direction == "rpdo" else self.description.tpdos
+        return tuple(number for number in numbers if self.has(MAPPING[direction] + number - 1))
 
-    def mapping_problem(self, direction: Direction, number: int, words: tuple[int, ...]) -> str | None:
-        """Why this PDO cannot carry this mapping, None where it can."""
-        index = _MAPPING[direction] + number - 1
-        if _COMMUNICATION[direction] + number - 1 not in self.od or not self.has(index):
-            return f"has no {direction.upper()}{number}"
-        if self._variable(index, 0).access_type == "rw":
-            capacity = self._highest(index)
-            return None if len(words) <= capacity else f"{direction.upper()}{number} maps at most {capacity} objects"
-        if self.fixed_mapping(direction, number) != words:
-            fixed = ", ".join(f"{word:08X}h" for word in self.fixed_mapping(direction, number))
-            return f"{direction.upper()}{number} has the fixed mapping {fixed or 'none'}"
-        return None
+    def capacity(self, direction: Direction, number: int) -> int:
+        """How many objects may be mapped to a PDO; 0: its mapping is fixed."""
+        index = MAPPING[direction] + number - 1
+        count = self.description.entry(index)
+        if count is None or not count.writable:
+            return 0
+        entries = (self.description.entry(index, subindex) for subindex in range(1, MOST_ENTRIES + 1))
+        return sum(1 for _ in itertools.takewhile(lambda entry: entry is not None and entry.writable, entries))
 
     def fixed_mapping(self, direction: Direction, number: int) -> tuple[int, ...]:
         """The mapping that the EDS gives as default."""
-        index = _MAPPING[direction] + number - 1
-        return tuple(self._default(index, sub) or 0 for sub in range(1, (self._default(index, 0) or 0) + 1))
+        index = MAPPING[direction] + number - 1
+        return tuple(self.number(index, sub) or 0 for sub in range(1, (self.number(index) or 0) + 1))
 
-    def _default(self, index: int, subindex: int) -> int | None:
-        variable = self._variable(index, subindex)
-        value = None if variable is None else variable.default
-        return value if isinstance(value, int) else None
+    def mapped_entry(self, word: int) -> PdoEntry:
+        """An object of a fixed mapping, whether the EDS calls it mappable or not."""
+        entry = self.description.entry(word >> 16, word >> 8 & 0xFF)
+        return PdoEntry.from_word(word, entry is not None and entry.signed, entry.name if entry is not None else "")
 
-    def _variable(self, index: int, subindex: int) -> Any:
-        if index not in self.od:
+    def can_cycle(self, direction: Direction, number: int) -> bool:
+        """Whether a PDO exists or can be switched on, and follows every SYNC or can be made to."""
+        index = COMMUNICATION[direction] + number - 1
+        cob_id, kind = self.description.entry(index, 1), self.description.entry(index, 2)
+        off = cob_id is None or (not cob_id.writable and (self.number(index, 1) or INVALID) & INVALID)
+        return (
+            not off and kind is not None and (kind.initial == EVERY_SYNC or (kind.writable and kind.allows(EVERY_SYNC)))
+        )
+
+    def fixed_cob_id(self, direction: Direction, number: int) -> int | None:
+        """The identifier of a PDO that exists and whose COB-ID cannot be changed; None where it can."""
+        index = COMMUNICATION[direction] + number - 1
+        entry, value = self.description.entry(index, 1), self.number(index, 1)
+        if entry is None or entry.writable or value is None or value & INVALID:
             return None
-        found = self.od[index]
-        if not hasattr(found, "subindices"):
-            return found if subindex == 0 else None
-        return found[subindex] if subindex in found.subindices or 0 < subindex <= self._highest(index) else None
+        return value & _IDENTIFIER
 
-    def _highest(self, index: int) -> int:
-        """Highest sub-index; an array may list only its first member and stand for all (CiA 306, CompactSubObj)."""
-        found = self.od[index]
-        listed: int = max(found.subindices, default=0)
-        if type(found).__name__ != "ODArray" or 0 not in found.subindices:
-            return listed
-        return max(listed, min(found.subindices[0].default or 0, 254))
+    def own_bits(self, direction: Direction, number: int) -> int:
+        """Bits 29 and 30 of the COB-ID of a PDO."""
+        return (self.number(COMMUNICATION[direction] + number - 1, 1) or 0) & OWN_BITS
 
 
 # What a device cannot take its part without: objects, with what they are needed for, and the bus's bit rate.
@@ -130,8 +138,6 @@ _OF_KIND: Mapping[NodeKind, Mapping[int, str]] = {
         0x6060: "modes of operation",
         0x6061: "modes of operation display",
         0x6064: "position actual value",
-        0x607A: "target position",
-        0x60C2: "interpolation time period",
     },
     "tactile": {0x2000: "tactile mode"},
 }
@@ -144,16 +150,17 @@ def missing_objects(device: Abilities, kind: NodeKind, setup: Setup) -> list[str
     return [
         f"{section}.eds = {device.eds}: object {index:04X}h ({what}) is missing; scene {setup.name} needs it"
         for index, what in needed.items()
-        if index not in device.od
+        if index not in device.od.indices
     ]
 
 
 def missing_bitrate(device: Abilities, kind: NodeKind, setup: Setup) -> list[str]:
     """That the device does not have the bus's bit rate, where its EDS lists them."""
-    if not device.bitrates or setup.bus.bitrate in device.bitrates:
+    bitrates = device.description.bitrates
+    if not bitrates or setup.bus.bitrate in bitrates:
         return []
     section = "arm" if kind == "drive" else "sensor"
-    has = ", ".join(map(str, device.bitrates))
+    has = ", ".join(map(str, bitrates))
     return [f"bus.bitrate = {setup.bus.bitrate}: {section}.eds = {device.eds} has {has} bit/s"]
 
 
@@ -170,14 +177,17 @@ def order_by_deadline(pdos: Sequence[PlannedPdo]) -> list[PlannedPdo]:
     """The same PDOs with identifiers in the order of their deadlines.
 
     At equal deadlines feedback has priority over commands; otherwise the order stays. An RPDO that several drives read
-    keeps one identifier.
+    keeps one identifier, and so does a PDO whose COB-ID cannot be changed.
     """
-    free = (cob_id for cob_id in _POOL if not is_restricted(cob_id))
-    first = {pdo.cob_id: pdo for pdo in reversed(pdos)}
+    fixed = {pdo.cob_id for pdo in pdos if pdo.fixed_id}
+    free = (cob_id for cob_id in _POOL if not is_restricted(cob_id) and cob_id not in fixed)
+    first = {pdo.cob_id: pdo for pdo in reversed(pdos) if not pdo.fixed_id}
     ordered = sorted(first.values(), key=lambda pdo: (pdo.deadline_ns, pdo.direction == "rpdo", pdo.cob_id))
     chosen = {pdo.cob_id: cob_id for pdo, cob_id in zip(ordered, free, strict=False)}
     return [
-        replace(pdo, layout=PdoLayout(chosen[pdo.cob_id], pdo.entries, pdo.transmission_type, fd=pdo.layout.fd))
+        pdo
+        if pdo.fixed_id
+        else replace(pdo, layout=PdoLayout(chosen[pdo.cob_id], pdo.entries, pdo.transmission_type, fd=pdo.layout.fd))
         for pdo in pdos
     ]
 
@@ -199,167 +209,3 @@ def identifier_problems(pdos: Iterable[PlannedPdo]) -> list[str]:
                 f"{other.direction.upper()}{other.number} too; choose other node ids"
             )
     return problems
-
-
-# Which PDOs a scene needs, with the default identifiers of the cell, as far as the devices' EDS files allow.
-
-STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
-POSITION, TARGET_POSITION = (0x6064, 0), (0x607A, 0)
-TORQUE = (0x6077, 0)
-DUMMY_INTEGER32 = 0x0004
-
-DRIVE_TPDO1, DRIVE_RPDO1, DRIVE_RPDO2 = 0x180, 0x200, 0x300
-TACTILE_TPDO1 = 0x511  # 180h + 16 would beat every RPDO; below them all it waits for none of the drives' frames
-TACTILE_DEADLINE_CYCLES = 2
-RESENT_MS, LOST_MS = 100, 250
-"""How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
-EVERY_SYNC = 1
-ON_EVENT = 255
-
-HEADER, WINDOW_TAXELS, IMAGE_TAXELS, FEATURES = (0x2120, 0), 0x2110, 0x2100, 0x2130
-IMAGE_WORDS = 32
-FD_WORDS = (8, 6, 4, 3, 2, 1)
-"""Objects of 8 bytes that fill a CAN FD frame without a byte left over."""
-
-
-@dataclass(slots=True)
-class PdoPlanning:
-    """PDOs found so far, with what was wrong and what a device could not give.
-
-    Attributes:
-        setup: of the scene.
-        sync: the cycle.
-        devices: what each node can.
-    """
-
-    setup: Setup
-    sync: SyncPlan
-    devices: Mapping[int, Abilities]
-    pdos: list[PlannedPdo] = field(default_factory=list)
-    problems: list[str] = field(default_factory=list)
-    not_available: list[tuple[str, str]] = field(default_factory=list)
-
-    def entries(self, node_id: int, direction: Direction, *objects: tuple[int, int]) -> list[PdoEntry]:
-        """The objects as entries; what the device cannot map becomes a problem."""
-        device, found = self.devices[node_id], []
-        for index, subindex in objects:
-            entry = device.entry(index, subindex, direction)
-            if entry is None:
-                why = f"is not mappable to a {direction.upper()}" if device.has(index, subindex) else "is missing"
-                self.problems.append(f"node {node_id}: {device.eds}: object {index:04X}h:{subindex:02X} {why}")
-            else:
-                found.append(entry)
-        return found
-
-    def add(
-        self,
-        node_id: int,
-        direction: Direction,
-        number: int,
-        layout: PdoLayout,
-        *,
-        kind: NodeKind = "drive",
-        cycles: int = 1,
-    ) -> None:
-        """Take a PDO if the device can have it; one that SYNC triggers has `cycles` cycles to get through."""
-        device = self.devices[node_id]
-        problem = device.mapping_problem(direction, number, layout.mapping_words())
-        if problem is not None:
-            wanted = ", ".join(f"{entry.index:04X}h:{entry.subindex:02X}" for entry in layout.entries)
-            self.problems.append(
-                f"node {node_id}: {device.eds} {problem}; needed: {wanted}; use a device or an EDS that can map it"
-            )
-            return
-        on_event = layout.transmission_type == ON_EVENT
-        self.pdos.append(
-            PlannedPdo(
-                node_id=node_id,
-                direction=direction,
-                number=number,
-                layout=layout,
-                rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
-                bits_worst=frame_bits(layout.length, self.setup.bus),
-                deadline_ns=RESENT_MS * 1_000_000 if on_event else cycles * self.sync.period_ns,
-                event_timer_ms=LOST_MS if on_event else 0,
-                kind=kind,
-            )
-        )
-
-
-def plan_drive_pdos(planning: PdoPlanning) -> None:
-    """Feedback and targets of the drives: one PDO each way, or two targets sharing one RPDO."""
-    arm, devices = planning.setup.arm, planning.devices
-    if arm is None:
-        return
-    for node_id in arm.node_ids:
-        _plan_feedback(planning, node_id)
-    without = [devices[node_id].eds for node_id in arm.node_ids if devices[node_id].dummy(DUMMY_INTEGER32, 32) is None]
-    for eds in without if arm.grouped else ():
-        why = f"{eds}: DummyUsage excludes {DUMMY_INTEGER32:04X}h, so each drive keeps its own target RPDO"
-        planning.not_available.append(("two targets in one RPDO", why))
-    for axis, node_id in enumerate(arm.node_ids):
-        if not arm.grouped or without:
-            entries = planning.entries(node_id, "rpdo", CONTROLWORD, TARGET_POSITION)
-            planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), EVERY_SYNC))
-            continue
-        # the controlword alone on change and again every 100 ms; the target in this drive's half of its pair's RPDO, a
-        # dummy in the half of the other, whose first drive owns the identifier
-        entries = planning.entries(node_id, "rpdo", CONTROLWORD)
-        planning.add(node_id, "rpdo", 1, PdoLayout(DRIVE_RPDO1 + node_id, tuple(entries), ON_EVENT))
-        first = arm.node_ids[axis - axis % 2]
-        entries, dummy = planning.entries(node_id, "rpdo", TARGET_POSITION), devices[node_id].dummy(DUMMY_INTEGER32, 32)
-        if entries and dummy is not None:
-            halves = (*entries, dummy) if node_id == first else (dummy, *entries)
-            planning.add(node_id, "rpdo", 2, PdoLayout(DRIVE_RPDO2 + first, halves, EVERY_SYNC))
-
-
-def _plan_feedback(planning: PdoPlanning, node_id: int) -> None:
-    """Statusword and position, and the torque where the device can send it too."""
-    device = planning.devices[node_id]
-    entries = planning.entries(node_id, "tpdo", STATUSWORD, POSITION)
-    torque = device.entry(*TORQUE, "tpdo")
-    problem: str | None = f"6077h is {'not mappable to a TPDO' if device.has(*TORQUE) else 'missing'}"
-    if torque is not None:
-        problem = device.mapping_problem("tpdo", 1, tuple(entry.word for entry in (*entries, torque)))
-    if problem is not None:
-        planning.not_available.append(("motor torque (torque_permille of log.npz)", f"{device.eds}: {problem}"))
-    elif torque is not None:
-        entries.append(torque)
-    planning.add(node_id, "tpdo", 1, PdoLayout(DRIVE_TPDO1 + node_id, tuple(entries), EVERY_SYNC))
-
-
-def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
-    """Header and payload of a tactile frame, all triggered by every `ratio`-th SYNC."""
-    array, fd = planning.setup.array, planning.setup.bus.fd
-    if array is None:
-        return
-    device = planning.devices[array.node_id]
-    long = fd and has_long_pdos(device.od)
-    if fd and not long:
-        why = f"{device.eds} has no PDOs of up to 64 bytes (2007h); tactile_array_fd.eds is of an array that has"
-        planning.not_available.append(("CAN FD frames from the sensor", why))
-    if array.mode == "window" and not has_window_size(device.od):
-        why = f"{device.eds} has no window size (2008h), so the window keeps {WINDOW}×{WINDOW} taxels"
-        planning.not_available.append(("another window", why))
-        if array.window != WINDOW:
-            planning.problems.append(f"node {array.node_id}: {why}: sensor.window = {WINDOW}, not {array.window}")
-    header, *rest = tactile_objects(array)
-    parcels = [[header]]  # the header alone, then an object each, or as many as 64 bytes hold
-    while rest:
-        size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
-        parcels.append(rest[:size])
-        rest = rest[size:]
-    for number, objects in enumerate(parcels, start=1):
-        if entries := planning.entries(array.node_id, "tpdo", *objects):
-            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
-            cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
-            planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
-
-
-def tactile_objects(array: Array) -> tuple[tuple[int, int], ...]:
-    """The objects of a tactile frame, its header first."""
-    if array.mode == "features":
-        return (FEATURES, 1), (FEATURES, 2)
-    if array.mode == "image":
-        return HEADER, *((IMAGE_TAXELS, half) for half in range(1, IMAGE_WORDS + 1))
-    return HEADER, *((WINDOW_TAXELS, word) for word in range(1, window_words(int(array.window)) + 1))

@@ -8,17 +8,16 @@ from dataclasses import dataclass, replace
 from canprobe.errors import EdsError, PlanError
 from canprobe.planning.bridges import unavailable_bridges
 from canprobe.planning.choices import candidates, left_out, outputs, warnings, ways_out
+from canprobe.planning.configuration import make_setups
 from canprobe.planning.devices import (
     Abilities,
-    PdoPlanning,
     identifier_problems,
     missing_bitrate,
     missing_objects,
     order_by_deadline,
-    plan_drive_pdos,
-    plan_tactile_pdos,
 )
 from canprobe.planning.model import (
+    SYNC_OVERFLOW,
     Choice,
     Direction,
     NodeKind,
@@ -30,6 +29,8 @@ from canprobe.planning.model import (
     Traffic,
 )
 from canprobe.planning.motion import check_motion
+from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
+from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
 from canprobe.planning.window import cut_patch
 from canprobe.scene.setup import Node, Setup
@@ -66,9 +67,9 @@ def make_plan(setup: Setup) -> Plan:
     if problems or bus is None:
         raise PlanError(problems, ways)
     absent = left_out(setup)
-    return Plan(
+    plan = Plan(
         setup=setup,
-        nodes=_nodes(setup, devices, bus.pdos),
+        nodes=_nodes(setup, devices, bus.pdos, bus.sync),
         pdos=bus.pdos,
         sync=bus.sync,
         buses=bus.buses,
@@ -79,6 +80,20 @@ def make_plan(setup: Setup) -> Plan:
         not_available=(*bus.not_available, *unavailable_bridges(setup)),
         warnings=tuple(warnings(setup, bus.pdos)),
     )
+    return _with_configuration(plan)
+
+
+def _with_configuration(plan: Plan) -> Plan:
+    """The plan with what its devices cannot take of their configuration.
+
+    Raises:
+        PlanError: a device cannot take what it must.
+    """
+    setups = make_setups(plan)
+    if problems := [problem for setup in setups for problem in setup.problems]:
+        raise PlanError(list(dict.fromkeys(problems)))
+    lacks = [(one.what, f"{setup.eds}: {one.why}: {one.write.absence}") for setup in setups for one in setup.left_out]
+    return replace(plan, not_available=tuple(dict.fromkeys((*plan.not_available, *lacks))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +132,7 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
         if not bus.overload and not bus.problems:
             return bus
         found.append(bus)
+    found = [bus for bus in found if bus.setup.arm is None or bus.setup.arm.torque]  # as ways out are planned
     nearest = min(found, key=lambda bus: bus.misfit)
     if len(found) > 1:
         chosen = ", ".join(f"{choice.key} = {choice.value}" for choice in nearest.choices)
@@ -126,13 +142,16 @@ def _choose(setup: Setup, devices: Mapping[int, Abilities], problems: list[str])
 
 
 def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Choice, ...] = ()) -> _BusPlan:
-    sync, problems = plan_sync(setup)
+    sync, exact = plan_sync(setup)
+    drives = [devices[node_id] for node_id in setup.arm.node_ids] if setup.arm is not None else []
+    problem = period_problem(setup.rate_hz, sync.period_us, exact, drives)
     ratio, found = plan_ratio(setup)
     not_available = []
-    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if SYNC_COUNTER not in device.od]:
+    if uncounted := [f"node {node_id}" for node_id, device in sorted(devices.items()) if not _counts_syncs(device)]:
         sync = replace(sync, overflow=0)
         not_available.append(("SYNC counter", f"{', '.join(uncounted)} cannot take one: no 1019h"))
-    planning = PdoPlanning(setup, sync, devices, problems=[*problems, *found], not_available=not_available)
+    problems = [*([problem] if problem is not None else []), *found]
+    planning = PdoPlanning(setup, sync, devices, problems=problems, not_available=not_available)
     plan_drive_pdos(planning)
     plan_tactile_pdos(planning, ratio)
     planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
@@ -157,6 +176,12 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
         overload=overload,
         not_available=tuple(dict.fromkeys(planning.not_available)),
     )
+
+
+def _counts_syncs(device: Abilities) -> bool:
+    """Whether a device can take a SYNC with our counter."""
+    entry = device.description.entry(SYNC_COUNTER)
+    return entry is not None and (entry.initial == SYNC_OVERFLOW or (entry.writable and entry.allows(SYNC_OVERFLOW)))
 
 
 def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
@@ -201,6 +226,7 @@ def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
             try:
                 device = known[key] = Abilities.of(node.eds, node.node_id)
                 problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
+                problems += operation_problems(device) if kind == "drive" else []
             except EdsError as error:
                 known[key] = None
                 problems.append(str(error))
@@ -209,7 +235,9 @@ def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
     return devices, problems
 
 
-def _nodes(setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...]) -> tuple[PlannedNode, ...]:
+def _nodes(
+    setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPdo, ...], sync: SyncPlan
+) -> tuple[PlannedNode, ...]:
     channel_of = {node_id: channel for channel, node_ids in _channels(setup).items() for node_id in node_ids}
     nodes = [
         PlannedNode(
@@ -221,6 +249,8 @@ def _nodes(setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
             emulated=node.emulated,
             channel=channel_of[node.node_id],
             switched_off=_switched_off(node.node_id, devices[node.node_id], pdos),
+            mode=choose_mode(devices[node.node_id]) if kind == "drive" else None,
+            interpolation=interpolations(devices[node.node_id], sync.period_us) if kind == "drive" else (),
         )
         for kind, role, node in _roles(setup)
     ]
@@ -228,8 +258,8 @@ def _nodes(setup: Setup, devices: Mapping[int, Abilities], pdos: tuple[PlannedPd
 
 
 def _switched_off(node_id: int, device: Abilities, pdos: tuple[PlannedPdo, ...]) -> tuple[tuple[Direction, int], ...]:
-    """PDOs that the device has and the scene does not need."""
+    """PDOs that the device has, that the scene does not need and that can be switched off."""
     used = {(pdo.direction, pdo.number) for pdo in pdos if pdo.node_id == node_id}
     directions: tuple[Direction, ...] = ("rpdo", "tpdo")
     has = [(direction, number) for direction in directions for number in device.pdo_numbers(direction)]
-    return tuple(one for one in has if one not in used)
+    return tuple(one for one in has if one not in used and device.fixed_cob_id(*one) is None)

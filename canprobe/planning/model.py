@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.scene.model import Scene
 from canprobe.scene.rules import with_choices
@@ -16,6 +17,9 @@ HEARTBEAT_CONSUMED_MS = 250
 SYNC_OVERFLOW = 240
 AROUND_S = 3.0
 """What a task takes besides its phase, about: enabling, the way to the object, settling, letting go."""
+
+EVERY_SYNC = 1
+"""Transmission type of what goes in every cycle."""
 
 NodeKind = Literal["drive", "tactile"]
 Direction = Literal["tpdo", "rpdo"]
@@ -37,6 +41,25 @@ class Identity:
 
 
 @dataclass(frozen=True, slots=True)
+class Interpolation:
+    """A time as 60C2h expresses it: value · 10^index s.
+
+    Attributes:
+        value: 60C2h:01.
+        index: 60C2h:02.
+    """
+
+    value: int
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.value}·10{str(self.index).translate(_SUPERSCRIPT)} s"
+
+
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+@dataclass(frozen=True, slots=True)
 class PlannedNode:
     """A node that is brought up.
 
@@ -49,6 +72,8 @@ class PlannedNode:
         emulated: served by the emulator.
         channel: of the bus that it is on.
         switched_off: PDOs of the EDS that the scene does not need, (direction, number).
+        mode: of operation, 6060h; None: no drive.
+        interpolation: the period as 60C2h may express it, the first as it is written; empty: no drive.
     """
 
     node_id: int
@@ -59,6 +84,8 @@ class PlannedNode:
     emulated: bool
     channel: str
     switched_off: tuple[tuple[Direction, int], ...]
+    mode: OperationMode | None = None
+    interpolation: tuple[Interpolation, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +105,10 @@ class PlannedPdo:
         event_timer_ms: 14xxh:05, 0 without.
         kind: of the node.
         channel: of the bus that it is on; empty until that is planned.
+        used: False for a TPDO that nobody needs and that cannot be switched off.
+        fixed_id: its COB-ID cannot be changed.
+        own_bits: bits 29 and 30 of its COB-ID, as the device has them.
+        constants: what entries hold that the cycle does not command, by (index, sub-index).
     """
 
     node_id: int
@@ -91,6 +122,10 @@ class PlannedPdo:
     event_timer_ms: int = 0
     kind: NodeKind = "drive"
     channel: str = ""
+    used: bool = True
+    fixed_id: bool = False
+    own_bits: int = 0
+    constants: tuple[tuple[tuple[int, int], int], ...] = ()
 
     @property
     def cob_id(self) -> int:
@@ -115,21 +150,19 @@ class PlannedPdo:
 
 @dataclass(frozen=True, slots=True)
 class SyncPlan:
-    """SYNC as 1005h, 1006h, 1019h and 60C2h express it.
+    """SYNC as 1005h, 1006h and 1019h express it.
 
     Attributes:
         rate_hz: as the scene asks.
         period_ns: integer.
         period_us: 1006h.
         overflow: 1019h.
-        interpolation_100us: 60C2h:01 with index −4; None without drives.
     """
 
     rate_hz: float
     period_ns: int
     period_us: int
     overflow: int
-    interpolation_100us: int | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,6 +329,6 @@ class Plan:
         return tuple(node.node_id for node in self.nodes)
 
     def pdos_of(self, node_id: int, direction: Direction) -> tuple[PlannedPdo, ...]:
-        """PDOs of one node in one direction, by number."""
-        found = [pdo for pdo in self.pdos if pdo.node_id == node_id and pdo.direction == direction]
+        """The PDOs of one node in one direction that the scene uses, by number."""
+        found = [pdo for pdo in self.pdos if pdo.node_id == node_id and pdo.direction == direction and pdo.used]
         return tuple(sorted(found, key=lambda pdo: pdo.number))

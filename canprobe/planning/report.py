@@ -29,7 +29,7 @@ from canprobe.protocol.pdo import PdoEntry
 # its commands follow. Heartbeats and what comes on events are left out: the worst case, with all of them, is the
 # response time of each message.
 
-Part = Literal["SYNC", "feedback", "controller", "command", "tactile"]
+Part = Literal["SYNC", "feedback", "controller", "command", "tactile", "other"]
 _ROUNDS = 4
 
 
@@ -106,7 +106,7 @@ def _released(
                     out = start + plan.traffic.budget.compute_ns
                     yield Slot("command", bus.channel, pdo.cob_id, cycle, out, out + length)
             elif cycle % pdo.transmission_type == 0:
-                part: Part = "tactile" if pdo.kind == "tactile" else "feedback"
+                part: Part = "tactile" if pdo.kind == "tactile" else "feedback" if pdo.used else "other"
                 yield Slot(part, bus.channel, pdo.cob_id, cycle, begin + sync_ns, begin + sync_ns + length)
 
 
@@ -127,7 +127,14 @@ def _carried(released: Iterator[Slot]) -> Iterator[Slot]:
         now = end
 
 
-LETTERS: dict[Part, str] = {"SYNC": "S", "feedback": "f", "controller": "C", "command": "r", "tactile": "t"}
+LETTERS: dict[Part, str] = {
+    "SYNC": "S",
+    "feedback": "f",
+    "controller": "C",
+    "command": "r",
+    "tactile": "t",
+    "other": "o",
+}
 """What stands for each part in `timeline_rows`."""
 
 
@@ -177,7 +184,8 @@ def _lines(plan: Plan) -> Iterator[str]:
             f"{bus.bitrate} bit/s; everything else classical; every controller on the bus must tolerate CAN FD, which "
             "no EDS states"
         )
-    interpolation = f", 60C2h = {sync.interpolation_100us}·10⁻⁴ s" if sync.interpolation_100us is not None else ""
+    times = " or ".join(dict.fromkeys(str(node.interpolation[0]) for node in plan.nodes if node.interpolation))
+    interpolation = f", 60C2h = {times}" if times else ""
     yield (
         f"SYNC {sync.rate_hz:g} Hz (1006h = {sync.period_us} µs, 1019h = {sync.overflow}{interpolation}), "
         f"heartbeat every {HEARTBEAT_PRODUCED_MS} ms, lost after {HEARTBEAT_CONSUMED_MS} ms"
@@ -192,7 +200,8 @@ def _lines(plan: Plan) -> Iterator[str]:
     title = f"one cycle of {_us(sync.period_ns)} µs, worst case, µs after its SYNC is due"
     yield from _titled(title, _budget_rows(plan.traffic.budget))
     each = f"as it goes, worst-case lengths, one character {_us(sync.period_ns // TIMELINE_WIDTH)} µs"
-    parts = "(S SYNC, f feedback, C controller, r commands, t tactile)"
+    other = "" if all(pdo.used for pdo in plan.pdos) else ", o not used"
+    parts = f"(S SYNC, f feedback, C controller, r commands, t tactile{other})"
     yield from _titled(f"{each} {parts}", timeline_rows(plan, TIMELINE_WIDTH))
     yield from _titled("chosen by the plan", ((f"{one.key} = {one.value}", one.why) for one in plan.choices))
     yield from _titled("joint speeds", _speed_rows(plan))

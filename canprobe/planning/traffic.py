@@ -36,36 +36,19 @@ from canprobe.protocol.response_times import (
 )
 from canprobe.scene.setup import Bus, Setup
 
-# Can the cycle be said in CANopen's objects: SYNC period, interpolation period, tactile trigger.
+# Can the cycle be said in CANopen's objects: SYNC period, tactile trigger.
 
-INTERPOLATION_US = 100  # 60C2h with index −4
-INTERPOLATION_MAX = 255  # 60C2h:01 is an UNSIGNED8
 _TOLERANCE = 1e-5  # of a rate written with six digits
 
 
-def plan_sync(setup: Setup) -> tuple[SyncPlan, list[str]]:
-    """The SYNC of a scene, and why its period is not possible.
+def plan_sync(setup: Setup) -> tuple[SyncPlan, bool]:
+    """The SYNC of a scene, in whole µs, and whether that is the rate of the scene.
 
-    Source: CiA 301 object 1006h (period in µs), CiA 402 object 60C2h (interpolation period, here n·10⁻⁴ s).
+    Source: CiA 301 object 1006h (period in µs).
     """
-    rate, moves, problems = setup.rate_hz, setup.arm is not None, []
-    step_us = INTERPOLATION_US if moves else 1
-    period_us = max(1, round(1e6 / rate / step_us)) * step_us
-    if abs(period_us * rate / 1e6 - 1) >= _TOLERANCE:
-        below = int(1e6 / rate / step_us)
-        near = sorted(1e6 / (count * step_us) for count in (below, below + 1) if count > 0)
-        problems.append(
-            f"cycle.rate_hz = {rate:g}: a SYNC period of {1e6 / rate:.3f} µs cannot be set "
-            f"({'1006h counts µs and 60C2h n·10⁻⁴ s' if moves else '1006h counts µs'}); "
-            f"take {' or '.join(f'{rate:.6g}' for rate in near)} Hz"
-        )
-    units = period_us // INTERPOLATION_US
-    if moves and units > INTERPOLATION_MAX:
-        problems.append(
-            f"cycle.rate_hz = {rate:g}: 60C2h holds at most {INTERPOLATION_MAX}·10⁻⁴ s; "
-            f"take {1e6 / (INTERPOLATION_MAX * INTERPOLATION_US):.1f} Hz or more"
-        )
-    return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW, units if moves else None), problems
+    period_us = max(1, round(1e6 / setup.rate_hz))
+    exact = abs(period_us * setup.rate_hz / 1e6 - 1) < _TOLERANCE
+    return SyncPlan(1e6 / period_us, period_us * 1000, period_us, SYNC_OVERFLOW), exact
 
 
 def plan_ratio(setup: Setup) -> tuple[int, list[str]]:
@@ -140,7 +123,7 @@ class _Messages:
         sync: the SYNC; its offset is 0.
         feedback: TPDOs that the controller waits for.
         commands: RPDOs that it sends.
-        other: TPDOs that it does not wait for, of the array.
+        other: TPDOs that it does not wait for, of the array or not used.
         strangers: what keeps its own time.
         best_sync_ns: shortest time of a SYNC on the wire.
         best_feedback_ns: shortest time of the feedback.
@@ -220,7 +203,7 @@ def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int
             strangers.append(message)
         elif pdo.direction == "rpdo":
             cyclic["commands"].append(message)
-        elif pdo.kind == "drive":
+        elif pdo.kind == "drive" and pdo.used:
             cyclic["feedback"].append(message)
             feedback_bits += best_case_bits(pdo.layout.length)
         else:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from canprobe.cell.array import make_tactile
 from canprobe.cell.controller import Measurement
 from canprobe.cell.cycle import SYNCS_REMEMBERED, Intake
-from canprobe.cell.drives import CommandFrame, DriveGroup, command_frames, make_drives
+from canprobe.cell.drives import CONTROLWORD, TARGET, CommandFrame, DriveGroup, command_frames, make_drives
 from canprobe.cell.lift_off import WayBack
 from canprobe.cell.supervision import HOLD_CYCLES, TOUCH_FORCE
 from canprobe.errors import ProtocolError
@@ -159,9 +159,9 @@ class LogCycles:
     def _take_command(self, frame: CommandFrame, data: bytes) -> None:
         for axis, layout, picks in frame.parts:
             for value, pick in zip(layout.unpack(data), picks, strict=True):
-                if pick:
+                if pick == TARGET:
                     self._targets[axis] = value
-                else:
+                elif pick == CONTROLWORD:
                     self._words[axis] = value
 
     def _known_targets(self) -> tuple[int, ...] | None:

@@ -287,6 +287,11 @@ class BringUpSettings:
     """Longest time to one SDO answer."""
     start_s: Annotated[float, Range(0, 60, open_low=True)] = 1.0
     """Longest time from NMT start to the heartbeat that confirms it."""
+    enable_s: Annotated[float, Range(0, 600, open_low=True)] = 2.0
+    """Longest time in which the drives change to their mode, and from the command to enable operation to their
+    confirmation. Brakes and a search for the commutation take longer."""
+    stop_s: Annotated[float, Range(0, 600, open_low=True)] = 0.5
+    """Longest time of a quick stop, and of disabling the drives after it."""
     emulated_s: Annotated[float, Range(0, 3600, open_low=True)] = 120.0
     """Longest time in which the process of the emulated nodes starts."""
     retries: Annotated[int, Range(0, 100)] = 2

@@ -108,6 +108,7 @@ class Arm:
         q_start: (n,) rad; selects the branch of the inverse kinematics, and is where an emulated arm stands.
         missed_syncs: SYNC periods without a sign of life after which drive and master take each other for dead.
         grouped: two targets share an RPDO through dummy mapping.
+        torque: the drives send their torque where they can; the plan gives it up where the bus has no room for it.
     """
 
     model: ArmModel
@@ -115,6 +116,7 @@ class Arm:
     q_start: Floats
     missed_syncs: int
     grouped: bool | Auto
+    torque: bool = True
 
     @property
     def node_ids(self) -> tuple[int, ...]:

@@ -37,12 +37,12 @@ from numpy.typing import NDArray
 from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import Participant
 from canprobe.cell.conditions import BY_KEY
-from canprobe.cell.configuration import motor_speed_limit
 from canprobe.cell.controller import Controller, Measurement
 from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
 from canprobe.errors import CanprobeError, SafetyStop
+from canprobe.planning.configuration import motor_speed_limit
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.results.summary import summarise

@@ -19,9 +19,9 @@ from canprobe.bus.disk import read_candump
 from canprobe.bus.interfaces import open_port
 from canprobe.bus.port import Clock, MonotonicClock
 from canprobe.bus.scheduling import MASTER_PRIORITY, realtime
-from canprobe.cell.configuration import NodeSetup, make_setups
 from canprobe.cell.controller import Command, Controller, Measurement
 from canprobe.errors import CanprobeError
+from canprobe.planning.configuration import NodeSetup, make_setups
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
 from canprobe.protocol.frames import SYNC_ID, SyncCounter

@@ -11,10 +11,10 @@ import yaml
 
 import canprobe
 from canprobe.bridge.export import dcf_text, final_values, read_bus_yml, write_bus_yml, write_dcfs
-from canprobe.cell.configuration import make_setups
 from canprobe.cli import main
 from canprobe.eds.packaged import check_eds
 from canprobe.errors import UsageError
+from canprobe.planning.configuration import make_setups
 from canprobe.scene.load import load_scene
 
 

@@ -14,11 +14,13 @@ from undrawn import undrawn_run
 import canprobe
 from canprobe.bus.lockstep import Participant
 from canprobe.bus.network import upload
-from canprobe.cell.configuration import make_setups
+from canprobe.cell.controller import Command
 from canprobe.eds.packaged import eds_path
 from canprobe.emulator.faults import Fault, FaultKind, FaultyNode
+from canprobe.emulator.node.dictionary import Abort, SdoAbort
 from canprobe.emulator.world import make_world
 from canprobe.errors import BusError, InterfaceError, NodeError
+from canprobe.planning.configuration import make_setups
 from canprobe.session.session import Session
 
 MS = 1_000_000
@@ -119,7 +121,7 @@ def test_what_did_not_take_over_the_nodes_sends_nothing(tmp_path, what):
 
 def refuse_a_write(node):
     if node.node_id == 3:
-        node.dictionary.entries.pop(0x606500)
+        node.dictionary.entries.pop(0x606000)
 
 
 FAILED = {
@@ -178,22 +180,118 @@ def test_a_node_that_does_not_answer_is_named_with_the_entry(tmp_path):
 def test_all_that_failed_is_told(tmp_path):
     def refuse(node):
         if node.node_id in (2, 5):
-            node.dictionary.entries.pop(0x606500)
+            node.dictionary.entries.pop(0x606000)
 
     with pytest.raises(NodeError) as failed:
         open_session(tmp_path, change=refuse).__enter__()
     text = str(failed.value)
-    assert text.startswith("node 2: (joint 2) write of 6065h:00 = ")
-    assert "; node 5: (joint 5) write of 6065h:00 = " in text and text.count("failed: Code 0x06090011") == 2
+    assert text.startswith("node 2: (joint 2) write of 6060h:00 = ")
+    assert "; node 5: (joint 5) write of 6060h:00 = " in text and text.count("failed: Code 0x06090011") == 2
 
 
-def test_a_value_that_does_not_stay_is_told(tmp_path):
+def forgetting(index, value):
+    """For `change`: node 4 holds another value than is written to an object."""
+
     def forget(node):
         if node.node_id == 4:
-            node.dictionary.on_write(0x6066, lambda sub, value: node.dictionary.put(0x6066, sub, 7))
+            node.dictionary.on_write(index, lambda sub, _: node.dictionary.put(index, sub, value))
 
-    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 6066h:00 reads back 0x7 after 0x32 was written"):
-        open_session(tmp_path, change=forget).__enter__()
+    return forget
+
+
+def test_a_required_value_that_does_not_stay_is_told(tmp_path):
+    with pytest.raises(NodeError, match=r"node 4: \(joint 4\) 1017h:00 reads back 0x7 after 0x64 was written"):
+        open_session(tmp_path, change=forgetting(0x1017, 7)).__enter__()
+
+
+def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(tmp_path):
+    def change(node):
+        forgetting(0x6066, 7)(node)
+        if node.node_id == 2:
+            node.dictionary.entries.pop(0x101601)
+
+    with open_session(tmp_path, change=change) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+    remarks = [line for line in session.said if "left as the device has it" in line]
+    assert remarks == [
+        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: the node"
+        " notices a dead master is left as the device has it: the device will not notice a dead master",
+        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: following error time-out is left as the"
+        " device has it: a drive that lags is given as long as the device has it",
+    ]
+
+
+def test_another_expression_of_the_interpolation_time_is_tried(tmp_path):
+    def refuse_tenths(node):
+        if node.node_id == 5:
+            node.dictionary.on_check(0x60C2, refuse)
+
+    def refuse(subindex, value):
+        if subindex == 2 and value == -4:
+            raise SdoAbort(Abort.VALUE)
+
+    nodes = {}
+    with open_session(tmp_path, change=refuse_tenths, nodes=nodes) as session:
+        held = {n: tuple(node.dictionary.number(0x60C2, sub) for sub in (1, 2)) for n, node in nodes.items()}
+    assert held == {n: (25, -4) if n != 5 else (250, -5) for n in range(1, 7)}
+    (remark,) = [line for line in session.said if "means the same" in line]
+    assert remark.startswith("node 5: (joint 5) takes 60C2h:01 = 250, 60C2h:02 = -5")
+
+
+@pytest.mark.parametrize("refuses", [True, False])
+def test_bits_29_and_30_of_a_cob_id_stay_as_the_device_has_them(tmp_path, refuses):
+    """It refuses to clear bit 30, or holds it whatever is written."""
+    rtr_off = 1 << 30
+
+    def keep(node):
+        if node.node_id != 3:
+            return
+        for index in range(0x1800, 0x1804):
+            node.dictionary.set_default(index, 1, node.dictionary.number(index, 1) | rtr_off)
+            if refuses:
+                node.dictionary.on_check(index, refuse)
+            else:
+                node.dictionary.on_write(index, lambda s, v, i=index: node.dictionary.put(i, s, v | rtr_off * (s == 1)))
+
+    def refuse(subindex, value):
+        if subindex == 1 and not value & rtr_off:
+            raise SdoAbort(Abort.VALUE)
+
+    nodes = {}
+    with open_session(tmp_path, change=keep, nodes=nodes) as session:
+        assert done_to(session) == ["configured, software 1.0"] * 6
+        assert nodes[3].dictionary.number(0x1800, 1) == 0x4000_0183
+
+
+@pytest.mark.parametrize(("revision", "taken"), [(0x1_0004, True), (0x2_0000, False), (0xFFFF, False)])
+def test_a_revision_of_the_same_major_number_is_taken(tmp_path, revision, taken):
+    def newer(node):
+        if node.node_id == 3:
+            node.dictionary.set_default(0x1018, 3, revision)
+
+    session = open_session(tmp_path, change=newer)
+    if taken:
+        with session:
+            (remark,) = [line for line in session.said if "revision" in line]
+        assert remark == (
+            "node 3: (joint 3) has revision 00010004h, puma260_joint.eds describes 00010000h: the same major revision,"
+            " taken"
+        )
+    else:
+        with pytest.raises(NodeError, match=rf"1018h:03 revision number expected 0x10000, got {revision:#x}"):
+            session.__enter__()
+
+
+def test_a_drive_in_another_mode_is_not_enabled(tmp_path):
+    def stay(node):
+        if node.node_id == 2:
+            node.dictionary.on_read(0x6061, lambda sub: node.dictionary.put(0x6061, 0, 1))
+
+    told = r"^node 2: \(joint 2\) is in mode 1 \(6061h\) after 6060h = 8 was written"
+    with open_session(tmp_path, change=stay, enable_s=0.3) as session, pytest.raises(NodeError, match=told):
+        session.cell.run(lambda _: Command())
+    words = {d[:2] for _, i, d in frames(tmp_path) if 0x201 <= i <= 0x206}
+    assert words == {bytes(2)}, "no drive was switched on"
 
 
 def test_a_kept_configuration_is_not_written_again(tmp_path):

@@ -1,11 +1,21 @@
 """The drive group: bytes in, joint angles out; joint targets in, bytes out; late is late."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from canprobe.cell.array import TactileReceiver
-from canprobe.cell.drives import BASE_COUNTS, CARRIED_CYCLES, STEADY, DriveAxis, DriveGroup, PositionTrack
-from canprobe.protocol.cia402 import DriveState
+from canprobe.cell.drives import (
+    CARRIED_CYCLES,
+    REST_COUNTS_LEAST,
+    REST_NS,
+    DriveAxis,
+    DriveGroup,
+    PositionTrack,
+    rest_counts,
+)
+from canprobe.protocol.cia402 import DriveState, OperationMode
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
 from canprobe.protocol.tactile import FrameAssembler, TactileHeader, TactileMode, pack_whole
 from canprobe.robot.model import joints_to_units
@@ -14,6 +24,8 @@ from canprobe.robot.puma import MODELS
 STATUS, POSITION, TORQUE = PdoEntry(0x6041, 0, 16), PdoEntry(0x6064, 0, 32, True), PdoEntry(0x6077, 0, 16, True)
 WORD, TARGET, DUMMY = PdoEntry(0x6040, 0, 16), PdoEntry(0x607A, 0, 32, True), PdoEntry(0x0004, 0, 32)
 MODEL = MODELS["upenn"]
+BASE = 8
+"""Counts: a milliradian of a joint of the PUMA, about."""
 ENABLED = DriveState.OPERATION_ENABLED.value
 NAN = float("nan")
 
@@ -27,15 +39,16 @@ def make_group(grouped=False, repeat=40, torque=range(1, 7)):
             commands = (PdoLayout(0x200 + i, (WORD,), 255), PdoLayout(0x301 + (i - 1) // 2 * 2, entries))
         else:
             commands = (PdoLayout(0x200 + i, (WORD, TARGET)),)
-        axes.append(DriveAxis(i, feedback, commands))
+        axes.append(DriveAxis(i, (feedback,), commands))
     return DriveGroup(tuple(axes), MODEL, repeat)
 
 
 def hear(group, counts, status=ENABLED, skip=()):
     for i, axis in enumerate(group.axes):
         if i not in skip:
-            torque = [-7] * (len(axis.feedback.entries) - 2)
-            group.push(axis.feedback.cob_id, axis.feedback.pack(status, round(counts[i]), *torque))
+            (feedback,) = axis.feedback
+            torque = [-7] * (len(feedback.entries) - 2)
+            group.push(feedback.cob_id, feedback.pack(status, round(counts[i]), *torque))
 
 
 def test_joint_angles_come_back_through_the_coupled_wrist():
@@ -84,9 +97,9 @@ def test_a_tpdo_twice_or_after_the_window_is_late_and_not_used():
 def test_a_tpdo_from_before_the_sync_is_late_though_it_is_read_afterwards():
     group = make_group()
     group.begin(0, 1000)
-    group.push(0x181, group.axes[0].feedback.pack(ENABLED, 5, 0), 999)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 5, 0), 999)
     assert (group.late, group.ages()[0]) == (1, 1)
-    group.push(0x181, group.axes[0].feedback.pack(ENABLED, 7, 0), 1000)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 7, 0), 1000)
     assert (group.late, group.ages()[0]) == (1, 0)
 
 
@@ -121,13 +134,91 @@ def test_a_fault_reset_that_did_not_take_gets_a_new_edge():
     assert words == [1, 0, 1, 0]
 
 
+# Drives of other makes: several PDOs each way, more in them than is needed, interpolated position.
+
+SPEED, MODE = PdoEntry(0x6081, 0, 32), PdoEntry(0x6061, 0, 8, True)
+RECORD = PdoEntry(0x60C1, 1, 32, True)
+
+
+def one_kind(feedback, commands, **options):
+    """Six drives whose TPDOs and RPDOs map these entries each."""
+    axes = [
+        DriveAxis(
+            i,
+            tuple(PdoLayout(0x180 + 0x100 * k + i, entries) for k, entries in enumerate(feedback)),
+            tuple(PdoLayout(0x200 + 0x100 * k + i, entries) for k, entries in enumerate(commands)),
+            **options,
+        )
+        for i in range(1, 7)
+    ]
+    return DriveGroup(tuple(axes), MODEL)
+
+
+def send(group, k, *values):
+    for axis in group.axes:
+        group.push(axis.feedback[k].cob_id, axis.feedback[k].pack(*values))
+
+
+def test_feedback_in_two_tpdos_and_values_that_nobody_reads():
+    group = one_kind([(STATUS, MODE), (MODE, POSITION, TORQUE)], [(WORD,), (TARGET, SPEED)], constants={(0x6081, 0): 9})
+    group.begin(0)
+    send(group, 0, ENABLED, 8)
+    assert not group.complete and not group.heard_all and group.frames() == []
+    send(group, 1, 8, -55, 7)
+    assert group.complete and group.enabled and group.torque_permille == [7] * 6
+    assert dict(group.frames())[0x301] == (-55).to_bytes(4, "little", signed=True) + (9).to_bytes(4, "little")
+    group.begin(1)
+    send(group, 1, 8, -55, 7)
+    group.end_collect()
+    assert group.missed == 6 and group.ages() == (0,) * 6
+
+
+@pytest.mark.parametrize("beyond", [b"", b"\x01", b"\xff\xff"])
+def test_what_a_frame_has_beyond_its_mapping_is_not_read(beyond):
+    group = make_group(torque=())
+    group.begin(0)
+    group.push(0x181, group.axes[0].feedback[0].pack(ENABLED, 77) + beyond)
+    assert group.malformed == 0 and group.statuswords[0] == ENABLED and group.targets()[0] == 77
+    group.push(0x182, group.axes[1].feedback[0].pack(ENABLED, 77)[:-1])
+    assert group.malformed == 1
+
+
+def test_no_rpdo_goes_to_a_drive_that_was_never_heard():
+    """Its target would be 0 and not where it is."""
+    group = make_group()
+    group.begin(0)
+    hear(group, [4000] * 6, skip=(2,))
+    assert sorted(can_id for can_id, _ in group.frames()) == [0x201, 0x202, 0x204, 0x205, 0x206]
+    group.begin(1)
+    hear(group, [4000] * 6)
+    frames = dict(group.frames())
+    assert len(frames) == 6 and {data[2:] for data in frames.values()} == {(4000).to_bytes(4, "little")}
+
+
+def test_interpolated_position_sets_bit_4_while_operation_is_enabled():
+    group = one_kind([(STATUS, POSITION)], [(WORD, RECORD)], mode=OperationMode.INTERPOLATED_POSITION)
+    words = []
+    states = [0x40, 0x21, 0x23, 0x27, 0x27]
+    for cycle, status in enumerate(states):
+        group.begin(cycle)
+        send(group, 0, status, 5)
+        frame = group.frames()[0][1]
+        words.append(int.from_bytes(frame[:2], "little"))
+        assert frame[2:] == (5).to_bytes(4, "little")
+    assert words == [0x06, 0x07, 0x0F, 0x1F, 0x1F]
+    group.goal = DriveState.QUICK_STOP_ACTIVE
+    assert int.from_bytes(group.frames()[0][1][:2], "little") == 0x02
+    group.goal = DriveState.SWITCH_ON_DISABLED
+    assert int.from_bytes(group.frames()[0][1][:2], "little") & 0x10 == 0
+
+
 # Positions that a motor can and cannot have reached, and where it is when nobody says.
 
 PERIOD = 2_500_000
 
 
 def moving(rate=10, cycles=20, track=None):
-    track = track or PositionTrack()
+    track = track or PositionTrack(BASE)
     for k in range(cycles):
         track.aim(abs(rate))
         assert track.take(rate * k, k, k * PERIOD, guarded=True) or k == 0
@@ -152,20 +243,49 @@ def test_a_jump_is_not_believed_and_the_next_right_one_is(sign):
 
 
 def test_before_the_drive_is_enabled_everything_is_believed_but_nothing_at_rest():
-    track = PositionTrack()
-    for k in range(STEADY + 1):
+    track = PositionTrack(BASE)
+    for k in range(6):
+        assert track.rested_ns < REST_NS
         track.take(1000, k, k * PERIOD, guarded=False)
-    assert track.steady >= STEADY
+    assert track.rested_ns == REST_NS
     assert track.take(5000, 9, 9 * PERIOD, guarded=False)
-    assert track.steady == 0
+    assert track.rested_ns == 0
     track.take(1000, 10, 10 * PERIOD, guarded=False)
-    assert track.steady == 0
+    assert track.rested_ns == 0
+
+
+@pytest.mark.parametrize("period_ns", [1_000_000, PERIOD, 10_000_000])
+def test_rest_is_a_time_within_a_milliradian(period_ns):
+    """Noise of 12 counts on a fine encoder is rest; a slow motion on it is not, though each of its steps is small."""
+    base = 100_000 * 1e-3
+    still, slow = PositionTrack(base), PositionTrack(base)
+    for k in range(1 + -(-REST_NS // period_ns)):
+        still.take((12, -12, 3)[k % 3], k, k * period_ns, guarded=False)
+        slow.take(round(20e-3 * 1e-6 * period_ns * k * base), k, k * period_ns, guarded=False)
+    assert still.rested_ns >= REST_NS or k * period_ns < REST_NS
+    assert still.rested_ns == k * period_ns
+
+
+def test_a_slow_motion_is_no_rest():
+    """A tenth of a radian a second: a quarter of a milliradian in each cycle."""
+    track = PositionTrack(100.0)
+    for k in range(200):
+        track.take(25 * k, k, k * PERIOD, guarded=False)
+        assert track.rested_ns <= REST_NS
+
+
+def test_a_milliradian_in_the_counts_of_each_drive():
+    milliradians = np.abs(np.diag(MODEL.counts)) / 1000
+    assert milliradians.min() < REST_COUNTS_LEAST < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
+    assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, REST_COUNTS_LEAST))
+    fine = dataclasses.replace(MODEL, counts=100 * MODEL.counts)
+    assert rest_counts(fine) == pytest.approx(np.abs(np.diag(fine.counts)) / 1000)
 
 
 def test_a_start_and_a_stop_are_believed():
     """A drive of 30 Hz behind a ramp that begins and ends at once: x'' = ω²(r − x) − 2 ζ ω x'."""
     omega, dt, x, v = 188.0, 2.5e-3, 0.0, 0.0
-    track, reference = PositionTrack(), 0.0
+    track, reference = PositionTrack(BASE), 0.0
     for k in range(200):
         step = 40.0 if 50 <= k < 120 else 0.0
         track.aim(step)
@@ -179,18 +299,18 @@ def test_a_start_and_a_stop_are_believed():
 
 
 def test_noise_of_some_counts_is_believed():
-    track = PositionTrack()
+    track = PositionTrack(BASE)
     for k in range(50):
-        assert track.take((k % 2) * (BASE_COUNTS // 3), k, k * PERIOD, guarded=True)
+        assert track.take((k % 2) * (BASE // 3), k, k * PERIOD, guarded=True)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_wrong_reports_at_rest_do_not_grow_into_a_motion(sign):
     """Each of them is near to where the one before would lead, and the target asks for nothing of the kind."""
     track = moving(0)
-    assert track.take(sign * BASE_COUNTS, 20, 20 * PERIOD, guarded=True)
-    assert track.position(23, 23 * PERIOD) == sign * BASE_COUNTS
-    assert not track.take(sign * 3 * BASE_COUNTS, 21, 21 * PERIOD, guarded=True)
+    assert track.take(sign * BASE, 20, 20 * PERIOD, guarded=True)
+    assert track.position(23, 23 * PERIOD) == sign * BASE
+    assert not track.take(sign * 3 * BASE, 21, 21 * PERIOD, guarded=True)
     assert track.take(0, 22, 22 * PERIOD, guarded=True)
 
 

@@ -9,9 +9,9 @@ import pytest
 
 import canprobe
 import canprobe.eds.packaged
-from canprobe.cell.configuration import make_setups
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
+from canprobe.planning.configuration import make_setups
 from canprobe.planning.devices import tactile_objects
 from canprobe.planning.window import patch_radius_m, taxels_needed, window_choices
 from canprobe.scene.load import dump_scene, parse_scene

@@ -13,7 +13,7 @@ import canprobe
 from canprobe.planning.devices import Abilities, identifier_problems
 from canprobe.planning.make import make_plan
 from canprobe.planning.measured import expected_messages
-from canprobe.planning.model import PlannedPdo
+from canprobe.planning.model import Interpolation, PlannedPdo
 from canprobe.planning.report import plan_dict
 from canprobe.planning.traffic import controller_starts
 from canprobe.protocol.pdo import PdoEntry, PdoLayout
@@ -137,13 +137,20 @@ def test_six_drives_alone_end_at_500_hz():
     ("rate", "period_us", "units"), [(400, 2500, 25), (500, 2000, 20), (200, 5000, 50), (40, 25_000, 250)]
 )
 def test_sync_period(rate, period_us, units):
-    sync = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)})).sync
-    assert (sync.period_us, sync.period_ns, sync.interpolation_100us) == (period_us, period_us * 1000, units)
-    assert sync.overflow == 240
+    plan = canprobe.plan(change(load_scene("free"), cycle={"rate_hz": float(rate)}))
+    sync = plan.sync
+    assert (sync.period_us, sync.period_ns, sync.overflow) == (period_us, period_us * 1000, 240)
+    assert {node.interpolation[0] for node in plan.nodes} == {Interpolation(units, -4)}, "as the device has it"
 
 
-@pytest.mark.parametrize(("rate", "near"), [(300.0, "294.118 or 303.03"), (440.0, "434.783 or 454.545")])
-def test_sync_period_that_60c2h_cannot_hold(rate, near):
+@pytest.mark.parametrize("rate", [333.333, 1000 / 3, 333.3333])
+def test_a_rate_with_six_digits_is_the_rate_of_a_whole_period(rate):
+    assert canprobe.plan(change(load_scene("free"), cycle={"rate_hz": rate})).sync.period_ns == 3_000_000
+
+
+@pytest.mark.parametrize(("rate", "near"), [(300.0, "294.118 or 303.03"), (30.0, "29.4118 or 30.303")])
+def test_a_period_that_60c2h_cannot_hold(rate, near):
+    """334 and 333 · 10⁻⁵ s would be nearer, but a value has one byte."""
     (problem,) = reasons(change(load_scene("free"), cycle={"rate_hz": rate}))
     assert near in problem
 
@@ -155,8 +162,9 @@ def test_sync_period_of_a_sensor_alone_needs_only_whole_microseconds():
     assert "1006h counts µs" in problem
 
 
-def test_sync_too_slow_for_60c2h():
-    assert any("at most 255" in problem for problem in reasons(change(load_scene("free"), cycle={"rate_hz": 20.0})))
+def test_a_period_too_long_for_60c2h():
+    (problem,) = reasons(change(load_scene("free"), cycle={"rate_hz": 3.0}))
+    assert "60C2h takes 1 to 255 · 10^-6 or -5 or -4 or -3 s" in problem and problem.endswith("take 3.92157 Hz")
 
 
 @pytest.mark.parametrize("rate", [150.0, 300.0, 400 / 7])
@@ -317,15 +325,18 @@ class TestOtherDevices:
     def test_fixed_mapping_is_used_where_it_is_the_right_one(self, edit):
         assert canprobe.plan(edit((r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro")))
 
-    def test_fixed_mapping_that_is_another_is_refused(self, edit):
-        problems = reasons(
-            edit(
-                (r"(\[1600sub0\][^\[]*AccessType=)rw", r"\1ro"),
-                (r"(\[1600sub2\][^\[]*DefaultValue=)\w+", r"\g<1>0x60FF0020"),
-            )
+    @pytest.mark.parametrize("fixed", [(0,), (0, 1, 2, 3)])
+    def test_fixed_mapping_that_is_another_is_refused_unless_another_pdo_does(self, edit, fixed):
+        scene = edit(
+            *((rf"(\[160{n}sub0\][^\[]*AccessType=)rw", r"\1ro") for n in fixed),
+            (r"(\[1600sub2\][^\[]*DefaultValue=)\w+", r"\g<1>0x60FF0020"),
         )
+        if len(fixed) < 4:
+            assert canprobe.plan(scene).pdos_of(1, "rpdo")[0].number == 2
+            return
+        problems = reasons(scene)
         assert len(problems) == 6
-        assert all("fixed mapping 60400010h, 60FF0020h" in problem for problem in problems)
+        assert all("RPDO1 has the fixed mapping 60400010h, 60FF0020h" in problem for problem in problems)
 
     def test_missing_objects_are_named(self, edit):
         problems = reasons(edit((r"\[60C2\]", "[5FFF]"), (r"\[60C2sub", "[5FFFsub"), (r"=0x60C2", "=0x5FFF")))
@@ -386,12 +397,29 @@ def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(be
 
 
 def test_a_controller_that_takes_too_long_is_refused(cylinder):
-    budget = canprobe.plan(cylinder).traffic.budget
-    longest = (budget.slack_ns + budget.compute_ns) / 1000
-    assert canprobe.plan(change(cylinder, cycle={"compute_us": longest})).traffic.budget.slack_ns == 0
-    longer = change(cylinder, cycle={"compute_us": longest + 1})
-    assert "1 µs behind the next SYNC" in reasons(longer)[0]
+    setup = resolve(cylinder)
+    budgets = [make_plan(setup.changed("arm", torque=torque)).traffic.budget for torque in (True, False)]
+    longest, without = [(budget.slack_ns + budget.compute_ns) / 1000 for budget in budgets]
+    for compute_us, what in (
+        (longest, ()),
+        (longest + 1, ("motor torque (6077h)",)),
+        (without, ("motor torque (6077h)",)),
+    ):
+        plan = canprobe.plan(change(cylinder, cycle={"compute_us": compute_us}))
+        assert tuple(what for what, _ in plan.left_out if "torque" in what) == what
+        assert plan.traffic.budget.slack_ns >= 0
+    longer = change(cylinder, cycle={"compute_us": without + 1})
+    assert "behind the next SYNC" in reasons(longer)[0]
     assert f"cycle.compute_us = {longest:.0f}" in [way.partition(":")[0] for way in ways_out(longer)]
+
+
+def test_torque_is_given_up_before_the_window_is_narrowed(cylinder):
+    """At 454.5 Hz 2·(65 + 6·(135 + 115)) + 9·135 = 4345 of 4400 µs leave no room for jitter; 4105 do."""
+    plan = canprobe.plan(change(cylinder, cycle={"rate_hz": 1e6 / 2200}, sensor={"rate_hz": 1e6 / 4400}))
+    assert plan.setup.array.window == 8
+    assert plan.traffic.demands[1].used_ns == 4_105_000
+    assert {len(plan.pdos_of(n, "tpdo")[0].entries) for n in range(1, 7)} == {2}
+    assert "motor torque (6077h)" in dict(plan.left_out)
 
 
 def test_a_sensor_alone_has_a_budget_too():
