@@ -118,8 +118,6 @@ class JointSettings:
     """Node id of the drive. Left out: the number of the joint, from 1."""
     eds: Annotated[str | None, ScenePath()] = None
     """EDS of the drive. Left out: `arm.eds`."""
-    channel: Channel | None = None
-    """Channel of the drive's bus. Left out: `bus.channel`."""
     emulated: bool | None = None
     """canprobe serves the drive. Left out: `arm.emulated`."""
     serial_number: SerialNumber | None = None
