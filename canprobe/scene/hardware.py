@@ -70,8 +70,8 @@ class ArmSettings:
     """SYNC periods of silence after which master and drives treat each other as lost."""
     grouped_rpdo: bool | Auto = False
     """Put two targets into one RPDO by dummy mapping."""
-    torque: bool | Auto = "auto"
-    """Map the motor torque (6077h) into the TPDO of each drive. "auto": where the bus has room for it."""
+    torque: bool = True
+    """Map the motor torque (6077h) into the TPDO of each drive, where the drive has it and the bus has room for it."""
 
 
 @dataclass(frozen=True, slots=True)
