@@ -414,7 +414,7 @@ def test_a_controller_that_takes_too_long_is_refused(cylinder):
 
 
 def test_torque_is_given_up_before_the_window_is_narrowed(cylinder):
-    """At 454.5 Hz 2·(65 + 6·(135 + 115)) + 9·135 = 4345 of 4400 µs leave no room for jitter; 4105 do, with 115 for 135."""
+    """At 454.5 Hz 2·(65 + 6·(135 + 115)) + 9·135 = 4345 of 4400 µs leave no room for jitter; 4105 do."""
     plan = canprobe.plan(change(cylinder, cycle={"rate_hz": 1e6 / 2200}, sensor={"rate_hz": 1e6 / 4400}))
     assert plan.setup.array.window == 8
     assert plan.traffic.demands[1].used_ns == 4_105_000
