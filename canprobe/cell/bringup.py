@@ -398,19 +398,27 @@ class BringUp:
                 yield from self._write_one_of(report, times)
 
     def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
-        """The first of several sets of writes that mean the same and that the device takes."""
-        for i, writes in enumerate(options):
+        """The first of several sets of writes that mean the same and that the device takes, or else holds."""
+        first: RefusedError | None = None
+        for writes in options:
             try:
                 for write in writes:
                     yield from self._write(report.setup, write)
-            except RefusedError:
-                if i == len(options) - 1:
-                    raise
+            except RefusedError as refused:
+                first = first or refused
             else:
-                if i:
-                    values = ", ".join(f"{write.place} = {write.value}" for write in writes)
-                    report.remarks.append(f"takes {values}, which means the same as what it refused")
+                if first is not None:
+                    report.remarks.append(f"takes {_values(writes)}, which means the same as what it refused")
                 return
+        for writes in options:
+            held = []
+            for write in writes:
+                held.append((yield from self._read(report.setup, write.index, write.subindex)) == write.value)
+            if all(held):
+                report.remarks.append(f"refuses to be written {_values(writes)}, and holds it")
+                return
+        assert first is not None
+        raise first
 
     def _write(self, setup: NodeSetup, write: Write) -> Dialogue:
         variable = _variable(setup, write.index, write.subindex)
@@ -457,6 +465,10 @@ class BringUp:
 
 class RefusedError(NodeError):
     """A device refused a value, or holds another one."""
+
+
+def _values(writes: Sequence[Write]) -> str:
+    return ", ".join(f"{write.place} = {write.value}" for write in writes)
 
 
 def _refused(setup: NodeSetup, write: Write, error: Exception) -> RefusedError:

@@ -216,22 +216,21 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
 
 
 def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:
-    """What each node can by its own EDS, and what is missing there; a file that several nodes have is read once."""
-    known: dict[tuple[NodeKind, str], Abilities | None] = {}
+    """What each node can by its own EDS, and what is missing there, said once of a file that several nodes have."""
+    seen: set[tuple[NodeKind, str]] = set()
     devices: dict[int, Abilities] = {}
     problems: list[str] = []
     for kind, _, node in _roles(setup):
-        key = kind, node.eds
-        if key not in known:
-            try:
-                device = known[key] = Abilities.of(node.eds, node.node_id)
-                problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
-                problems += operation_problems(device) if kind == "drive" else []
-            except EdsError as error:
-                known[key] = None
-                problems.append(str(error))
-        if (found := known[key]) is not None:
-            devices[node.node_id] = found
+        first = (kind, node.eds) not in seen
+        seen.add((kind, node.eds))
+        try:
+            device = devices[node.node_id] = Abilities.of(node.eds, node.node_id)
+        except EdsError as error:
+            problems += [str(error)] if first else []
+            continue
+        if first:
+            problems += missing_objects(device, kind, setup) + missing_bitrate(device, kind, setup)
+            problems += operation_problems(device) if kind == "drive" else []
     return devices, problems
 
 

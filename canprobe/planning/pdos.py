@@ -23,6 +23,8 @@ STATUSWORD, CONTROLWORD = (0x6041, 0), (0x6040, 0)
 POSITION = (0x6064, 0)
 TORQUE = (0x6077, 0)
 MODE = (0x6060, 0)
+STATES = frozenset((0x1001, 0x603F, 0x6041, 0x6061))
+"""Objects that change with the state of a drive and not with its motion."""
 DUMMY_INTEGER32 = 0x0004
 
 DRIVE_TPDOS, DRIVE_RPDOS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
@@ -272,7 +274,8 @@ def _plan_grouped(planning: PdoPlanning, node_id: int, first: int) -> None:
 def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
     """TPDOs that nobody needs and that cannot be switched off.
 
-    One that is sent on events is counted once a cycle, or by its inhibit time: no EDS states how often a value changes.
+    No EDS states how often one is sent on events. What only has a state is counted ten times a second; anything else,
+    such as a position, changes in every cycle, unless the inhibit time allows less.
     """
     device, sync = planning.devices[node_id], planning.sync
     used = {pdo.number for pdo in planning.pdos if pdo.node_id == node_id and pdo.direction == "tpdo"}
@@ -285,8 +288,10 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
         entries = tuple(map(device.mapped_entry, device.fixed_mapping("tpdo", number)))
         inhibit_100us = device.number(communication, 3) or 0
         on_event = kind > SYNCHRONOUS
-        rate = min(sync.rate_hz, 10_000 / inhibit_100us) if on_event and inhibit_100us else sync.rate_hz
-        rate = rate if on_event else rate / kind
+        rate = sync.rate_hz / kind
+        if on_event:
+            seldom = all(entry.index in STATES for entry in entries)
+            rate = min(1000 / RESENT_MS if seldom else sync.rate_hz, 10_000 / (inhibit_100us or 1))
         layout = PdoLayout(cob_id, entries, kind)
         planning.not_available.append(
             (

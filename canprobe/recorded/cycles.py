@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from canprobe.cell.array import make_tactile
 from canprobe.cell.controller import Measurement
 from canprobe.cell.cycle import SYNCS_REMEMBERED, Intake
-from canprobe.cell.drives import CONTROLWORD, TARGET, CommandFrame, DriveGroup, command_frames, make_drives
+from canprobe.cell.drives import CONTROLWORD, TARGET, CommandFrame, DriveGroup, command_frames, make_drives, rest_counts
 from canprobe.cell.lift_off import WayBack
 from canprobe.cell.supervision import HOLD_CYCLES, TOUCH_FORCE
 from canprobe.errors import ProtocolError
@@ -263,15 +263,19 @@ class LoggedWayBack:
 
 def worst_count(model: ArmModel, q: Vector, targets: tuple[int, ...]) -> int:
     """Largest difference of joint positions (n,), rad or m, and recorded motor targets, counts."""
-    return int(np.abs(np.round(joints_to_units(model, q)) - targets).max())
+    return int(_count_differences(model, q, targets).max())
+
+
+def _count_differences(model: ArmModel, q: Vector, targets: tuple[int, ...]) -> Vector:
+    return np.abs(np.round(joints_to_units(model, q)) - targets)
 
 
 # The contacts of the run: by the scene's task, or from the images alone.
 
-OWN_COUNTS = 20
-"""Median difference up to which the task drove: 0.5 mm or 0.2 deg. A lost line changes a few counts for a while."""
-PARTED_COUNTS = 100
-"""Difference from which the recorded targets are not the task's: 2 mm or 1 deg."""
+OWN_RESTS = 2.5
+"""Median difference, in `rest_counts`, up to which the task drove: 0.5 mm or 0.2 deg. A lost line changes some."""
+PARTED_RESTS = 12.5
+"""Difference, in `rest_counts`, from which the recorded targets are not the task's: 2 mm or 1 deg."""
 PARTED_S = 0.1
 """Time at that difference after which they stay apart: the servo corrects the effect of a lost line sooner."""
 
@@ -284,7 +288,8 @@ class TaskReplay:
         task: the task, at its end.
         compared: number of cycles with recorded targets and the task's.
         differing: of these, with a difference of more than ``TARGET_TOLERANCE``.
-        median_counts, worst_counts: the median and the largest difference.
+        median_rests: the median of the differences, in `rest_counts`.
+        worst_counts: the largest difference.
         lifted_s: when the cell began to lift off, which ended the task's replay (s); else None.
         parted_s: when the recorded targets had departed from the task's, which ended its replay (s); else None.
     """
@@ -292,7 +297,7 @@ class TaskReplay:
     task: TouchTask
     compared: int
     differing: int
-    median_counts: float
+    median_rests: float
     worst_counts: int
     lifted_s: float | None
     parted_s: float | None
@@ -301,7 +306,7 @@ class TaskReplay:
     def drove(self) -> bool:
         """Most recorded targets, to the end, are those of this task, and its scan had a contact."""
         came_to_scan = self.task.shape is not None and bool(self.task.shape.samples)
-        return came_to_scan and self.parted_s is None and self.median_counts <= OWN_COUNTS
+        return came_to_scan and self.parted_s is None and self.median_rests <= OWN_RESTS
 
 
 def controller_cycles(cycles: Iterable[LogCycle]) -> Iterator[LogCycle]:
@@ -340,7 +345,7 @@ def replay_task(plan: Plan, cycles: Iterable[LogCycle]) -> TaskReplay:
         task,
         compared=len(differences),
         differing=sum(d > TARGET_TOLERANCE for d in differences),
-        median_counts=float(np.median(differences)) if differences else math.inf,
+        median_rests=float(np.median(comparison.rests)) if differences else math.inf,
         worst_counts=max(differences, default=0),
         lifted_s=way_back.steps[0][0].measurement.t_ns * 1e-9 if way_back.steps else None,
         parted_s=comparison.parted_s,
@@ -355,15 +360,19 @@ class _Comparison:
         self.parted_s: float | None = None
         self._model = plan.setup.arm.model
         self._patience = round(PARTED_S * 1e9 / plan.sync.period_ns)
+        self._rest = np.array(rest_counts(self._model))
         self.differences: list[int] = []
+        self.rests: list[float] = []
         self._away = 0
 
     def add(self, cycle: LogCycle, q: Vector | None) -> None:
         """One cycle, and the joint targets (n,), rad or m, of the replay."""
         if cycle.targets is None or q is None:
             return
-        self.differences.append(worst_count(self._model, q, cycle.targets))
-        self._away = self._away + 1 if self.differences[-1] > PARTED_COUNTS else 0
+        differences = _count_differences(self._model, q, cycle.targets)
+        self.differences.append(int(differences.max()))
+        self.rests.append(float((differences / self._rest).max()))
+        self._away = self._away + 1 if self.rests[-1] > PARTED_RESTS else 0
         if self._away > self._patience:
             self.parted_s = cycle.measurement.t_ns * 1e-9
 

@@ -105,7 +105,9 @@ def _arm(scene: Scene) -> Arm | None:
         )
         for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
     ]
-    return Arm(model, tuple(drives), start_posture(joints), settings.missed_syncs, settings.grouped_rpdo, settings.torque)
+    return Arm(
+        model, tuple(drives), start_posture(joints), settings.missed_syncs, settings.grouped_rpdo, settings.torque
+    )
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:

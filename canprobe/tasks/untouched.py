@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from canprobe.cell.array import patch_of
 from canprobe.cell.controller import Command, Controller, Measurement
+from canprobe.cell.drives import rest_counts
 from canprobe.cell.supervisor import JointGuard
 from canprobe.planning.model import Plan
 from canprobe.tasks.probing import smooth_step
@@ -100,8 +101,8 @@ class HoldTask(Task):
 
 # What a joint's first motion showed, and the operator who looks at it.
 
-TOLERANCE, TOLERANCE_COUNTS = 0.05, 4
-"""How far an encoder's way may be from what was asked: this share, but at least so many counts."""
+TOLERANCE, TOLERANCE_RESTS = 0.05, 0.5
+"""How far an encoder's way may be from what was asked: this share, but at least this part of `rest_counts`."""
 
 
 class Answer(Enum):
@@ -152,18 +153,20 @@ class JointFinding:
         return where + way + (f": {self.fault}" if self.fault is not None else ": as expected")
 
 
-def find_fault(joint: int, asked: Vector, moved: Vector) -> str | None:
+def find_fault(joint: int, asked: Vector, moved: Vector, rest: Sequence[float]) -> str | None:
     """What is wrong with the motors' ways, the joint's own first; None where nothing is.
 
     Args:
         joint: that was to turn, from 0.
         asked, moved: ways of the motors (n,), drive units.
+        rest: within which each is at rest (n,), drive units.
     """
-    tolerance = np.maximum(TOLERANCE * np.abs(asked), TOLERANCE_COUNTS)
+    least = TOLERANCE_RESTS * np.array(rest)
+    tolerance = np.maximum(TOLERANCE * np.abs(asked), least)
     wrong = np.abs(moved - asked) > tolerance
     if wrong[joint]:
         share = float(moved[joint] / asked[joint])
-        if abs(moved[joint]) <= TOLERANCE_COUNTS:
+        if abs(moved[joint]) <= least[joint]:
             return "it did not turn"
         if share < 0:
             return "it turned the wrong way"
@@ -259,7 +262,7 @@ class JointCheck(Controller):
         measured = yield from self._move(start, start + way)
         assert before.q is not None and measured.q is not None
         moved = units_per_q @ (measured.q - before.q)
-        fault = find_fault(joint, units_per_q @ way, moved)
+        fault = find_fault(joint, units_per_q @ way, moved, rest_counts(self._model))
         positive = "along" if its.prismatic else "by the right hand round"
         seen = f"did joint {joint + 1} turn by about {told:+.1f} {unit}, positive {positive} its axis?"
         answer = yield from self._asked(seen, start + way)

@@ -583,3 +583,24 @@ def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     ):
         pass
     assert failed.value.node_id == 3
+
+
+@pytest.mark.parametrize(("rate_hz", "taken"), [(400.0, True), (200.0, False)])
+def test_an_interpolation_time_that_cannot_be_written_must_be_the_right_one(tmp_path, rate_hz, taken):
+    """25·10⁻⁴ s as delivered."""
+
+    def refuse(subindex, value):
+        raise SdoAbort(Abort.READ_ONLY)
+
+    def fix(node):
+        if node.node_id == 5:
+            node.dictionary.on_check(0x60C2, refuse)
+
+    session = open_session(tmp_path, change=fix, rate_hz=rate_hz)
+    if taken:
+        with session:
+            (remark,) = [line for line in session.said if "holds it" in line]
+        assert remark.endswith("refuses to be written 60C2h:01 = 25, 60C2h:02 = -4, and holds it")
+    else:
+        with pytest.raises(NodeError, match=r"^node 5: \(joint 5\) write of 60C2h:01 = 0x32 failed"):
+            session.__enter__()

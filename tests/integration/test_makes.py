@@ -1,0 +1,165 @@
+"""Drives of other makes in one cell, each as its EDS describes it: planned, brought up, enabled, moved, left.
+
+The EDS files are of `makes`. All of them can have a period of 3 ms: whole milliseconds, and tenths of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from makes import MAKES, write_eds
+from scenes import change, reasons
+
+import canprobe
+from canprobe.cell.controller import Command
+from canprobe.emulator.drive import modes
+from canprobe.planning.make import make_plan
+from canprobe.planning.model import Interpolation
+from canprobe.protocol.cia402 import DriveState, OperationMode
+from canprobe.scene.resolve import resolve
+from canprobe.session.session import Session
+
+RATE_HZ = 333.333
+SWING = np.radians((3, -3, 3, 3, -3, 3))
+IP, CSP = OperationMode.INTERPOLATED_POSITION, OperationMode.CYCLIC_SYNC_POSITION
+MOVING = {name: CSP for name in MAKES if name not in ("no_cyclic_mode", "interpolated")}
+if hasattr(modes, "InterpolatedPosition"):
+    MOVING["interpolated"] = IP
+
+
+def scene_of(make, folder):
+    eds = {"eds": str(write_eds(make, folder))}
+    return change(canprobe.load_scene("free"), arm=eds, cycle={"rate_hz": RATE_HZ}, scene={"figures": False})
+
+
+def mixed_plan(makes, folder):
+    """Six drives of several makes."""
+    setup = resolve(scene_of(makes[0], folder))
+    drives = [
+        replace(drive, eds=str(write_eds(makes[i % len(makes)], folder))) for i, drive in enumerate(setup.arm.drives)
+    ]
+    return make_plan(setup.changed("arm", drives=tuple(drives)))
+
+
+def moved(plan, folder, *, at_cycles=200):
+    """Bring a cell up and move its joints: what was said, how far each joint came (rad), the frames on the bus."""
+    said, q = [], []
+
+    def controller(measurement):
+        q.append(measurement.q)
+        k = len(q)
+        return Command(q[0] + SWING * min(1.0, k / 100), done=k > at_cycles)
+
+    with Session(plan, folder, said.append) as session:
+        session.run(controller)
+        faults = session.cell.faults
+    from canprobe.bus.disk import read_candump
+
+    assert faults == []
+    return said, q[-1] - q[0], [(can_id, data) for _, _, can_id, data in read_candump(folder / "bus.log")]
+
+
+@pytest.mark.parametrize("make", MOVING)
+def test_a_cell_of_one_make_moves(tmp_path, make):
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert {node.mode for node in plan.nodes} == {MOVING[make]}
+    said, way, frames = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert not any("left as the device has it" in line and "by its EDS" not in line for line in said), (
+        "all was foreseen"
+    )
+    assert_first_targets_are_positions(plan, frames)
+
+
+def assert_first_targets_are_positions(plan, frames):
+    """Of each drive: its first RPDO has the position of its first TPDO, whatever 607Ah holds as delivered."""
+    for node in plan.nodes:
+        (feedback,), (commands,) = plan.pdos_of(node.node_id, "tpdo"), plan.pdos_of(node.node_id, "rpdo")
+        reports = next(data for can_id, data in frames if can_id == feedback.cob_id)
+        orders = [commands.layout.unpack(data) for can_id, data in frames if can_id == commands.cob_id]
+        assert orders[0][:2] == (0, feedback.layout.unpack(reports)[1])
+        enabling = next(order for order in orders if order[0] & 0x0F == 0x0F)
+        assert enabling[1] == orders[0][1]
+        bits = {order[0] & 0x10 for order in orders if order[0] & 0x0F == 0x0F}
+        assert (0x10 in bits) == (node.mode is IP)
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        ("milliseconds_only", [Interpolation(3, -3)]),
+        ("microsecond_index", [Interpolation(3, -3), Interpolation(30, -4)]),
+        ("late_target", [Interpolation(3, -3)]),
+        ("bare", [Interpolation(3, -3), Interpolation(30, -4)]),
+        ("fixed_mapping", [Interpolation(30, -4)]),
+        ("tpdo_without_rtr", [Interpolation(3, -3)]),
+    ],
+)
+def test_the_period_as_each_make_expresses_it(tmp_path, make, expected):
+    assert list(canprobe.plan(scene_of(make, tmp_path)).nodes[0].interpolation) == expected
+
+
+def test_a_rate_that_a_make_cannot_express_is_refused_with_the_nearest_that_all_can(tmp_path):
+    scene = change(scene_of("milliseconds_only", tmp_path), cycle={"rate_hz": 400.0})
+    (problem,) = reasons(scene)
+    assert problem.startswith("cycle.rate_hz = 400: a SYNC period of 2500 µs cannot be set (")
+    assert problem.endswith("60C2h takes 1 to 100 · 10^-3 s); take 333.333 or 500 Hz")
+    assert canprobe.plan(change(scene, cycle={"rate_hz": 333.333})).sync.period_ns == 3_000_000
+
+
+def test_a_make_without_a_mode_for_targets_is_refused_with_the_modes_that_it_has(tmp_path):
+    modes = next(problem for problem in reasons(scene_of("no_cyclic_mode", tmp_path)) if "6502h" in problem)
+    assert "profile position (1), profile velocity (3), homing (6); needed: cyclic synchronous position (8)" in modes
+
+
+def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):
+    rows = {what: why.partition(": ")[2] for what, why in canprobe.plan(scene_of("bare", tmp_path)).not_available}
+    assert rows["the node notices a dead master (1016h:01)"] == (
+        "no such object: the device will not notice a dead master"
+    )
+    assert {what[-9:-1] for what in rows} == {
+        "1016h:01", "2000h:00", "6065h:00", "6066h:00", "607Fh:00", "607Dh:01", "607Dh:02", "605Ah:00", "6007h:00"
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("make", "entry", "why"),
+    [
+        ("milliseconds_only", "605A", None),  # 0 to 6, 2 is among them
+        ("microsecond_index", "605A", None),  # read-only, but it is 2
+        ("late_target", "6065", None),
+    ],
+)
+def test_what_limits_and_access_allow_is_no_lack(tmp_path, make, entry, why):
+    rows = [row for row in canprobe.plan(scene_of(make, tmp_path)).not_available if f"{entry}h" in row[0]]
+    assert rows == []
+
+
+def test_fixed_mappings_are_used_as_they_are(tmp_path):
+    plan = canprobe.plan(scene_of("fixed_mapping", tmp_path))
+    feedback, commands = plan.pdos_of(2, "tpdo"), plan.pdos_of(2, "rpdo")
+    assert [(pdo.number, pdo.cob_id, pdo.transmission_type) for pdo in feedback] == [(3, 0x382, 1)]
+    assert [(pdo.number, pdo.cob_id) for pdo in commands] == [(3, 0x402)]
+    (besides,) = [pdo for pdo in plan.pdos if pdo.node_id == 2 and not pdo.used]
+    assert (besides.number, besides.cob_id, besides.rate_hz) == (1, 0x182, 10)
+    assert "TPDO1 switched off" in dict(plan.not_available)
+
+
+def test_six_makes_in_one_cell_move(tmp_path):
+    makes = [name for name, mode in MOVING.items() if mode is CSP]
+    assert len(makes) == 6
+    said, way, _ = moved(mixed_plan(makes, tmp_path), tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert sum("configured" in line for line in said) == 6
+
+
+@pytest.mark.parametrize("make", ["bare", "fixed_mapping"])
+def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    _, _, frames = moved(plan, tmp_path / "run", at_cycles=5)
+    for node_id in plan.node_ids:
+        (feedback,) = plan.pdos_of(node_id, "tpdo")
+        last = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
+        assert feedback.layout.unpack(last)[0] & 0x6F == DriveState.SWITCH_ON_DISABLED.value
