@@ -126,7 +126,9 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, wit
 
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:
-    dictionary, od_of = load_eds(planned.eds, planned.node_id), partial(load_eds, planned.eds)
+    dictionary = load_eds(planned.eds, planned.node_id)
+    speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
+    od_of = partial(load_eds, planned.eds) if speaks_lss else None
     if planned.kind == "drive":
         assert setup.arm is not None
         axis = setup.arm.node_ids.index(planned.node_id)

@@ -255,8 +255,7 @@ def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     if setup.arm is None:
         yield "six drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
     elif not setup.arm.torque:
-        asked = setup.scene.arm is None or setup.scene.arm.torque
-        yield "motor torque (6077h)", "the bus has no room for it beside the task" if asked else "arm.torque = false"
+        yield "motor torque (6077h)", "arm.torque is false, or the bus has no room for it beside what the task needs"
     if array is None:
         yield "tactile node and its PDOs", f'no [sensor]: task.kind = "{kind}" feels nothing'
     elif array.mode == "window":

@@ -259,3 +259,22 @@ def test_cia402_55_a_lagging_wrist_motor_stands_on_its_pulse():
     answer = node.receive(0x605, bytes.fromhex("4064600000000000"), t_ns + 1250 * 10**6)[0][1]
     assert abs(int.from_bytes(answer[4:], "little", signed=True)) <= 1
     assert [plant.motor_counts(axis) for axis in (0, 1, 2, 3, 5)] == pytest.approx(others, abs=1e-6)
+
+
+@pytest.mark.parametrize(("method", "end"), [(17, "q_min"), (18, "q_max")])
+def test_cia402_55_a_coupled_wrist_joint_finds_its_switch_where_the_joint_really_is(rig, method, end):
+    """Axis 5 of the ideal arm counts from 0 at power on, and lags 8 ms behind its reference."""
+    rig.plant = plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    rig.drive.node = make_drive_node(load_eds("puma260_joint", 1), 1, 4, plant, incremental=True)
+    rig.drive.node.start(0)
+    assert rig.signed(0x6064) == 0
+    rig.put(_6099_1=20_000, _6099_2=500, _609A=200_000, _6098=method).enable(6)
+    rig.drive.advance(rig.drive.t_ns + 10_000_000)
+    rig.word(START)
+    for _ in range(4000):
+        rig.drive.advance(rig.drive.t_ns + 2_500_000)
+    assert bits(rig) == DONE
+    margin = 0.01 * (UPENN.q_max[4] - UPENN.q_min[4])
+    wanted = getattr(UPENN, end)[4] + (margin if method == 18 else -margin)
+    assert plant.truth()["q"][4] == pytest.approx(wanted, abs=1e-4)
+    assert abs(rig.signed(0x6064)) <= 1
