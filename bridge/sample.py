@@ -154,7 +154,7 @@ class Sample:
         t_ns: time of its SYNC since the bus was opened, as in `bus.log`.
         cycle: its number; None before the first cycle and after the last.
         phase: of the task in lower case (`approach`, `scan`, …); None where the controller gives none.
-        q: (6,) joint angles at the SYNC, rad; None without an arm, or before all joints were heard.
+        q: (n,) joint positions at the SYNC, rad or m; None without an arm, or before all joints were heard.
         touch: a tactile frame that became usable in this cycle.
         patch: a new answer of the estimator.
         frames: what was on the bus since the sample before, with `EFF_FLAG` and `RTR_FLAG` on identifiers.

@@ -43,7 +43,7 @@ class Moment:
     Attributes:
         t_s: on the clock of the samples, s.
         phase: of the task.
-        q: (6,) joint angles, rad; None without an arm.
+        q: (n,) joint positions, rad or m; None without an arm.
         contact: where the probe touches; None without contact.
         answer: the newest one of the estimator; None before the first.
         taxels: (16, 16) counts of the newest frame; None before the first.

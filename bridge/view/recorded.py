@@ -30,7 +30,7 @@ from canprobe.touch.linear_algebra import tangent_rotation
 
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),
-    "q_rad": (6,),
+    "q_rad": (-1,),
     "phase": (),
     "force_n": (),
     "contact_mm": (3,),
@@ -40,7 +40,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
     "K_per_m": (2, 2),
     "K_covariance_per_m2": (3, 3),
 }
-"""Columns of ``log.npz`` that are shown, and the shape of a row."""
+"""Columns of ``log.npz`` that are shown, and the shape of a row; -1: one value a joint."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,7 +123,7 @@ def read_run(folder: Path) -> RecordedRun:
             raise UsageError(f"{folder}: no {name} in this folder; expected one that `canprobe run --out DIR` wrote")
     _check_schema(folder / "summary.json")
     scene = load_scene(folder / "scene.toml")
-    log = _read_log(folder / "log.npz")
+    log = _read_log(folder / "log.npz", len(scene.drives))
     rows = _new_answers(log)
     shape = None if scene.object is None else true_object(scene.object)
     return RecordedRun(
@@ -159,7 +159,7 @@ def _check_schema(file: Path) -> None:
         raise UsageError(f"{file}: expected schema {SCHEMA}, got {found!r}; run the scene again with this canprobe")
 
 
-def _read_log(file: Path) -> dict[str, Array]:
+def _read_log(file: Path, joints: int) -> dict[str, Array]:
     try:
         with file.open("rb") as opened:  # numpy leaves a file open that it cannot read
             saved = np.load(opened, allow_pickle=False)
@@ -173,11 +173,9 @@ def _read_log(file: Path) -> dict[str, Array]:
         raise UsageError(f"{file}: expected a column 't_s' with a row for each cycle, got none")
     check_clock(file, log)
     for name, values in log.items():
-        if values.shape != (rows, *_SHAPES[name]) or values.dtype.kind != "f":
-            raise UsageError(
-                f"{file}: {name}: expected floats of shape {(rows, *_SHAPES[name])}, got {values.dtype} of"
-                f" {values.shape}"
-            )
+        shape = (rows, *(joints if size < 0 else size for size in _SHAPES[name]))
+        if values.shape != shape or values.dtype.kind != "f":
+            raise UsageError(f"{file}: {name}: expected floats of shape {shape}, got {values.dtype} of {values.shape}")
     return log
 
 

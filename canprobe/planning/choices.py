@@ -253,7 +253,7 @@ def left_out(setup: Setup) -> tuple[tuple[str, str], ...]:
 def _not_sent(setup: Setup) -> Iterator[tuple[str, str]]:
     array, kind = setup.array, setup.kind
     if setup.arm is None:
-        yield "six drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
+        yield "drives, their PDOs, joint limits", f'no [arm]: task.kind = "{kind}" moves nothing'
     elif not setup.arm.torque:
         yield "motor torque (6077h)", "arm.torque is false, or the bus has no room for it beside what the task needs"
     if array is None:

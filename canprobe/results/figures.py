@@ -54,7 +54,7 @@ def _rows(result: RunResult) -> list[list[tuple[Panel, float]]]:
         rows = [[*force, *taxels]]
         if result.summary.get("calibration") is not None:
             rows.append([(_draw_tool, 1.0)])
-        elif "q_rad" in log:
+        elif "q_rad" in log and log["q_rad"].ndim == 2:  # of a failed bring-up nothing may be known
             rows.append([(_draw_joints, 1.0)])
     return [row for row in rows if row]
 
@@ -163,16 +163,19 @@ def _draw_taxels(part: SubFigure, result: RunResult) -> None:
 
 def _draw_joints(part: SubFigure, result: RunResult) -> None:
     """A panel a joint: joints that move alike would hide each other in one."""
-    t, q = result.log["t_s"], np.degrees(result.log["q_rad"])
-    columns = min(3, q.shape[1])
-    grid = part.subplots(-(-q.shape[1] // columns), columns, squeeze=False, sharex=True, sharey=True)
-    for i, axes in enumerate(grid.flat):
-        axes.set_visible(i < q.shape[1])
-        if i < q.shape[1]:
-            axes.plot(t, q[:, i] - q[0, i], color=BLUE)
-            axes.set_title(f"joint {i + 1}")
+    arm = result.plan.setup.arm
+    assert arm is not None
+    t, q, joints = result.log["t_s"], result.log["q_rad"], arm.model.joints
+    columns = min(3, len(joints))
+    turns = len({joint.prismatic for joint in joints}) == 1
+    grid = part.subplots(-(-len(joints) // columns), columns, squeeze=False, sharex=True, sharey=turns)
+    for axes in grid.flat[len(joints) :]:
+        axes.set_visible(False)
+    for i, (axes, joint) in enumerate(zip(grid.flat, joints, strict=False)):
+        axes.plot(t, [joint.shown(value) for value in q[:, i] - q[0, i]], color=BLUE)
+        axes.set_title(f"joint {i + 1} ({joint.unit})")
     part.supxlabel("time (s)", fontsize="medium")
-    part.supylabel("angle from the start (deg)", fontsize="medium")
+    part.supylabel("way from the start", fontsize="medium")
 
 
 # The picture of a plan: its cycles on every bus, and how much of its deadline each message may take.

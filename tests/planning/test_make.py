@@ -23,7 +23,7 @@ from canprobe.scene.load import load_scene, packaged_scenes
             {"tactile"},
             None,
             None,
-            {"six drives, their PDOs, joint limits", "surface estimator", "tactile servo"},
+            {"drives, their PDOs, joint limits", "surface estimator", "tactile servo"},
         ),
         ("free", {"drive"}, None, None, {"tactile node and its PDOs", "surface estimator", "tactile servo"}),
     ],
