@@ -3,7 +3,7 @@
 A `cell.Cell` is made of a plan and a port; nothing is sent before it is entered.
 
 1. Entering brings the nodes up (`bringup`, top to bottom): listen, reset, identify, configure, start. Where another
-   master is at work the cell sends nothing and gives up. `configuration` derives from the plan what is written into
+   master is at work the cell sends nothing and gives up. The plan's `configuration` states what is written into
    each node: a list of objects with value and purpose.
 2. `Cell.run` enables the drives and runs a `controller.Controller`. Each cycle: SYNC on an absolute deadline, TPDOs
    matched by identifier and arrival (`cycle`, `drives`, `array`), a `Measurement`, the supervision, `step`, RPDOs,

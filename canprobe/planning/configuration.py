@@ -222,8 +222,9 @@ def _excluded(device: Abilities, write: Write) -> str | None:
 
 
 def _ends(entry: Entry) -> str:
-    low, high = ("" if limit is None else f"{limit:g}" for limit in (entry.low, entry.high))
-    return f"{low} to {high}".strip() if low or high else f"values of {entry.bits} bits"
+    if entry.low is None:
+        return f"values of {entry.bits} bits" if entry.high is None else f"at most {entry.high}"
+    return f"at least {entry.low}" if entry.high is None else f"{entry.low} to {entry.high}"
 
 
 def _pdo_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Write]:

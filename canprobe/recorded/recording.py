@@ -99,6 +99,7 @@ def read_recording(path: Path, plan: Plan, *, as_taken: bool) -> Recording:
 def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
     lengths: dict[int, int] = {pdo.cob_id: pdo.layout.length for pdo in plan.pdos}
     answers = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo"}
+    may_be_longer = {pdo.cob_id for pdo in plan.pdos if pdo.direction == "tpdo" and pdo.kind == "drive"}
     channels: dict[str, _Channel] = {}
     error_frames = 0
     main, *others = [bus.channel for bus in plan.buses]
@@ -114,7 +115,7 @@ def _read(path: Path, plan: Plan) -> tuple[dict[str, _Channel], int]:
         elif (length := lengths.get(can_id)) is None:
             channel.other += 1
             error_frames += is_bus_error(can_id)
-        elif len(data) != length:
+        elif len(data) < length or (len(data) > length and can_id not in may_be_longer):
             channel.malformed += 1
         else:
             channel.frames.append((can_id, data, t_ns))

@@ -5,16 +5,18 @@ The EDS files are of `makes`. All of them can have a period of 3 ms: whole milli
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from makes import MAKES, write_eds
+from makes import MAKES, changed, pdo, without, word, write_eds
 from scenes import change, reasons
 
 import canprobe
 from canprobe.cell.controller import Command
 from canprobe.emulator.drive import modes
+from canprobe.planning.configuration import make_setups
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Interpolation
 from canprobe.protocol.cia402 import DriveState, OperationMode
@@ -163,3 +165,150 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
         (feedback,) = plan.pdos_of(node_id, "tpdo")
         last = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
         assert feedback.layout.unpack(last)[0] & 0x6F == DriveState.SWITCH_ON_DISABLED.value
+
+
+# What a make may have besides: values that the drives do not take, PDOs with more in them, or with less.
+
+
+def variant(change_objects, base="late_target"):
+    """A make with other objects."""
+    make = MAKES[base]()
+    change_objects(make.objects)
+    return replace(make, name="variant")
+
+
+def rows_of(plan):
+    return {what: why.partition(": ")[2] for what, why in plan.not_available}
+
+
+@pytest.mark.parametrize(
+    ("place", "values", "why"),
+    [
+        ((0x605A, 0), {"access": "ro", "default": 6}, "it is ro, 6"),
+        ((0x605A, 0), {"low": 5, "high": 6}, "it takes 5 to 6"),
+        ((0x605A, 0), {"access": "ro", "default": 2}, None),
+        ((0x6066, 0), {"access": "const", "default": 10}, "it is const, 10"),
+        ((0x607F, 0), {"high": 100}, "it takes at most 100"),
+        ((0x1016, 1), {"access": "ro"}, "it is ro, 0"),
+    ],
+)
+def test_a_wished_value_that_the_eds_excludes_is_left_out(tmp_path, place, values, why):
+    make = variant(lambda objects: changed(objects, *place, **values))
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    rows = {what: text for what, text in rows_of(plan).items() if f"{place[0]:04X}h" in what}
+    assert [text.partition(":")[0] for text in rows.values()] == ([why] if why else [])
+
+
+@pytest.mark.parametrize(
+    ("place", "values", "told"),
+    [
+        ((0x1017, 0), {"access": "const", "default": 0}, "1017h:00 = 100 .* is needed: it is const, 0"),
+        ((0x1017, 0), {"high": 50}, "1017h:00 = 100 .* is needed: it takes at most 50"),
+        ((0x6060, 0), {"access": "ro", "default": 1}, "6060h:00 = 8 .* is needed: it is ro, 1"),
+    ],
+)
+def test_a_required_value_that_the_eds_excludes_is_refused_with_what_there_is(tmp_path, place, values, told):
+    make = variant(lambda objects: changed(objects, *place, **values))
+    (problem,) = reasons(scene_of(make, tmp_path))
+    assert re.search(told, problem)
+
+
+def fixed_pdos(*layouts):
+    """Exactly these PDOs, with fixed mappings."""
+
+    def change_objects(objects):
+        for number in range(1, 9):
+            without(objects, *(base + number - 1 for base in (0x1400, 0x1600, 0x1800, 0x1A00)))
+        for direction, number, words, options in layouts:
+            objects |= pdo(direction, number, words, fixed=True, **options)
+
+    return variant(change_objects)
+
+
+W, T, S, P = word(0x6040, 0, 16), word(0x607A, 0, 32), word(0x6041, 0, 16), word(0x6064, 0, 32)
+SPEED, MODE, ACTUAL_SPEED = word(0x6081, 0, 32), word(0x6060, 0, 8), word(0x606C, 0, 32)
+
+
+def test_controlword_and_target_in_different_fixed_pdos_and_more_in_them(tmp_path):
+    make = fixed_pdos(
+        ("rpdo", 1, (W, MODE), {}),
+        ("rpdo", 2, (SPEED, T), {}),
+        ("tpdo", 1, (S,), {}),
+        ("tpdo", 2, (ACTUAL_SPEED, P), {}),
+    )
+    plan = canprobe.plan(change(scene_of(make, tmp_path), cycle={"rate_hz": 200.0}))
+    assert [pdo.number for pdo in plan.pdos_of(1, "tpdo")] == [1, 2]
+    assert {pdo.number: pdo.constants for pdo in plan.pdos_of(1, "rpdo")} == {
+        1: (((0x6060, 0), 8),),
+        2: (((0x6081, 0), 100_000),),
+    }
+    _, way, frames = moved(plan, tmp_path / "run")
+    assert way == pytest.approx(SWING, abs=np.radians(0.2))
+    assert {data[2] for can_id, data in frames if can_id == 0x201} == {8}
+    assert {data[:4] for can_id, data in frames if can_id == 0x301} == {(100_000).to_bytes(4, "little")}
+
+
+def test_the_pdo_that_carries_nothing_else_is_preferred(tmp_path):
+    make = fixed_pdos(
+        ("rpdo", 1, (W, T, MODE), {}), ("rpdo", 2, (W, T), {}), ("tpdo", 1, (S, P), {}), ("tpdo", 2, (S, P), {})
+    )
+    plan = canprobe.plan(scene_of(make, tmp_path))
+    assert [pdo.number for pdo in (*plan.pdos_of(1, "rpdo"), *plan.pdos_of(1, "tpdo"))] == [2, 1]
+    assert [(pdo.number, pdo.rate_hz) for pdo in plan.pdos if pdo.node_id == 1 and not pdo.used] == [
+        (2, pytest.approx(1000 / 3))
+    ]
+
+
+def test_a_fixed_pdo_whose_other_values_have_no_safe_default_is_refused(tmp_path):
+    make = fixed_pdos(("tpdo", 1, (S, P), {}))
+    make.objects.update(
+        pdo(
+            "rpdo",
+            1,
+            (
+                W,
+                word(0x60FF, 0, 32),
+            ),
+            fixed=True,
+        )
+        | pdo("rpdo", 2, (T,), fixed=True)
+    )
+    problems = reasons(scene_of(make, tmp_path))
+    assert len(problems) == 6
+    assert all("RPDO1 also writes 60FFh:00, whose EDS entry has no default" in problem for problem in problems)
+
+
+def test_no_pdo_with_what_is_needed_is_refused_with_what_they_carry(tmp_path):
+    make = fixed_pdos(("rpdo", 1, (W,), {}), ("tpdo", 1, (S, P), {}))
+    assert "RPDO1 has the fixed mapping 60400010h; needed: 6040h:00, 607Ah:00" in reasons(scene_of(make, tmp_path))[0]
+
+
+def test_a_pdo_that_follows_no_sync_is_not_used(tmp_path):
+    def change_objects(objects):
+        changed(objects, 0x1800, 2, access="ro", default=255)
+
+    plan = canprobe.plan(scene_of(variant(change_objects), tmp_path))
+    assert {pdo.number for pdo in plan.pdos_of(3, "tpdo")} == {2}
+    assert [(pdo.number, pdo.cob_id) for pdo in plan.pdos_of(3, "tpdo")] == [(2, 0x183)]
+
+
+def test_bits_29_and_30_are_written_as_the_eds_has_them(tmp_path):
+    plan = canprobe.plan(scene_of("tpdo_without_rtr", tmp_path))
+    writes = {(w.index, w.subindex): w.value for w in make_setups(plan)[2].writes}
+    assert writes[0x1800, 1] == 0x4000_0183 and writes[0x1801, 1] == 0xC000_0283 and writes[0x1400, 1] == 0x203
+
+
+def test_targets_of_interpolated_position_go_to_60c1h(tmp_path):
+    """The master alone: what is written, what is mapped."""
+    plan = canprobe.plan(scene_of("interpolated", tmp_path))
+    writes = {(w.index, w.subindex): w.value for w in make_setups(plan)[0].writes}
+    assert writes[0x6060, 0] == 7 and writes[0x60C0, 0] == 0 and (writes[0x60C2, 1], writes[0x60C2, 2]) == (3, -3)
+    assert [writes[0x1600, sub] for sub in (0, 1, 2)] == [2, 0x60400010, 0x60C10120]
+
+
+def test_the_packaged_prbt_joint_is_planned_at_100_hz():
+    scene = change(canprobe.load_scene("free"), arm={"eds": "prbt_joint.eds", "node_ids": (3, 4, 5, 6, 7, 8)})
+    plan = canprobe.plan(change(scene, cycle={"rate_hz": 100.0}))
+    assert {(node.mode, node.interpolation) for node in plan.nodes} == {(IP, (Interpolation(10, -3),))}
+    assert [pdo.number for pdo in (*plan.pdos_of(3, "rpdo"), *plan.pdos_of(3, "tpdo"))] == [1, 1]
+    assert "what a quick stop does (605Ah:00)" in dict(plan.not_available)

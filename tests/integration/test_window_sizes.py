@@ -133,7 +133,7 @@ def test_a_sensor_without_the_object_keeps_8(tmp_path):
         plan.not_available
     )
     (setup,) = (setup for setup in make_setups(plan) if setup.node_id == 16)
-    assert not any(write.index == 0x2008 for write in setup.writes) and 0x2008 not in setup.lacks
+    assert not any(write.index == 0x2008 for write in setup.writes) and setup.left_out == ()
     with pytest.raises(PlanError, match=r"sensor\.window = 8, not 6"):
         canprobe.plan(change(scene, sensor={"window": 6}))
     result = canprobe.run(plan.scene, files=False, duration_s=0.1)
