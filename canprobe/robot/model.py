@@ -70,6 +70,21 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """What a joint carries up to the next one, in the frame of the joint.
+
+    Attributes:
+        mass: kg.
+        com: (3,) centre of mass, m.
+        tensor: (3, 3) inertia about it, kg m^2.
+    """
+
+    mass: float
+    com: Array
+    tensor: Array
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ArmModel:
     """Geometry, joints and drive units of one arm; compared by identity.
 

@@ -19,26 +19,11 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, Chain
-from canprobe.robot.model import Joint
+from canprobe.robot.model import Body, Joint
 
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
 _MOVING = {"revolute", "continuous", "prismatic"}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Body:
-    """What a joint carries up to the next one, in the frame of the joint.
-
-    Attributes:
-        mass: kg.
-        com: (3,) centre of mass, m.
-        tensor: (3, 3) inertia about it, kg m^2.
-    """
-
-    mass: float
-    com: Array
-    tensor: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.robot.puma import MODELS
+from canprobe.robot.puma import BODIES, MODELS
 from canprobe.robot.tool_calibration import ball_approaches
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.model import (
@@ -212,4 +212,5 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         ),
         without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
         adc_bits=plant.adc_bits,
+        bodies=None if model is None else BODIES[model.name],
     )

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.robot.model import ArmModel
+from canprobe.robot.model import ArmModel, Body
 from canprobe.robot.tool_calibration import BallApproach
 from canprobe.scene.model import (
     Auto,
@@ -325,6 +325,7 @@ class Truth:
         dynamics: of a dynamic arm.
         without: effects of the array that are switched off.
         adc_bits: of the array.
+        bodies: (n,) of the joints, without the probe; None where nobody knows them, which refuses "dynamic".
     """
 
     object: PlacedShape | None
@@ -337,6 +338,7 @@ class Truth:
     dynamics: Dynamics
     without: tuple[str, ...]
     adc_bits: int
+    bodies: tuple[Body | None, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
