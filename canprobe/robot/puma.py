@@ -16,6 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, from_dh
 from canprobe.robot.model import ArmModel, Body, Joint
 
@@ -94,6 +95,21 @@ The elbow offset is taken as the DH length a3, at right angles to the forearm.
 """
 
 MODELS: Mapping[str, ArmModel] = MappingProxyType({"upenn": UPENN, "unimate": UNIMATE})
+
+
+def dh_rows(model: ArmModel) -> Array:
+    """(6, 4) standard Denavit-Hartenberg rows of a PUMA 260, for what is written for it alone.
+
+    Args:
+        model: one of `MODELS`.
+
+    Raises:
+        PlanError: it is another arm.
+    """
+    puma = MODELS.get(model.name)
+    if puma is None or not np.array_equal(puma.chain.fixed, model.chain.fixed):
+        raise PlanError([f"arm {model.name!r}: expected a PUMA 260 ({', '.join(MODELS)}) here"])
+    return DH_ROWS[model.name]
 
 
 def _bodies(name: str) -> tuple[Body, ...]:

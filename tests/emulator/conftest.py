@@ -144,7 +144,6 @@ class FakePlant:
     image: np.ndarray = field(default_factory=lambda: np.zeros((16, 16), np.uint8))
     sampled: list[int] = field(default_factory=list)
     loops: list[tuple[int, int, float, float]] = field(default_factory=list)
-    brakes: list[tuple[int, bool]] = field(default_factory=list)
     t_ns: int = 0
     stuck: bool = False
     torque: int = 0
@@ -169,9 +168,6 @@ class FakePlant:
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         self.loops.append((axis, limit_permille, speed, torque_permille))
-
-    def set_brake(self, axis: int, closed: bool) -> None:
-        self.brakes.append((axis, closed))
 
     def set_ramp(self, axis: int, start: float, end: float, t0_ns: int, t1_ns: int) -> None:
         assert t1_ns > t0_ns

@@ -1,8 +1,8 @@
 """A CiA 402 drive on one axis of the plant: states, faults, options, and which mode is active.
 
-Outside operation enabled the brake holds, also from the end of a stop on. The drive stops by itself when the master
-dies: in the cyclic modes when SYNC or targets are missing, in all modes when the heartbeat is. A change of mode under
-way slows the motion down by 6084h until the new mode is given a target.
+Outside operation enabled the drive holds. It stops by itself when the master dies: in the cyclic modes when SYNC or
+targets are missing, in all modes when the heartbeat is. A change of mode under way slows the motion down by 6084h
+until the new mode is given a target.
 Source: CiA 402-2 (IEC 61800-7-201), finite state automaton, modes of operation.
 """
 
@@ -35,8 +35,6 @@ _TARGET, _STATUSWORD = key_of(0x607A), key_of(0x6041)
 _VOLATILE = frozenset({0x6040, 0x6071, 0x607A, 0x60B0, 0x60B1, 0x60B2, 0x60FF})
 _ABORT_COMMANDS = {2: Command.DISABLE_VOLTAGE, 3: Command.QUICK_STOP}  # of 6007h; 1 is a fault, 0 nothing
 _ENABLED = DriveState.OPERATION_ENABLED
-_BY_TORQUE = frozenset({_ENABLED, DriveState.QUICK_STOP_ACTIVE, DriveState.FAULT_REACTION_ACTIVE})
-"""States in which the brake is open, and the drive stops the motor if it is to stop."""
 
 
 class DriveApplication(Application):
@@ -97,7 +95,6 @@ class DriveApplication(Application):
         self.parts.loop.release()
         self.parts.feedback.reset(t_ns)
         self._motion.hold(t_ns)
-        self._close_brake(t_ns)
         for mode in self._modes.values():
             mode.reset()
         self._node.dictionary.put(0x6502, 0, sum(1 << mode - 1 for mode in self._modes if mode))
@@ -212,7 +209,6 @@ class DriveApplication(Application):
             self._mode.leave(t_ns)
         if new is _ENABLED:
             here = self._motion.hold(t_ns)
-            self._plant.set_brake(self._axis, False)
             self._values[_TARGET] = round(self._parameters.units.position(here))
             self._start_mode(t_ns)
         elif new is DriveState.QUICK_STOP_ACTIVE:
@@ -228,8 +224,6 @@ class DriveApplication(Application):
             self._forget_faults()
         elif old is DriveState.QUICK_STOP_ACTIVE and self._motion.busy:
             self._motion.hold(t_ns)
-        if new not in _BY_TORQUE and not self._motion.busy:
-            self._close_brake(t_ns)
         if new is not _ENABLED:
             self.parts.supervision.stop()
         self._show()
@@ -239,16 +233,11 @@ class DriveApplication(Application):
         parameters = self._parameters
         options = {DriveState.READY_TO_SWITCH_ON: parameters.shutdown, DriveState.SWITCHED_ON: parameters.disable}
         if options.get(self.state) == 1 and parameters.deceleration:
-            self._motion.decelerate(t_ns, parameters.deceleration, self._close_brake)
+            self._motion.decelerate(t_ns, parameters.deceleration)
         else:
             self._motion.hold(t_ns)
 
-    def _close_brake(self, t_ns: int) -> None:
-        self._plant.advance(t_ns)
-        self._plant.set_brake(self._axis, True)
-
     def _stopped(self, t_ns: int) -> None:
-        self._close_brake(t_ns)
         if self._parameters.quick_stop in STAYS_STOPPED:
             self._standstill = True
             self._show()

@@ -200,9 +200,6 @@ class AxisPlant(Protocol):
             torque_permille: added behind the velocity loop.
         """
 
-    def set_brake(self, axis: int, closed: bool) -> None:
-        """Close or open the motor's brake."""
-
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         """Follow a straight reference from `t0_ns` to `t1_ns`, then hold its end."""
 
@@ -359,9 +356,6 @@ class IdealAxis(AxisPlant):
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Nothing: there is no loop and no torque."""
-
-    def set_brake(self, axis: int, closed: bool) -> None:
-        """Nothing: without a torque nothing falls."""
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
         self._start, self._end, self._t0, self._t1 = start_counts, end_counts, t0_ns, t1_ns

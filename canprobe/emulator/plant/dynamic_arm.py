@@ -105,7 +105,7 @@ class Stepping:
 
 
 class DynamicArm:
-    """The n motors that drive the arm's links, each with a brake, which is open at first.
+    """The n motors that drive the arm's links.
 
     Args:
         model: the arm's geometry.
@@ -178,8 +178,8 @@ class DynamicArm:
         """
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
-            self._torques = y, self.equations.moving * self.equations.loops.drives(1e-9 * self.t_ns, y).given
-        permille = round(1000.0 * self._torques[1][axis] / self.model.joints[axis].rated_torque)
+            self._torques = y, self.equations.loops.drives(1e-9 * self.t_ns, y).given
+        permille = round(1000.0 * float(self._torques[1][axis]) / self.model.joints[axis].rated_torque)
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
@@ -195,27 +195,6 @@ class DynamicArm:
         rated = 1e-3 * self.model.joints[axis].rated_torque
         self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
         self._torques = None
-
-    def set_brake(self, axis: int, closed: bool) -> None:
-        """Close or open the brake of one motor.
-
-        A closed brake holds against everything, and the drive is without power. When it opens, the drive's loop starts
-        with an empty integrator: under a weight the axis falls until the loop carries it.
-
-        Args:
-            axis: from 0.
-            closed: from now on.
-        """
-        moving = self.equations.moving
-        if closed == (moving[axis] == 0.0):
-            return
-        self._advance_to(self.t_ns)
-        n = self.model.n
-        self._y = self._y.copy()
-        self._y[[n + axis, 2 * n + axis]] = 0.0
-        moving[axis] = 0.0 if closed else 1.0
-        self._hold_ns = self._y_ns - self._stepping.hold_ns  # mass matrix and bias are others now
-        self._now = self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.

@@ -314,7 +314,6 @@ class ArmEquations:
     Attributes:
         mass, bias: held, motor coordinates: (n, n) kg m^2; (n,) N m.
         contact: held; None where nothing is near.
-        moving: (n,) 1; 0 of a motor whose brake is closed, which stands still whatever acts on it.
     """
 
     def __init__(
@@ -329,7 +328,6 @@ class ArmEquations:
     ) -> None:
         self.body, self.loops, self.effects, self.held = body, loops, effects, held
         self.positions = model.n
-        self.moving = np.ones(model.n)
         self.contact: Contact | None = None
         self._touching = touching
         self._joints_per_motor = joints_per_motor(model)
@@ -357,11 +355,8 @@ class ArmEquations:
         return back.T @ mass @ back + self._rotors, back.T @ bias
 
     def _take(self, mass: Array, bias: Array) -> None:
-        """A motor that its brake holds has a row and a column of its own, which nothing pushes."""
-        if not self.moving.all():
-            mass = mass * np.outer(self.moving, self.moving) + np.diag(1.0 - self.moving)
         self.mass, self.bias = mass, bias
-        self.inverse: Array = np.linalg.inv(mass)
+        self.inverse: Array = np.asarray(np.linalg.inv(mass), dtype=np.float64)
 
     def resting(self, theta: Array) -> Array:
         """(3n,) state at rest that the drives hold: the integrators carry the weight.
@@ -386,7 +381,7 @@ class ArmEquations:
         if push is not None:
             net += push
         wound = loops.integral * drives.error - loops.unwind * (drives.asked - drives.given)
-        return np.concatenate((v, self.inverse @ (self.moving * net), self.moving * wound))
+        return np.concatenate((v, self.inverse @ net, wound))
 
     def drift(self, t: float, y: Array) -> Array:
         """Partial derivative of f by t: the reference moves on."""
@@ -394,12 +389,12 @@ class ArmEquations:
         return self._drift(by_error, sum_by_error)
 
     def _drift(self, by_error: Array, sum_by_error: Array) -> Array:
-        pull = self.moving * self.loops.slope * self.loops.position
+        pull = self.loops.slope * self.loops.position
         return np.concatenate((np.zeros(self.positions), self.inverse @ (by_error * pull), sum_by_error * pull))
 
     def jacobian(self, t: float, y: Array) -> Array:
         """(3n, 3n) of f by y; mass matrix, bias and contact geometry held."""
-        n, kp, moving = self.positions, self.loops.position, self.moving[:, None]
+        n, kp = self.positions, self.loops.position
         x, v, _ = y.reshape(3, -1)
         drives = self.loops.drives(t, y)
         by_error, drag, sum_by_error, sum_by_sum = self.loops.slopes(v, drives)
@@ -410,15 +405,15 @@ class ArmEquations:
             theta, rate = theta - pushed[1], rate - pushed[2]
         J = np.zeros((3 * n, 3 * n))
         J[:n, n : 2 * n] = np.eye(n)
-        J[n : 2 * n] = self.inverse @ (moving * np.hstack((theta, rate, by_sum)))
-        J[2 * n :] = moving * np.hstack((np.diag(-kp * sum_by_error), np.diag(-sum_by_error), np.diag(sum_by_sum)))
+        J[n : 2 * n] = self.inverse @ np.hstack((theta, rate, by_sum))
+        J[2 * n :] = np.hstack((np.diag(-kp * sum_by_error), np.diag(-sum_by_error), np.diag(sum_by_sum)))
         return J
 
     def linearised(self, t: float, y: Array, g: float) -> Linearised:
         """Rate, drift, and the solver of (I - g J) x = r by elimination: one n x n system for the rates."""
         if not self.held:
             self.hold(y)
-        n, kp, moving = self.positions, self.loops.position, self.moving
+        n, kp = self.positions, self.loops.position
         x, v, _ = y.reshape(3, -1)
         drives = self.loops.drives(t, y)
         by_error, drag, sum_by_error, sum_by_sum = self.loops.slopes(v, drives)
@@ -431,8 +426,7 @@ class ArmEquations:
         pushed = self.contact.linearised(x, v) if self.contact is not None else None
         if pushed is not None:
             springs = g * pushed[1]
-            added = g * (pushed[2] + springs)
-            inner += added if moving.all() else added * np.outer(moving, moving)
+            inner += g * (pushed[2] + springs)
         inverse = np.linalg.inv(inner)
 
         def solve(r: Array) -> Array:
@@ -441,7 +435,7 @@ class ArmEquations:
             torque = fed * third - by_theta * first
             if pushed is not None:
                 torque -= springs @ first
-            rates = inverse @ (self.mass @ second + moving * torque)
+            rates = inverse @ (self.mass @ second + torque)
             return np.concatenate((first + g * rates, rates, leak * (third - back * rates)))
 
         rate = self._rate(v, drives, None if pushed is None else pushed[0])

@@ -248,14 +248,6 @@ class IdealArm:
             limit_permille, speed, torque_permille: see ``DynamicArm.set_loop``.
         """
 
-    def set_brake(self, axis: int, closed: bool) -> None:
-        """Nothing: these motors stand still without a brake.
-
-        Args:
-            axis: from 0.
-            closed: see ``DynamicArm.set_brake``.
-        """
-
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque: inertia, viscous and Coulomb friction of its own joint alone.
 

@@ -122,16 +122,6 @@ class Plant:
         if self.arm is not None:
             self.arm.set_loop(axis, limit_permille, speed, torque_permille)
 
-    def set_brake(self, axis: int, closed: bool) -> None:
-        """Close or open the brake of one drive, see ``DynamicArm.set_brake``; nothing without an arm.
-
-        Args:
-            axis: from 0.
-            closed: from now on.
-        """
-        if self.arm is not None:
-            self.arm.set_brake(axis, closed)
-
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor answers to torque, see ``IdealArm.motor_dynamics``.
 
