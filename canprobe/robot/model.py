@@ -83,6 +83,15 @@ class Body:
     com: Array
     tensor: Array
 
+    def moved(self, T: Array) -> Body:
+        """The same body in another frame.
+
+        Args:
+            T: (4, 4) this frame in the other one, m.
+        """
+        R = T[:3, :3]
+        return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ArmModel:

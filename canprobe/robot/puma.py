@@ -118,7 +118,7 @@ def _bodies(name: str) -> tuple[Body, ...]:
     com[1, 2] -= DH_ROWS[name][1, 2]
     behind = (*chain.fixed[1:], chain.T_last_flange)
     return tuple(
-        Body(mass, T[:3, :3] @ at + T[:3, 3], T[:3, :3] @ np.diag(1e-6 * np.array(tensor)) @ T[:3, :3].T)
+        Body(mass, at, np.diag(1e-6 * np.array(tensor))).moved(T)
         for mass, at, tensor, T in zip(_MASS_KG, com, _INERTIA_KG_MM2, behind, strict=True)
     )
 

@@ -224,9 +224,8 @@ class _Tree:
             raise self.wrong(f"link {link}", "<mass> and <inertia> in its <inertial>", "one of them is missing")
         names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
         tensor = np.array([self._number(f"link {link}", inertia, name, 0.0) for name in names]).reshape(3, 3)
-        T = T @ self._origin(f"link {link}", element.find("origin"))
-        R = T[:3, :3]
-        return Body(self._number(f"link {link}", mass, "value", 0.0), T[:3, 3], R @ tensor @ R.T)
+        body = Body(self._number(f"link {link}", mass, "value", 0.0), np.zeros(3), tensor)
+        return body.moved(T @ self._origin(f"link {link}", element.find("origin")))
 
     def _origin(self, name: str, element: ElementTree.Element | None) -> Array:
         """(4, 4) of an <origin>: roll, pitch and yaw about fixed axes, then the translation."""

@@ -212,5 +212,5 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         ),
         without=tuple(effect for effect in EFFECTS if not getattr(plant, effect)),
         adc_bits=plant.adc_bits,
-        bodies=None if model is None else BODIES[model.name],
+        bodies=None if model is None else BODIES.get(model.name),
     )

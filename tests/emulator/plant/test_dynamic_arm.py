@@ -341,5 +341,5 @@ def test_an_ideal_arm_of_any_kind_follows_too(made):
 
 
 def test_an_arm_without_bodies_has_no_dynamics():
-    with pytest.raises(PlanError, match="arm 'upenn' has no masses and inertias"):
+    with pytest.raises(PlanError, match="the masses of arm 'upenn' are not known"):
         make_arm(replace(config(), bodies=None))
