@@ -32,8 +32,8 @@ def dynamics_problem(name: str, bodies: Sequence[Body | None] | None) -> str | N
     lead = 'plant.fidelity = "dynamic"'
     if bodies is None:
         return (
-            f"{lead}: the masses of arm {name!r} are not known; give its joints mass_kg, com_mm and inertia_kg_m2 (in a "
-            'URDF <inertial>), or set plant.fidelity = "ideal"'
+            f"{lead}: the masses of arm {name!r} are not known; give its joints mass_kg, com_mm and inertia_kg_m2 "
+            '(in a URDF <inertial>), or set plant.fidelity = "ideal"'
         )
     if importlib.util.find_spec("mujoco") is None:
         return f"{lead} needs the package mujoco: pip install 'canprobe[dynamics]'"
