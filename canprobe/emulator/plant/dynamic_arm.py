@@ -121,6 +121,8 @@ class DynamicArm:
         self._stepping, self._step = stepping, STEPS[stepping.method]
         units = joints_to_units(model, q0)
         self._scales = units_per_motor(model)
+        # of a drive that counts backwards negative: its torques are in its own sense
+        self._rated = np.sign(self._scales) * [joint.rated_torque for joint in model.joints]
         self._references = [Reference(c) for c in units.tolist()]
         self._y = equations.resting((units - model.zero_units) / self._scales)
         self._y_ns = 0
@@ -179,7 +181,7 @@ class DynamicArm:
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
             self._torques = y, self.equations.loops.drives(1e-9 * self.t_ns, y).given
-        permille = round(1000.0 * float(self._torques[1][axis]) / self.model.joints[axis].rated_torque)
+        permille = round(1000.0 * float(self._torques[1][axis]) / float(self._rated[axis]))
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
@@ -192,8 +194,10 @@ class DynamicArm:
             torque_permille: added behind the velocity loop.
         """
         self._advance_to(self.t_ns)
-        rated = 1e-3 * self.model.joints[axis].rated_torque
-        self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
+        rated = 1e-3 * float(self._rated[axis])
+        self.equations.loops.set_loop(
+            axis, abs(rated) * limit_permille, speed / self._scales[axis], rated * torque_permille
+        )
         self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
