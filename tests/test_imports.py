@@ -59,6 +59,7 @@ EXTRAS = {
     "bridge/ros2_dds.py": {"cyclonedds"},
     "bridge/view/stage.py": {"viser"},
     "results/picture.py": {"matplotlib"},
+    "robot/dynamics.py": {"mujoco"},
     "results/figures.py": {"matplotlib"},
     "results/surface_figure.py": {"matplotlib"},
 }

@@ -179,6 +179,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         q0=q0,
         fidelity=truth.fidelity,
         dynamics=truth.dynamics,
+        bodies=truth.bodies,
         base_offset_m=_base_offset(setup.arm.model.chain, truth.model.chain, q0, setup.probe.T_flange_probe),
     )
 

@@ -33,6 +33,7 @@ from canprobe.planning.operation import choose_mode, interpolations, operation_p
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
 from canprobe.planning.window import cut_patch
+from canprobe.robot.dynamics import dynamics_problem
 from canprobe.scene.setup import Node, Setup
 
 SYNC_COUNTER = 0x1019
@@ -64,6 +65,10 @@ def make_plan(setup: Setup) -> Plan:
             ways = ways or [*cut.ways]
     joint_speeds, unreachable = check_motion(setup)
     problems += unreachable
+    truth, arm = setup.truth, setup.arm
+    if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):
+        problem = dynamics_problem(arm.model.name, truth.bodies)
+        problems += [problem] if problem is not None else []
     if problems or bus is None:
         raise PlanError(problems, ways)
     absent = left_out(setup)

@@ -2,12 +2,11 @@
 
 - `chain` is the geometry of any serial arm of 1 to 8 joints, revolute or prismatic: poses, Jacobians and velocities
   from one evaluation on plain floats. Chains come from Denavit-Hartenberg rows, or by `urdf` out of a file.
-- `model` puts the joints to a chain (stops, speeds, motors, friction) and how drive units follow from them. `puma` has
-  both geometries of the PUMA 260 as such data.
+- `model` puts the joints to a chain (stops, speeds, motors, friction, bodies) and how drive units follow from them.
+  `puma` has both geometries of the PUMA 260 as such data.
 - `inverse` goes from poses to joints numerically: what n joints can hold of a pose, the joints for a pose from a known
   posture on, damped steps of the Jacobian near singular poses, and postures that put the probe on a surface.
-- `dynamics` has masses, mass matrix and bias torques of the arm with its probe; `straight_line` writes such
-  arithmetic down as one compiled function, which the dynamic plant steps through.
+- `dynamics` has mass matrix and bias torques of an arm with what it carries, computed by MuJoCo.
 - `tool_calibration` finds the probe's centre on the flange from touches of a ball.
 
 Frames are spelled in names: `T_base_flange` takes flange coordinates to base. Joint vectors are rad, of

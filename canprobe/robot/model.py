@@ -70,6 +70,30 @@ class Joint:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Body:
+    """What a joint carries up to the next one, in the frame of the joint.
+
+    Attributes:
+        mass: kg.
+        com: (3,) centre of mass, m.
+        tensor: (3, 3) inertia about it, kg m^2.
+    """
+
+    mass: float
+    com: Array
+    tensor: Array
+
+    def moved(self, T: Array) -> Body:
+        """The same body in another frame.
+
+        Args:
+            T: (4, 4) this frame in the other one, m.
+        """
+        R = T[:3, :3]
+        return Body(self.mass, R @ self.com + T[:3, 3], R @ self.tensor @ R.T)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ArmModel:
     """Geometry, joints and drive units of one arm; compared by identity.
 

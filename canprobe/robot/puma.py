@@ -1,10 +1,11 @@
-"""The PUMA 260 as data: two published geometries with joint ranges, speeds, motors, friction and encoder counts.
+"""The PUMA 260 as data: two published geometries with joint ranges, speeds, motors, friction, encoder counts, bodies.
 
 The geometries disagree by millimetres, which makes their difference a realistic calibration error. Zero positions and
 ranges of the joints follow the UPenn convention in both.
 
 Source: gear ratios and wrist coupling of the PUMA 200 series as used by YARP's Babybot driver; motors and friction of a
-PUMA 560 (Corke & Armstrong-Helouvry 1994) scaled by size; continuous torques of a CRS A255-like arm.
+PUMA 560 (Corke & Armstrong-Helouvry 1994) scaled by size; continuous torques of a CRS A255-like arm. No maker ever
+published the masses of the links: they are the 560's too, lengths times 0.4706 and masses times 0.17.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, from_dh
-from canprobe.robot.model import ArmModel, Joint
+from canprobe.robot.model import ArmModel, Body, Joint
 
 _INCH = 0.0254
 _Q_MIN_DEG = (-180.0, -75.0, -235.0, -580.0, -30.0, -215.0)
@@ -37,6 +38,25 @@ _MOTOR_TURNS = (
     (0.0, 0.0, 0.0, 1.0, -5.6, 31.7692),  # joint 5 that of joint 6
 )
 """Of each motor (row) per turn of each joint (column)."""
+_MASS_KG = (0.0, 2.97, 0.82, 0.140, 0.058, 0.015)
+_COM_MM = (
+    (0.0, 0.0, 0.0),
+    (-171.0, 2.8, -107.0),  # z is counted from joint 1's axis: the 560's, mirrored
+    (-9.6, 6.6, 33.0),  # y mirrored
+    (0.0, 8.9, 0.0),
+    (0.0, 0.0, 0.0),
+    (0.0, 0.0, 15.0),
+)
+"""In the frames of standard Denavit-Hartenberg rows, which lie behind the links; of link 2 z as noted."""
+_INERTIA_KG_MM2 = (
+    (0.0, 13180.0, 0.0),
+    (4890.0, 19730.0, 20290.0),
+    (2480.0, 3240.0, 470.0),
+    (68.0, 49.0, 68.0),
+    (11.0, 15.0, 11.0),
+    (5.6, 5.6, 1.5),
+)
+"""About the centres of mass, along the axes of the same frames."""
 
 
 def _dh_rows(*, a2: float, a3: float, d2: float, d3: float, d6: float) -> Array:
@@ -90,3 +110,18 @@ def dh_rows(model: ArmModel) -> Array:
     if puma is None or not np.array_equal(puma.chain.fixed, model.chain.fixed):
         raise PlanError([f"arm {model.name!r}: expected a PUMA 260 ({', '.join(MODELS)}) here"])
     return DH_ROWS[model.name]
+
+
+def _bodies(name: str) -> tuple[Body, ...]:
+    """The links in the frames of their joints; how the geometry splits the shoulder's offset does not move link 2."""
+    chain, com = MODELS[name].chain, 1e-3 * np.array(_COM_MM)
+    com[1, 2] -= DH_ROWS[name][1, 2]
+    behind = (*chain.fixed[1:], chain.T_last_flange)
+    return tuple(
+        Body(mass, at, np.diag(1e-6 * np.array(tensor))).moved(T)
+        for mass, at, tensor, T in zip(_MASS_KG, com, _INERTIA_KG_MM2, behind, strict=True)
+    )
+
+
+BODIES: Mapping[str, tuple[Body, ...]] = MappingProxyType({name: _bodies(name) for name in MODELS})
+"""Bodies of the bare arm by the name of the geometry."""

@@ -19,26 +19,11 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, Chain
-from canprobe.robot.model import Joint
+from canprobe.robot.model import Body, Joint
 
 CONTINUOUS_RAD = 2 * math.pi
 """Stops of a continuous joint to either side: it has none itself, but cables and the counts of a drive have."""
 _MOVING = {"revolute", "continuous", "prismatic"}
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Body:
-    """What a joint carries up to the next one, in the frame of the joint.
-
-    Attributes:
-        mass: kg.
-        com: (3,) centre of mass, m.
-        tensor: (3, 3) inertia about it, kg m^2.
-    """
-
-    mass: float
-    com: Array
-    tensor: Array
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -253,9 +238,8 @@ class _Tree:
             raise self.wrong(f"link {link}", "<mass> and <inertia> in its <inertial>", "one of them is missing")
         names = ("ixx", "ixy", "ixz", "ixy", "iyy", "iyz", "ixz", "iyz", "izz")
         tensor = np.array([self._number(f"link {link}", inertia, name, 0.0) for name in names]).reshape(3, 3)
-        T = T @ self._origin(f"link {link}", element.find("origin"))
-        R = T[:3, :3]
-        return Body(self._number(f"link {link}", mass, "value", 0.0), T[:3, 3], R @ tensor @ R.T)
+        body = Body(self._number(f"link {link}", mass, "value", 0.0), np.zeros(3), tensor)
+        return body.moved(T @ self._origin(f"link {link}", element.find("origin")))
 
     def _origin(self, name: str, element: ElementTree.Element | None) -> Array:
         """(4, 4) of an <origin>: roll, pitch and yaw about fixed axes, then the translation."""

@@ -13,12 +13,12 @@ import numpy as np
 
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, Chain, dh_step, from_dh
-from canprobe.robot.model import ArmModel, Joint
-from canprobe.robot.urdf import Body, UrdfArm, from_urdf
+from canprobe.robot.model import ArmModel, Body, Joint
+from canprobe.robot.urdf import UrdfArm, from_urdf
 from canprobe.scene.geometry import transform
 from canprobe.scene.hardware import ArmSettings, JointSettings
 
-Bodies = tuple[Body | None, ...]
+Bodies = tuple[Body | None, ...] | None
 
 _MM = 1e-3
 _OF_REVOLUTE = {
@@ -44,7 +44,7 @@ _PRISMATIC_DEFAULTS = {"rated_torque": 200.0, "rotor_inertia": 5.0, "coulomb": 2
 
 
 def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]) -> tuple[ArmModel, Bodies]:
-    """The arm of a cell, and the bodies of its links, None for one of unknown mass.
+    """The arm of a cell, and the bodies of its links; None where masses are not known.
 
     Args:
         name: of the cell.
@@ -60,7 +60,7 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
         _refuse_other_names(found, sections, arm)
         chain = _moved(found.chain, mount, flange)
         joints = [_joint(section, joint) for section, joint in zip(sections.values(), found.joints, strict=True)]
-        bodies = found.bodies
+        bodies: Bodies = found.bodies if any(found.bodies) else None
     else:
         rows = [
             (s.a_mm * _MM, math.radians(s.alpha_deg), s.d_mm * _MM, math.radians(s.theta_deg))
@@ -77,7 +77,9 @@ def arm_model(name: str, arm: ArmSettings, sections: Mapping[str, JointSettings]
             T_last_flange=flange,
         )
         joints = [_joint(section, _bare(joint, section)) for joint, section in sections.items()]
-        bodies = tuple(_body(section, place, arm) for section, place in zip(sections.values(), rows, strict=True))
+        known = all(section.mass_kg is not None for section in sections.values())
+        each = zip(sections.values(), rows, strict=True)
+        bodies = tuple(_body(section, row, arm) for section, row in each) if known else None
     model = ArmModel(chain, tuple(joints), _units_per_q(sections), np.array([s.zero_counts for s in sections.values()]))
     return model, bodies
 
@@ -125,15 +127,13 @@ def _units_per_q(sections: Mapping[str, JointSettings]) -> Array:
     return scaled
 
 
-def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body | None:
+def _body(section: JointSettings, row: tuple[float, float, float, float], arm: ArmSettings) -> Body:
     """The link behind a joint, in the frame of the joint; a row gives it in the frame that the row leads to."""
-    if section.mass_kg is None:
-        return None
     T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
     xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
     tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
     R = T[:3, :3]
-    return Body(section.mass_kg, R @ (np.array(section.com_mm) * _MM) + T[:3, 3], R @ tensor @ R.T)
+    return Body(section.mass_kg or 0.0, R @ (np.array(section.com_mm) * _MM) + T[:3, 3], R @ tensor @ R.T)
 
 
 def start_posture(sections: Mapping[str, JointSettings]) -> Array:

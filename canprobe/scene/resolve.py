@@ -217,7 +217,7 @@ def _shape(settings: ShapeSettings) -> Shape:
 def _true_arm(scene: Scene, arm: Arm | None) -> tuple[ArmModel | None, Bodies]:
     """The arm that is emulated, and the bodies of its links."""
     if scene.arm is None or arm is None:
-        return None, ()
+        return None, None
     other = scene.plant.true_cell if scene.plant is not None else None
     if other is None:
         return arm.model, arm_model(scene.cell.name, scene.arm, scene.joints)[1]

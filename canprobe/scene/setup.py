@@ -19,9 +19,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.robot.model import ArmModel
+from canprobe.robot.model import ArmModel, Body
 from canprobe.robot.tool_calibration import BallApproach
-from canprobe.robot.urdf import Body
 from canprobe.scene.hardware import Auto
 from canprobe.scene.model import (
     BridgeSettings,
@@ -353,7 +352,6 @@ class Truth:
     Attributes:
         object: None where nothing can be touched.
         model: the arm; None without one.
-        bodies: of its links, None for one of unknown mass; for a dynamic arm.
         T_flange_probe: (4, 4) of the probe's centre.
         stiffness: K/h of its layer, N/m³.
         damping: Hunt–Crossley α, s/m.
@@ -362,11 +360,11 @@ class Truth:
         dynamics: of a dynamic arm.
         without: effects of the array that are switched off.
         adc_bits: of the array.
+        bodies: (n,) of the joints, without the probe; None where nobody knows them, which refuses "dynamic".
     """
 
     object: PlacedShape | None
     model: ArmModel | None
-    bodies: tuple[Body | None, ...]
     T_flange_probe: Floats
     stiffness: float
     damping: float
@@ -375,6 +373,7 @@ class Truth:
     dynamics: Dynamics
     without: tuple[str, ...]
     adc_bits: int
+    bodies: tuple[Body | None, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -28,12 +28,11 @@ from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.dynamic_arm import DynamicArm, Stepping, make_equations
 from canprobe.emulator.plant.plant import Plant, PlantState
 from canprobe.emulator.plant.probe import depth_for_force
-from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.results.picture import AMBER, BLUE, GREEN, GREY, INK, ORANGE, PINK, SHADE, legend, log_scale, picture
 from canprobe.robot.chain import tool_z_offset
 from canprobe.robot.inverse import inverse_near, probe_pose, start_posture
 from canprobe.robot.model import joints_to_units, units_per_motor, units_to_joints
-from canprobe.robot.puma import UPENN
+from canprobe.robot.puma import BODIES, UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.studies.harness import Array, Column, Row, StudyResult, measuring_facts
 from canprobe.studies.sweep import Sweep
@@ -58,9 +57,6 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
     shape = make_object("cylinder", T_base_object=pose, radius=_RADIUS)
     depth = depth_for_force(FORCE_N, (1.0 / _RADIUS, 0.0), 0.040, stiffness_n_m3)
     q = start_posture(UPENN, _POINT, (0, 0, 1), _NEAR, radius_m=0.040, T_flange_probe=_TOOL, clearance_m=-depth)
-    config = PlantConfig(
-        UPENN, q, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=TaxelConfig()
-    )
     targets = []
     for k in range(cycles + 1):
         turn = SPEED_M_S * k * CYCLE_NS * 1e-9 / _RADIUS
@@ -71,7 +67,7 @@ def trial(stiffness_n_m3: float, cycles: int) -> tuple[PlantConfig, Array]:
     counts = np.array(targets)
     start = units_to_joints(UPENN, counts[0])  # a posture that the encoders can hold
     return PlantConfig(
-        UPENN, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", taxels=config.taxels
+        UPENN, start, object=shape, stiffness_n_m3=stiffness_n_m3, fidelity="dynamic", bodies=BODIES["upenn"]
     ), counts
 
 
@@ -119,7 +115,7 @@ def reference(stiffness_n_m3: float, cycles: int, rtol: float) -> Array:
     y = equations.resting(targets[0] / scale)
     for k in range(cycles):
         slope = (targets[k + 1] - targets[k]) / scale / h
-        equations.loops.set_reference(k * h, (targets[k] / scale).tolist(), slope.tolist())
+        equations.loops.set_reference(k * h, targets[k] / scale, slope)
         solved = solve_ivp(
             equations.rate, (k * h, (k + 1) * h), y, "Radau", rtol=rtol, atol=1e-2 * rtol, jac=equations.jacobian
         )

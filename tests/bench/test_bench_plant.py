@@ -1,6 +1,6 @@
 """Costs of the plant's inner calls. Run with --benchmark-only; skipped by default.
 
-Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150, a dynamic cycle 300.
+Goals on an idle machine: forward 10 us, Jacobian 25, advance 15, truth 40, image 150, a dynamic cycle 1000.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import TaxelArray, TaxelConfig
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
-from canprobe.robot.dynamics import RigidBody, puma260_inertia
+from canprobe.robot.dynamics import RigidBody
 from canprobe.robot.inverse import damped_step, inverse_near, start_posture
-from canprobe.robot.puma import UPENN
+from canprobe.robot.puma import BODIES, UPENN
 from canprobe.touch.objects import make_object
 
 POINT, TOOL = np.array((-0.120, -0.1225, 0.374)), tool_z_offset(80.0)
@@ -26,7 +26,7 @@ SHAPES = {"cylinder": {"radius": 0.036}, "saddle": {"radius_x": 0.06, "radius_y"
 def plant_of(fidelity):
     q0 = start_posture(UPENN, POINT, (0, 0, 1), ELBOW_FORM, radius_m=0.04, T_flange_probe=TOOL, clearance_m=-0.43e-3)
     shape = make_object("cylinder", T_base_object=POSE, radius=0.036)
-    return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity))
+    return Plant(PlantConfig(UPENN, q0, object=shape, fidelity=fidelity, bodies=BODIES["upenn"]))
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_bench_advance_one_cycle(benchmark, plant):
 
 
 def test_bench_rigid_body(benchmark):
-    benchmark(RigidBody(UPENN, puma260_inertia(UPENN)).terms, ELBOW_FORM, np.ones(6))
+    benchmark(RigidBody(UPENN.chain, BODIES["upenn"]).terms, ELBOW_FORM, np.ones(6))
 
 
 def test_bench_dynamic_cycle_in_contact(benchmark):

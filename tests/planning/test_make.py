@@ -3,13 +3,16 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 from scenes import change
 
 import canprobe
+from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
 from canprobe.scene.load import load_scene, packaged_scenes
+from canprobe.scene.resolve import resolve
 
 
 @pytest.mark.parametrize(
@@ -132,3 +135,19 @@ def test_help_imports_not_even_numpy():
         "sys.exit(len({'numpy', 'can'} & set(sys.modules)))"
     )
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"bodies": None}, r"the masses of arm 'upenn' are not known; give .* or set plant.fidelity = \"ideal\""),
+        ({}, r"pip install 'canprobe\[dynamics\]'"),
+    ],
+    ids=["no bodies", "no extra"],
+)
+def test_a_dynamic_arm_that_cannot_be_emulated_is_refused(monkeypatch, changes, match):
+    setup = resolve(load_scene("cylinder"))
+    setup = replace(setup, truth=replace(setup.truth, fidelity="dynamic", **changes))
+    monkeypatch.setattr("canprobe.robot.dynamics.importlib.util.find_spec", lambda name: None)
+    with pytest.raises(canprobe.PlanError, match=match):
+        make_plan(setup)

@@ -1,112 +1,135 @@
-"""Rigid-body dynamics against MuJoCo, a potential, and the published weight torques."""
+"""Rigid-body dynamics against Pinocchio, closed forms, a potential, and the published weight torques."""
 
-import mujoco
+import math
+import sys
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from canprobe.robot.chain import forward_jacobian, tool_z_offset
-from canprobe.robot.dynamics import LinkInertia, RigidBody, ball_inertia, puma260_inertia
-from canprobe.robot.puma import MODELS, UPENN, dh_rows
+from canprobe.errors import PlanError
+from canprobe.robot.chain import forward, from_dh, link_transforms, tool_z_offset
+from canprobe.robot.dynamics import RigidBody, ball, dynamics_problem, joined
+from canprobe.robot.model import Body
+from canprobe.robot.puma import BODIES, MODELS, UPENN, dh_rows
 
 TOOL = tool_z_offset(80.0)
 BOTH = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 HORIZONTAL = np.radians((0.0, 0.0, -90.0, 0.0, 0.0, 0.0))
+SLIDING = {"six": "......", "seven": ".......", "gantry": "___", "mixed": "._.._.._", "one": ".", "slide": "_"}
+"""Joints by the name of an arm: . turns, _ slides."""
 
 
-def random_links(seed):
-    """Bodies that could exist: tensors of point clouds."""
-    rng = np.random.default_rng(seed)
-    clouds = rng.normal(0.0, 0.05, (6, 30, 3))
-    tensors = [np.eye(3) * (c * c).sum() - c.T @ c for c in clouds]
-    return LinkInertia(rng.uniform(0.1, 3.0, 6), rng.normal(0.0, 0.1, (6, 3)), 0.01 * np.array(tensors))
+def solid(rng):
+    """A body that could exist: its tensor is that of a cloud of points."""
+    cloud = rng.normal(0.0, 0.05, (30, 3))
+    tensor = 0.01 * (np.eye(3) * (cloud * cloud).sum() - cloud.T @ cloud)
+    return Body(rng.uniform(0.1, 3.0), rng.normal(0.0, 0.1, 3), tensor)
 
 
-def denavit_hartenberg(q, a, alpha, d):
-    c, s, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
-    return np.array(((c, -s * ca, s * sa, a * c), (s, c * ca, -c * sa, a * s), (0, sa, ca, d), (0, 0, 0, 1)))
+def random_arm(name):
+    """Any geometry, and bodies."""
+    rng, kinds = np.random.default_rng(len(name)), SLIDING[name]
+    chain = from_dh(0.4 * rng.normal(size=(len(kinds), 4)), name=name, prismatic=[kind == "_" for kind in kinds])
+    return chain, [solid(rng) for _ in kinds]
 
 
-def in_mujoco(model, links):
-    """The same arm for MuJoCo: a body frame is the Denavit-Hartenberg frame before, turned by the joint."""
-    words = lambda values: " ".join(repr(float(v)) for v in values)  # noqa: E731
-    pose, bodies = "", ""
-    for (a, alpha, d), mass, com, tensor in zip(
-        dh_rows(model)[:, :3], links.mass, links.com, links.tensor, strict=True
-    ):
-        c, s = np.cos(alpha), np.sin(alpha)
-        R = np.array(((1, 0, 0), (0, c, -s), (0, s, c)))
-        T = R @ tensor @ R.T
-        six = (T[0, 0], T[1, 1], T[2, 2], T[0, 1], T[0, 2], T[1, 2])
-        at = words(np.array((a, 0, d)) + R @ com)
-        bodies += f'<body {pose}><joint axis="0 0 1"/><inertial pos="{at}" mass="{mass}" fullinertia="{words(six)}"/>'
-        pose = f'pos="{words((a, 0, d))}" quat="{words((np.cos(alpha / 2), np.sin(alpha / 2), 0, 0))}"'
-    text = f'<mujoco><option gravity="0 0 -9.81"/><worldbody>{bodies}<site {pose}/>{"</body>" * 6}</worldbody></mujoco>'
-    made = mujoco.MjModel.from_xml_string(text)
-    return made, mujoco.MjData(made)
+class Pinocchio:
+    """The same arm there: its joints turn about, or slide along, the z axes of their own frames too."""
+
+    def __init__(self, chain, bodies):
+        self.pin = pin = pytest.importorskip("pinocchio")
+        self.model, joint = pin.Model(), 0
+        for T, slides, body, name in zip(chain.fixed, chain.prismatic, bodies, chain.joints, strict=True):
+            kind = pin.JointModelPZ() if slides else pin.JointModelRZ()
+            joint = self.model.addJoint(joint, kind, pin.SE3(T), name)
+            if body is not None:
+                self.model.appendBodyToJoint(joint, pin.Inertia(body.mass, body.com, body.tensor), pin.SE3.Identity())
+        self.model.gravity.linear = np.array((0.0, 0.0, -9.81))
+        self.data = self.model.createData()
+
+    def terms(self, q, qd):
+        upper = np.triu(self.pin.crba(self.model, self.data, q))
+        return upper + np.triu(upper, 1).T, self.pin.nonLinearEffects(self.model, self.data, q, qd)
 
 
-@BOTH
-@pytest.mark.parametrize("seed", range(3))
-def test_mass_matrix_and_bias_are_those_of_mujoco(model, seed):
-    links = random_links(seed)
-    made, data = in_mujoco(model, links)
-    body, rng = RigidBody(model, links), np.random.default_rng(100 + seed)
-    for q, qd in rng.uniform(-3.0, 3.0, (20, 2, 6)):
-        data.qpos[:], data.qvel[:] = q, qd
-        mujoco.mj_forward(made, data)
-        columns = np.zeros((6, 6))
-        for column, unit in zip(columns, np.eye(6), strict=True):
-            mujoco.mj_mulM(made, data, column, unit)
+def agree(chain, bodies, seed=0):
+    body, oracle, rng = RigidBody(chain, bodies), Pinocchio(chain, bodies), np.random.default_rng(100 + seed)
+    for q, qd in rng.uniform(-3.0, 3.0, (20, 2, chain.n)):
         mass, bias = body.terms(q, qd)
-        assert mass == pytest.approx(columns, abs=1e-10)
-        assert bias == pytest.approx(data.qfrc_bias, abs=1e-10)
+        expected_mass, expected_bias = oracle.terms(q, qd)
+        assert mass == pytest.approx(expected_mass, rel=1e-10, abs=1e-10)
+        assert bias == pytest.approx(expected_bias, rel=1e-10, abs=1e-10)
+
+
+@pytest.mark.parametrize("name", SLIDING)
+def test_mass_matrix_and_bias_are_those_of_pinocchio(name):
+    agree(*random_arm(name))
 
 
 @BOTH
-def test_pose_and_jacobian_are_those_of_mujoco(model):
-    made, data = in_mujoco(model, random_links(0))
-    rng = np.random.default_rng(1)
-    for q in rng.uniform(-3.0, 3.0, (20, 6)):
-        data.qpos[:] = q
-        mujoco.mj_forward(made, data)
-        T, J = forward_jacobian(model.chain, q, np.eye(4))
-        linear, angular = np.zeros((3, 6)), np.zeros((3, 6))
-        mujoco.mj_jacSite(made, data, linear, angular, 0)
-        assert T[:3, 3] == pytest.approx(data.site_xpos[0], abs=1e-10)
-        assert T[:3, :3] == pytest.approx(data.site_xmat[0].reshape(3, 3), abs=1e-10)
-        assert pytest.approx(np.vstack((linear, angular)), abs=1e-10) == J
+def test_so_are_those_of_a_published_table_that_no_solid_could_have(model):
+    """Link 1 has no mass and turns about one axis only."""
+    agree(model.chain, BODIES[model.name])
+
+
+@pytest.mark.parametrize("name", SLIDING)
+def test_joints_may_carry_nothing(name):
+    chain, bodies = random_arm(name)
+    agree(chain, [*bodies[:-1], None])
+    agree(chain, [None] * chain.n)
+
+
+def test_a_pendulum_and_a_lift_are_the_closed_forms():
+    upright = np.eye(4)
+    upright[:3, :3] = np.array(((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)))  # z along base x
+    pendulum = from_dh(np.zeros((1, 4)), T_base_mount=upright)
+    body = Body(2.0, np.array((0.3, 0.0, 0.0)), np.diag((0.01, 0.02, 0.03)))
+    mass, bias = RigidBody(pendulum, [body]).terms([0.4], [1.0])
+    assert mass == pytest.approx(0.03 + 2.0 * 0.3**2)
+    assert bias == pytest.approx(2.0 * 9.81 * 0.3 * math.cos(0.4))
+    lift = from_dh(np.zeros((1, 4)), prismatic=[True])
+    mass, bias = RigidBody(lift, [body]).terms([0.4], [1.0])
+    assert (mass[0, 0], bias[0]) == pytest.approx((2.0, 2.0 * 9.81))
 
 
 def test_weight_of_the_horizontal_arm_is_the_published_one():
-    links = puma260_inertia(UPENN)
-    loaded = links.with_payload(0.3, TOOL, ball_inertia(0.3, 0.04))
-    bare = RigidBody(UPENN, links).gravity(HORIZONTAL)[1]
+    links = BODIES["upenn"]
+    load = ball(0.3, 0.04, (UPENN.chain.T_last_flange @ TOOL)[:3, 3])
+    bare = RigidBody(UPENN.chain, links).gravity(HORIZONTAL)[1]
     assert bare == pytest.approx(3.7, abs=0.05)
-    assert RigidBody(UPENN, loaded).gravity(HORIZONTAL)[1] - bare == pytest.approx(1.6, abs=0.05)
+    loaded = RigidBody(UPENN.chain, (*links[:-1], joined(links[-1], load))).gravity(HORIZONTAL)[1]
+    assert loaded - bare == pytest.approx(1.6, abs=0.05)
 
 
-@BOTH
-def test_gravity_is_the_slope_of_the_height(model):
-    links = puma260_inertia(model)
-    body, q = RigidBody(model, links), np.random.default_rng(3).uniform(-2.0, 2.0, 6)
+@pytest.mark.parametrize("name", SLIDING)
+def test_gravity_is_the_slope_of_the_height(name):
+    chain, bodies = random_arm(name)
+    q = np.random.default_rng(3).uniform(-2.0, 2.0, chain.n)
 
     def potential(q):
-        T, heights = np.eye(4), []
-        for angle, row, com in zip(q, dh_rows(model)[:, :3], links.com, strict=True):
-            T = T @ denavit_hartenberg(angle, *row)
-            heights.append(T[2, :3] @ com + T[2, 3])
-        return 9.81 * float(links.mass @ heights)
+        """Each body hangs on the end of a shorter arm, whose last link ends in the body's centre of mass."""
+        height = 0.0
+        for i, body in enumerate(bodies):
+            T = np.eye(4)
+            T[:3, 3] = body.com
+            short = replace(
+                chain, joints=chain.joints[: i + 1], prismatic=chain.prismatic[: i + 1], fixed=chain.fixed[: i + 1],
+                T_last_flange=T,
+            )  # fmt: skip
+            height += body.mass * forward(short, q[: i + 1])[2, 3]
+        return 9.81 * height
 
-    h = 1e-6 * np.eye(6)
-    slope = [(potential(q + d) - potential(q - d)) / 2e-6 for d in h]
-    assert body.gravity(q) == pytest.approx(slope, abs=1e-8)
+    slope = [(potential(q + d) - potential(q - d)) / 2e-6 for d in 1e-6 * np.eye(chain.n)]
+    assert RigidBody(chain, bodies).gravity(q) == pytest.approx(slope, abs=1e-6)
 
 
-@BOTH
-def test_kinetic_energy_changes_by_the_power_of_the_torques(model):
+@pytest.mark.parametrize("name", SLIDING)
+def test_kinetic_energy_changes_by_the_power_of_the_torques(name):
     """Coriolis torques do no work: d/dt (v'Mv / 2) = v'(M a + b - g)."""
-    body, rng = RigidBody(model, puma260_inertia(model)), np.random.default_rng(4)
-    q, v, a = rng.uniform(-1.0, 1.0, (3, 6))
+    chain, bodies = random_arm(name)
+    body, rng = RigidBody(chain, bodies), np.random.default_rng(4)
+    q, v, a = rng.uniform(-1.0, 1.0, (3, chain.n))
     mass, bias = body.terms(q, v)
 
     def energy(t):
@@ -114,27 +137,32 @@ def test_kinetic_energy_changes_by_the_power_of_the_torques(model):
         return 0.5 * vt @ body.terms(qt, vt)[0] @ vt
 
     power = v @ (mass @ a + bias - body.gravity(q))
-    assert (energy(1e-5) - energy(-1e-5)) / 2e-5 == pytest.approx(power, rel=1e-7)
-
-
-def test_a_payload_is_the_same_as_a_heavier_link():
-    """Two halves of a body fixed one after the other are the body."""
-    links, tensor = puma260_inertia(UPENN), np.diag((1e-3, 2e-3, 2.5e-3))
-    whole = links.with_payload(0.4, TOOL, tensor)
-    halves = links.with_payload(0.2, TOOL, tensor / 2).with_payload(0.2, TOOL, tensor / 2)
-    q = np.ones(6)
-    for one, other in zip(RigidBody(UPENN, whole).terms(q, q), RigidBody(UPENN, halves).terms(q, q), strict=True):
-        assert one == pytest.approx(other, abs=1e-14)
+    assert (energy(1e-5) - energy(-1e-5)) / 2e-5 == pytest.approx(power, rel=1e-6, abs=1e-9)
 
 
 @BOTH
-def test_along_other_coordinates_powers_are_the_same(model):
-    """q = B x: x'Mx' is the same energy, and b along x is B'b; rotors add theirs, weightless arms have none of it."""
-    body, rng = RigidBody(model, random_links(5)), np.random.default_rng(5)
-    B, x, xd, rotors = np.tril(rng.normal(size=(6, 6))), *rng.normal(size=(2, 6)), rng.uniform(0.1, 1.0, 6)
-    mass, bias = body.terms(B @ x, B @ xd)
-    along, along_bias = body.along(B, rotors.tolist()).terms(x, xd)
-    assert along == pytest.approx(B.T @ mass @ B + np.diag(rotors), rel=1e-12)
-    assert along_bias == pytest.approx(B.T @ bias, rel=1e-12)
-    light = body.along(B, rotors.tolist(), weight=False).terms(x, xd)[1]
-    assert light == pytest.approx(B.T @ (bias - body.gravity(B @ x)), rel=1e-10)
+def test_bodies_of_the_puma_stand_where_its_denavit_hartenberg_frames_put_them(model):
+    """Link 2's centre of mass lies 107 mm beside joint 1's axis, however the geometry splits that offset."""
+    at = link_transforms(model.chain, np.zeros(6))[0]
+    com = at[:3, :3] @ BODIES[model.name][1].com + at[:3, 3]
+    assert com[1] == pytest.approx(0.107, abs=1e-12)
+    assert com[0] == pytest.approx(float(dh_rows(model)[1, 0]) - 0.171, abs=1e-12)
+
+
+def test_halves_joined_are_the_whole():
+    whole = ball(0.4, 0.1, np.array((0.1, 0.2, 0.3)))
+    half = Body(0.2, whole.com, whole.tensor / 2)
+    two = joined(joined(None, half), half)
+    assert (two.mass, *two.com, *two.tensor.ravel()) == pytest.approx((0.4, *whole.com, *whole.tensor.ravel()))
+    apart = joined(Body(1.0, np.zeros(3), np.zeros((3, 3))), Body(3.0, np.array((0.4, 0.0, 0.0)), np.zeros((3, 3))))
+    assert apart.com == pytest.approx((0.3, 0.0, 0.0))
+    assert apart.tensor == pytest.approx(np.diag((0.0, 0.12, 0.12)))
+
+
+def test_what_is_missing_is_said_with_what_to_type(monkeypatch):
+    assert dynamics_problem("gantry", (None, None, None)) is None
+    assert 'plant.fidelity = "ideal"' in dynamics_problem("gantry", None)
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(PlanError, match=r"pip install 'canprobe\[dynamics\]'"):
+        RigidBody(UPENN.chain, BODIES["upenn"])

@@ -2,9 +2,9 @@
 
 `plant.Plant` is asked for motor positions, torques and images at an instant, and moves itself there.
 
-- `ideal_arm`: each drive is a second-order system, solved exactly. `dynamic_arm`: rigid links, friction, drive
-  cascade and the object's push, by `equations` and a choice of integrators; `held_step` is the default step on
-  dynamics held over a cycle, `pushing` the contact forces near one posture.
+- Both arms have 1 to 8 joints that turn or slide. `ideal_arm`: each drive is a second-order system, solved exactly.
+  `dynamic_arm`: rigid links, friction, drive cascade and the object's push, by `equations` and a choice of integrators
+  on dynamics held over a cycle; `pushing` is the contact forces near one posture.
 - `probe` is the elastic layer on an object (Winkler, Hunt–Crossley damping, regularised friction).
 - `taxels` makes counts of pressure: blur, gains, saturation, hysteresis, creep, crosstalk, noise, quantisation.
 - `config` says what a plant is made of.

@@ -8,7 +8,7 @@ import numpy as np
 
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.robot.chain import Array, tool_z_offset
-from canprobe.robot.model import ArmModel
+from canprobe.robot.model import ArmModel, Body
 from canprobe.scene.setup import Dynamics, Fidelity
 from canprobe.touch.shapes import PlacedShape
 
@@ -48,6 +48,7 @@ class PlantConfig:
         fidelity: "ideal": each motor is a second-order system; "dynamic": rigid links, friction, drive cascade, push
             of the object.
         dynamics: of a dynamic arm.
+        bodies: (n,) of its joints, without the probe; None where nobody knows them.
         base_offset_m: (3,) of the arm's base in the frame that counts as base.
     """
 
@@ -65,4 +66,5 @@ class PlantConfig:
     seed: int = 0
     fidelity: Fidelity = "ideal"
     dynamics: Dynamics = field(default_factory=Dynamics)
+    bodies: tuple[Body | None, ...] | None = None
     base_offset_m: Array = field(default_factory=lambda: np.zeros(3))

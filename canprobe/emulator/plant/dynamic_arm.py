@@ -14,10 +14,12 @@ import numpy as np
 import numpy.typing as npt
 
 from canprobe.emulator.plant.config import PlantConfig
-from canprobe.emulator.plant.equations import STEPS, ArmEquations, Effects, State, rosenbrock2
-from canprobe.emulator.plant.held_step import held_rosenbrock2
+from canprobe.emulator.plant.equations import STEPS, ArmEquations, DriveLoops, Effects
 from canprobe.emulator.plant.ideal_arm import PEAK_PERMILLE, IdealArm, MotorDynamics
+from canprobe.emulator.plant.pushing import Neighbourhood, Rubbing
+from canprobe.errors import PlanError
 from canprobe.robot.chain import Array
+from canprobe.robot.dynamics import GRAVITY_M_S2, RigidBody, ball, dynamics_problem, joined
 from canprobe.robot.model import ArmModel, joints_per_motor, joints_to_units, units_per_motor, units_to_joints
 
 # What a drive is asked for: straight ramps of counts, one after the other, each holding its end.
@@ -103,11 +105,11 @@ class Stepping:
 
 
 class DynamicArm:
-    """Six motors that drive the arm's links.
+    """The n motors that drive the arm's links.
 
     Args:
         model: the arm's geometry.
-        q0: (6,) joint angles at time 0, at rest, rad.
+        q0: (n,) joint positions at time 0, at rest, rad or m.
         equations: of motion.
         stepping: how they are integrated.
     """
@@ -117,16 +119,17 @@ class DynamicArm:
         self.equations = equations
         self.t_ns = 0
         self._stepping, self._step = stepping, STEPS[stepping.method]
-        scale, units = units_per_motor(model), joints_to_units(model, q0)
-        self._scales: list[float] = scale.tolist()
-        self._zeros: list[float] = model.zero_units.tolist()
+        units = joints_to_units(model, q0)
+        self._scales = units_per_motor(model)
+        # of a drive that counts backwards negative: its torques are in its own sense
+        self._rated = np.sign(self._scales) * [joint.rated_torque for joint in model.joints]
         self._references = [Reference(c) for c in units.tolist()]
-        self._y: State = equations.resting((units - model.zero_units) / scale).tolist()
+        self._y = equations.resting((units - model.zero_units) / self._scales)
         self._y_ns = 0
         self._hold_ns = -stepping.hold_ns
         self._bend_ns = 0
-        self._now: tuple[int, State] | None = None
-        self._torques: tuple[State, list[float]] | None = None
+        self._now: tuple[int, Array] | None = None
+        self._torques: tuple[Array, Array] | None = None
         self._bend()
 
     def set_ramp(self, axis: int, start_counts: float, end_counts: float, t0_ns: int, t1_ns: int) -> None:
@@ -146,19 +149,18 @@ class DynamicArm:
         self.t_ns = max(self.t_ns, t_ns)
 
     def motors(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Positions (counts) and rates (counts/s) of the six motors now."""
-        y = self._state()
-        positions = tuple([x * scale + zero for x, scale, zero in zip(y[:6], self._scales, self._zeros, strict=True)])
-        return positions, tuple([v * scale for v, scale in zip(y[6:12], self._scales, strict=True)])
+        """Positions (counts) and rates (counts/s) of the motors now."""
+        x, v, _ = self._state().reshape(3, -1)
+        return tuple((x * self._scales + self.model.zero_units).tolist()), tuple((v * self._scales).tolist())
 
     @property
     def q(self) -> Array:
-        """(6,) joint angles now, rad."""
+        """(n,) joint positions now, rad or m."""
         return units_to_joints(self.model, self.motors()[0])
 
     @property
     def qd(self) -> Array:
-        """(6,) joint rates now, rad/s."""
+        """(n,) joint rates now, rad/s or m/s."""
         rates: Array = self.model.q_per_unit @ np.array(self.motors()[1])
         return rates
 
@@ -166,50 +168,52 @@ class DynamicArm:
         """Position of one motor now, counts, continuous.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
-        return self._state()[axis] * self._scales[axis] + self._zeros[axis]
+        return float(self._state()[axis] * self._scales[axis] + self.model.zero_units[axis])
 
     def torque_permille(self, axis: int) -> int:
         """Torque of one motor over its continuous limit, as a drive reports it (6077h).
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
         y = self._state()
         if self._torques is None or self._torques[0] is not y:
-            self._torques = y, self.equations.torque(1e-9 * self.t_ns, y)
-        permille = round(1000.0 * self._torques[1][axis] / self.model.joints[axis].rated_torque)
+            self._torques = y, self.equations.loops.drives(1e-9 * self.t_ns, y).given
+        permille = round(1000.0 * float(self._torques[1][axis]) / float(self._rated[axis]))
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))
 
     def set_loop(self, axis: int, limit_permille: int, speed: float, torque_permille: float) -> None:
         """Torque limit and feed-forwards of one drive from now on.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
             limit_permille: largest torque, of the continuous torque; the configured limit if that is less.
             speed: counts/s added behind the position loop.
             torque_permille: added behind the velocity loop.
         """
         self._advance_to(self.t_ns)
-        rated = 1e-3 * self.model.joints[axis].rated_torque
-        self.equations.loops.set_loop(axis, rated * limit_permille, speed / self._scales[axis], rated * torque_permille)
+        rated = 1e-3 * float(self._rated[axis])
+        self.equations.loops.set_loop(
+            axis, abs(rated) * limit_permille, speed / self._scales[axis], rated * torque_permille
+        )
         self._torques = None
 
     def motor_dynamics(self, axis: int) -> MotorDynamics:
         """How one motor would answer to torque alone: its own inertia and friction, without the links.
 
         Args:
-            axis: 0 to 5.
+            axis: from 0.
         """
         joint = self.model.joints[axis]
         return MotorDynamics(
-            gain=1e-3 * joint.rated_torque * abs(self._scales[axis]) / joint.rotor_inertia,
+            gain=1e-3 * joint.rated_torque * abs(float(self._scales[axis])) / joint.rotor_inertia,
             coulomb=1000.0 * joint.coulomb / joint.rated_torque,
             damping=joint.viscous / joint.rotor_inertia,
         )
 
-    def _state(self) -> State:
+    def _state(self) -> Array:
         """State now."""
         if self._now is None or self._now[0] != self.t_ns:
             self._advance_to(self.t_ns, keep=False)
@@ -232,35 +236,30 @@ class DynamicArm:
 
     def _bend(self) -> None:
         """Some reference changes its slope here."""
-        now_ns, theta, slope = self._y_ns, [], []
-        self._bend_ns = NEVER
-        for reference, scale, zero in zip(self._references, self._scales, self._zeros, strict=True):
-            x, v = reference.at(now_ns)
-            theta.append((x - zero) / scale)
-            slope.append(v / scale)
-            bend_ns = reference.next_bend(now_ns)
-            self._bend_ns = min(self._bend_ns, bend_ns)
-        self.equations.loops.set_reference(1e-9 * now_ns, theta, slope)
+        now_ns = self._y_ns
+        x, v = np.array([reference.at(now_ns) for reference in self._references]).T
+        theta = (x - self.model.zero_units) / self._scales
+        self.equations.loops.set_reference(1e-9 * now_ns, theta, v / self._scales)
+        self._bend_ns = min(reference.next_bend(now_ns) for reference in self._references)
 
-    def _stepped(self, end_ns: int) -> State:
-        y, equations, t, h = self._y, self.equations, 1e-9 * self._y_ns, 1e-9 * (end_ns - self._y_ns)
+    def _stepped(self, end_ns: int) -> Array:
         if self._y_ns >= self._hold_ns + self._stepping.hold_ns:
-            equations.hold_at(y[:6], y[6:12])
+            self.equations.hold(self._y)
             self._hold_ns = self._y_ns
-        if self._step is rosenbrock2:
-            return held_rosenbrock2(equations, t, y, h)
-        stepped: list[float] = self._step(equations, t, np.array(y), h).tolist()
-        return stepped
+        return self._step(self.equations, 1e-9 * self._y_ns, self._y, 1e-9 * (end_ns - self._y_ns))
 
 
 # The arm that a plant's configuration asks for.
 
 
 def make_arm(config: PlantConfig) -> IdealArm | DynamicArm:
-    """An ideal or a dynamic arm; what the ideal one does not need is not imported.
+    """An ideal or a dynamic arm.
 
     Args:
         config: with a model.
+
+    Raises:
+        PlanError: a dynamic arm without bodies, or without the extra `dynamics`.
     """
     assert config.model is not None
     if config.fidelity == "ideal":
@@ -273,37 +272,35 @@ def make_equations(config: PlantConfig, effects: Effects | None = None, *, held:
     """Equations of motion of a dynamic arm.
 
     Args:
-        config: with a model.
+        config: with a model and its bodies.
         effects: what acts; everything by default.
         held: see ``ArmEquations``.
-    """
-    from canprobe.emulator.plant.equations import Cascade, DriveSettings
-    from canprobe.emulator.plant.pushing import Neighbourhood, Rubbing
-    from canprobe.robot.dynamics import RigidBody, ball_inertia, puma260_inertia
 
+    Raises:
+        PlanError: see ``make_arm``.
+    """
     assert config.model is not None
-    d, effects = config.dynamics, effects or Effects()
-    ball = ball_inertia(d.payload, config.radius_m)
-    links = puma260_inertia(config.model).with_payload(d.payload, config.T_flange_probe_centre, ball)
-    body = RigidBody(config.model, links)
-    back = joints_per_motor(config.model)
-    inertia = np.array([joint.rotor_inertia for joint in config.model.joints])
+    model, d, T_probe, effects = config.model, config.dynamics, config.T_flange_probe_centre, effects or Effects()
+    if config.bodies is None:
+        raise PlanError([dynamics_problem(model.name, None) or ""])
+    centre = (model.chain.T_last_flange @ T_probe)[:3, 3]
+    bodies = *config.bodies[:-1], joined(config.bodies[-1], ball(d.payload, config.radius_m, centre))
+    body = RigidBody(model.chain, bodies, GRAVITY_M_S2 if effects.gravity else 0.0)
+    back = joints_per_motor(model)
+    inertia = np.array([joint.rotor_inertia for joint in model.joints])
     if effects.links:  # a drive is tuned to what its motor moves in the first posture
-        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(6))[0] @ back)
-    drives = DriveSettings(
-        config.bandwidth_hz, config.damping_ratio, d.integral_s, d.velocity_feed_forward, d.torque_limit_permille
-    )
-    cascade = Cascade(drives, inertia, config.model)
+        inertia = inertia + np.diag(back.T @ body.terms(config.q0, np.zeros(model.n))[0] @ back)
+    loops = DriveLoops(model, inertia, config.bandwidth_hz, config.damping_ratio, d, friction=effects.friction)
     if config.object is None:
-        return ArmEquations(body, cascade, effects=effects, held=held)
+        return ArmEquations(model, body, loops, effects=effects, held=held)
     touching = Neighbourhood(
-        config.model.chain,
+        model.chain,
         back,
-        config.T_flange_probe_centre,
+        T_probe,
         config.base_offset_m,
         config.object,
         radius=config.radius_m,
         stiffness_n_m3=config.stiffness_n_m3,
         rubbing=Rubbing(config.damping_s_m, d.friction),
     )
-    return ArmEquations(body, cascade, touching, effects, held=held)
+    return ArmEquations(model, body, loops, touching, effects, held=held)

@@ -1,25 +1,27 @@
 """Equations of motion of the driven arm in contact, as a ``Problem`` for the integrators, which are here too.
 
-State (18): motor angles (rad), their rates (rad/s), the integrators of the six velocity loops (N m); all in motor
-coordinates. Mass matrix, bias (gravity, Coriolis) and the geometry of the contact can be held over a while
-(``hold``), which is the usual way, or evaluated in every call (``held=False``), which is the reference.
+State (3n): motor positions (rad), their rates (rad/s), the integrators of the n velocity loops (N m); all in motor
+coordinates, of prismatic joints in m, m/s and N. Mass matrix, bias (gravity, Coriolis) and the geometry of the contact
+can be held over a while (``hold``), which is the usual way, or evaluated in every call (``held=False``), which is the
+reference.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from math import sqrt, tanh
+from math import sqrt
 from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
-import numpy.typing as npt
 
-from canprobe.emulator.plant.ideal_arm import PEAK_PERMILLE, STICTION_RATE, natural_frequency
+from canprobe.emulator.plant.ideal_arm import STICTION_RATE, natural_frequency
 from canprobe.emulator.plant.pushing import Contact
-from canprobe.robot.dynamics import RigidBody, dense
+from canprobe.robot.chain import Array
+from canprobe.robot.dynamics import RigidBody
 from canprobe.robot.model import ArmModel, joints_per_motor
+from canprobe.scene.setup import Dynamics
 
 # Steps of ordinary differential equations y' = f(t, y), each one function of (problem, t, y, h).
 #
@@ -34,8 +36,6 @@ from canprobe.robot.model import ArmModel, joints_per_motor
 #
 # Source: Hairer & Wanner, Solving ODEs II, IV.7; Verwer, Spee, Blom & Hundsdorfer, SIAM J. Sci. Comput. 20, 1999
 # (ROS2); Hochbruck & Ostermann, Acta Numerica 2010 (exponential).
-
-Array = npt.NDArray[np.float64]
 
 GAMMA = 1.0 - sqrt(0.5)
 """Of ROS2."""
@@ -175,167 +175,111 @@ STEPS: Mapping[str, Step] = MappingProxyType(
 # the ideal arm: same bandwidth, same lag behind a ramp.
 
 
-@dataclass(frozen=True, slots=True)
-class DriveSettings:
-    """How the six drives are tuned.
+class Drives(NamedTuple):
+    """(n,) each: velocity error, torque asked for and torque given."""
 
-    Args:
-        bandwidth_hz: -3 dB frequency of position.
-        damping_ratio: 1 is critical.
-        integral_s: reset time of the velocity loop; 0 for none.
-        velocity_feed_forward: share of the reference's speed that is added behind the position loop; 1 removes the lag.
-        torque_limit_permille: of the continuous torque.
-    """
-
-    bandwidth_hz: float = 30.0
-    damping_ratio: float = 1.0
-    integral_s: float = 0.02
-    velocity_feed_forward: float = 0.0
-    torque_limit_permille: int = PEAK_PERMILLE
-
-
-class Cascade:
-    """Gains of six drives, motor coordinates, SI.
-
-    Args:
-        settings: the tuning.
-        inertia: (6,) what each drive takes for its motor's inertia, kg m^2.
-        model: the arm, for the rated torques.
-    """
-
-    def __init__(self, settings: DriveSettings, inertia: Array, model: ArmModel) -> None:
-        w, z = natural_frequency(settings.bandwidth_hz, settings.damping_ratio), settings.damping_ratio
-        self.position = w / (2.0 * z)
-        self.velocity: Array = 2.0 * z * w * inertia
-        self.integral: Array = self.velocity / settings.integral_s if settings.integral_s > 0.0 else 0.0 * inertia
-        self.unwind = 1.0 / settings.integral_s if settings.integral_s > 0.0 else 0.0
-        self.share = settings.velocity_feed_forward
-        rated = np.array([joint.rated_torque for joint in model.joints])
-        self.limit: Array = rated * (1e-3 * settings.torque_limit_permille)
-
-    @property
-    def lag_s(self) -> float:
-        """How far a motor stays behind a steady ramp, s."""
-        return (1.0 - self.share) / self.position
-
-
-# The six drive loops in plain floats: what each motor gives for what it is asked.
-
-Drives = tuple[list[float], list[float], list[float]]
-"""Velocity error, torque asked for and torque given, of every motor."""
-
-
-class LoopSlopes(NamedTuple):
-    """(6,) each: slope of torque by velocity error, by angle, by rate and by integrator; slope of the integrator's own
-    rate by velocity error and by itself."""
-
-    gain: Array
-    by_theta: Array
-    by_rate: Array
-    by_sum: Array
-    sum_by_error: Array
-    sum_by_sum: Array
+    error: Array
+    asked: Array
+    given: Array
 
 
 class DriveLoops:
-    """Position and velocity loops, torque limits and friction of the six motors, on straight references.
+    """Position and velocity loops, torque limits and friction of the n motors, on straight references.
 
     Args:
-        cascade: the drives.
-        model: the arm, for its friction.
+        model: the arm, for rated torques and friction.
+        inertia: (n,) what each drive takes for its motor's inertia, kg m^2.
+        bandwidth_hz: -3 dB frequency of position.
+        damping_ratio: 1 is critical.
+        dynamics: the rest of the tuning.
         friction: whether motors and gears rub.
 
     Attributes:
-        start, slope: (6,) reference at time 0 (rad) and its slope (rad/s).
-        ahead, fed: (6,) speed (rad/s) and torque (N m) added behind the position and the velocity loop.
-        gain, integral, limit: (6,) of the velocity loops and the largest torque.
-        viscous, coulomb: (6,) friction.
+        start, slope: (n,) reference at time 0 (rad) and its slope (rad/s).
+        ahead, fed: (n,) speed (rad/s) and torque (N m) added behind the position and the velocity loop.
+        position, unwind: gain of the position loops, and rate of unwinding, 1/s.
+        gain, integral, limit: (n,) of the velocity loops and the largest torque.
+        viscous, coulomb: (n,) friction.
     """
 
-    def __init__(self, cascade: Cascade, model: ArmModel, *, friction: bool) -> None:
-        on = 1.0 if friction else 0.0
-        self.cascade = cascade
-        self.position, self.unwind = cascade.position, cascade.unwind
-        self.viscous, self.coulomb = [on * j.viscous for j in model.joints], [on * j.coulomb for j in model.joints]
-        self.gain: list[float] = cascade.velocity.tolist()
-        self.integral: list[float] = cascade.integral.tolist()
-        self.limit: list[float] = cascade.limit.tolist()
-        self.fed, self._speed_fed = [0.0] * 6, [0.0] * 6
-        self.set_reference(0.0, (0.0,) * 6, (0.0,) * 6)
+    def __init__(
+        self,
+        model: ArmModel,
+        inertia: Array,
+        bandwidth_hz: float,
+        damping_ratio: float,
+        dynamics: Dynamics,
+        *,
+        friction: bool,
+    ) -> None:
+        w, reset_s = natural_frequency(bandwidth_hz, damping_ratio), dynamics.integral_s
+        self.position, self.unwind = w / (2.0 * damping_ratio), 1.0 / reset_s if reset_s > 0.0 else 0.0
+        self.gain: Array = 2.0 * damping_ratio * w * inertia
+        self.integral: Array = self.gain * self.unwind
+        rated = np.array([joint.rated_torque for joint in model.joints])
+        self._most: Array = rated * (1e-3 * dynamics.torque_limit_permille)
+        self.limit = self._most.copy()
+        self.viscous = np.array([friction * joint.viscous for joint in model.joints])
+        self.coulomb = np.array([friction * joint.coulomb for joint in model.joints])
+        self._share = dynamics.velocity_feed_forward
+        self.fed, self._speed_fed = np.zeros(model.n), np.zeros(model.n)
+        self.set_reference(0.0, np.zeros(model.n), np.zeros(model.n))
 
-    def set_reference(self, t: float, theta: Sequence[float], slope: Sequence[float]) -> None:
+    def set_reference(self, t: float, theta: Array, slope: Array) -> None:
         """Straight reference of all motors from now on.
 
         Args:
             t: s.
-            theta: (6,) at t, rad.
-            slope: (6,) rad/s.
+            theta: (n,) at t, rad.
+            slope: (n,) rad/s.
         """
-        self.start = [x - v * t for x, v in zip(theta, slope, strict=True)]
-        self.slope = list(slope)
-        self._add_speeds()
+        self.start, self.slope = theta - slope * t, slope
+        self.ahead: Array = self._share * slope + self._speed_fed
 
     def set_loop(self, axis: int, limit: float, speed: float, torque: float) -> None:
         """Torque limit and feed-forwards of one motor from now on.
 
         Args:
-            axis: 0 to 5.
-            limit: largest torque, N m; the cascade's own if that is less.
+            axis: from 0.
+            limit: largest torque, N m; the configured one if that is less.
             speed: added behind the position loop, rad/s.
             torque: added behind the velocity loop, N m.
         """
-        self.limit[axis] = min(limit, float(self.cascade.limit[axis]))
+        self.limit[axis] = min(limit, self._most[axis])
         self._speed_fed[axis], self.fed[axis] = speed, torque
-        self._add_speeds()
+        self.ahead = self._share * self.slope + self._speed_fed
 
-    def _add_speeds(self) -> None:
-        self.ahead = [self.cascade.share * v + f for v, f in zip(self.slope, self._speed_fed, strict=True)]
-
-    def drives(self, t: float, y: Sequence[float]) -> Drives:
+    def drives(self, t: float, y: Array) -> Drives:
         """What the cascades do.
 
         Args:
             t: s.
-            y: (18,) state of the arm.
+            y: (3n,) state of the arm.
         """
-        kp = self.position
-        errors, asked, given = [], [], []
-        for start, slope, ahead, gain, fed, limit, x, v, s in zip(
-            self.start, self.slope, self.ahead, self.gain, self.fed, self.limit, y[:6], y[6:12], y[12:], strict=True
-        ):
-            error = kp * (start + slope * t - x) + ahead - v
-            torque = gain * error + s + fed
-            errors.append(error)
-            asked.append(torque)
-            given.append(limit if torque > limit else -limit if torque < -limit else torque)
-        return errors, asked, given
+        x, v, s = y.reshape(3, -1)
+        error = self.position * (self.start + self.slope * t - x) + self.ahead - v
+        asked = self.gain * error + s + self.fed
+        return Drives(error, asked, np.minimum(np.maximum(asked, -self.limit), self.limit))
 
-    def slopes(self, rates: Sequence[float], drives: Drives) -> LoopSlopes:
-        """Slopes of every motor's torque, friction included, and of its integrator's rate.
+    def slopes(self, v: Array, drives: Drives) -> tuple[Array, Array, Array, Array]:
+        """(n,) each: slope of torque by velocity error, of friction by rate; of the integrator's rate by velocity error
+        and by the integrator itself. At its limit the torque depends on nothing, and the integrator unwinds.
 
         Args:
-            rates: (6,) of the motors, rad/s.
+            v: (n,) rates of the motors, rad/s.
             drives: what the cascades do.
         """
-        found = []
-        for asked, given, rate, gain, integral, viscous, coulomb in zip(
-            *drives[1:], rates, self.gain, self.integral, self.viscous, self.coulomb, strict=True
-        ):
-            free = asked == given
-            slope, held = (gain, 0.0) if free else (0.0, self.unwind)
-            bent = tanh(rate / STICTION_RATE)
-            drag = viscous + coulomb / STICTION_RATE * (1.0 - bent * bent)
-            found.append((slope, -self.position * slope, -slope - drag, float(free), integral - held * gain, -held))
-        return LoopSlopes(*np.array(found).T)
+        free = drives.asked == drives.given
+        bent = np.tanh(v / STICTION_RATE)
+        drag = self.viscous + self.coulomb / STICTION_RATE * (1.0 - bent * bent)
+        unwind = np.where(free, 0.0, self.unwind)
+        return free * self.gain, drag, self.integral - unwind * self.gain, -unwind
 
 
 # Equations of motion of the driven arm in contact, as a ``Problem`` for the integrators.
 
-State = Sequence[float]
-"""(18,) plain floats."""
-Touching = Callable[[State], Contact | None]
-"""Motor angles (6,), rad -> the contact near there, None where nothing is near."""
-_AT_REST = (0.0,) * 6
+Touching = Callable[[Array], Contact | None]
+"""Motor positions (n,) -> the contact near there, None where nothing is near."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -360,170 +304,139 @@ class ArmEquations:
     """The driven arm.
 
     Args:
+        model: the arm.
         body: links and payload.
-        cascade: the drives.
+        loops: the drives; references and feed-forwards are set there.
         touching: contact near a posture.
-        effects: what acts.
+        effects: what acts; whether there is gravity is the body's.
         held: whether ``hold`` sets what the calls use; else each call evaluates everything.
 
     Attributes:
-        loops: of the drives; references and feed-forwards are set there.
-        lower_mass, bias: held, motor coordinates: (21,) entries ``LOWER``, kg m^2; (6,) N m.
+        mass, bias: held, motor coordinates: (n, n) kg m^2; (n,) N m.
         contact: held; None where nothing is near.
     """
 
-    positions = 6
-
     def __init__(
         self,
+        model: ArmModel,
         body: RigidBody,
-        cascade: Cascade,
+        loops: DriveLoops,
         touching: Touching = lambda theta: None,
         effects: Effects = Effects(),
         *,
         held: bool = True,
     ) -> None:
-        self.body, self.effects, self.held = body, effects, held
-        self.loops = DriveLoops(cascade, body.model, friction=effects.friction)
+        self.body, self.loops, self.effects, self.held = body, loops, effects, held
+        self.positions = model.n
         self.contact: Contact | None = None
         self._touching = touching
-        rotors = [joint.rotor_inertia for joint in body.model.joints]
-        self._driven = body.along(joints_per_motor(body.model), rotors, weight=effects.gravity)
-        alone = [x if i == j else 0.0 for i, x in enumerate(rotors) for j in range(i + 1)]
-        self._take((*alone, *(0.0,) * 6))
+        self._joints_per_motor = joints_per_motor(model)
+        self._rotors = np.diag([joint.rotor_inertia for joint in model.joints])
+        self._take(self._rotors, np.zeros(model.n))
 
     def hold(self, y: Array) -> None:
         """Evaluate mass matrix, bias and contact geometry at a state.
 
         Args:
-            y: (18,) state.
+            y: (3n,) state.
         """
-        state: list[float] = y.tolist()
-        self.hold_at(state[:6], state[6:12])
-
-    def hold_at(self, theta: State, rate: State) -> None:
-        """As ``hold``, in plain floats.
-
-        Args:
-            theta: (6,) motor angles, rad.
-            rate: (6,) rad/s.
-        """
+        theta, rate, _ = y.reshape(3, -1)
+        mass, bias = self._rotors, np.zeros(self.positions)
         if self.effects.links:
-            self._take(self._driven.lower_terms(theta, rate if self.effects.coriolis else _AT_REST))
+            mass, bias = self._driven(theta, rate if self.effects.coriolis else np.zeros(self.positions))
+        self._take(mass, bias)
         if self.effects.contact:
             self.contact = self._touching(theta)
 
-    def _take(self, terms: tuple[float, ...]) -> None:
-        self.lower_mass, self.bias = terms[:21], terms[21:]
-        self._dense: tuple[Array, Array] | None = None
+    def _driven(self, theta: Array, rate: Array) -> tuple[Array, Array]:
+        """Mass matrix and bias of links and rotors in motor coordinates."""
+        back = self._joints_per_motor
+        mass, bias = self.body.terms(back @ theta, back @ rate)
+        return back.T @ mass @ back + self._rotors, back.T @ bias
 
-    def mass(self) -> tuple[Array, Array]:
-        """(6, 6) held mass matrix in motor coordinates, kg m^2, and its inverse."""
-        if self._dense is None:
-            mass = dense(self.lower_mass)
-            self._dense = mass, np.array(np.linalg.inv(mass), dtype=np.float64)
-        return self._dense
+    def _take(self, mass: Array, bias: Array) -> None:
+        self.mass, self.bias = mass, bias
+        self.inverse: Array = np.asarray(np.linalg.inv(mass), dtype=np.float64)
 
     def resting(self, theta: Array) -> Array:
-        """(18,) state at rest that the drives hold: the integrators carry the weight.
+        """(3n,) state at rest that the drives hold: the integrators carry the weight.
 
         Args:
-            theta: (6,) motor angles, rad.
+            theta: (n,) motor positions, rad.
         """
-        bias = self._driven.gravity(theta) if self.effects.links else np.zeros(6)
-        return np.concatenate((theta, np.zeros(6), bias))
-
-    def torque(self, t: float, y: State) -> list[float]:
-        """(6,) torque of the motors, motor coordinates, N m.
-
-        Args:
-            t: s.
-            y: (18,) state.
-        """
-        return self.loops.drives(t, y)[2]
+        still = np.zeros(self.positions)
+        bias = self._driven(theta, still)[1] if self.effects.links else still
+        return np.concatenate((theta, still, bias))
 
     def rate(self, t: float, y: Array) -> Array:
         """f(t, y)."""
         if not self.held:
             self.hold(y)
-        state = y.tolist()
-        return self._rate(state, self.loops.drives(t, state))
+        x, v, _ = y.reshape(3, -1)
+        return self._rate(v, self.loops.drives(t, y), self.contact.push(x, v) if self.contact is not None else None)
 
-    def _rate(self, state: list[float], drives: Drives) -> Array:
-        v, unwind = state[6:12], self.loops.unwind
-        net = np.array(
-            [
-                given - b - viscous * rate - coulomb * tanh(rate / STICTION_RATE)
-                for given, b, viscous, coulomb, rate in zip(
-                    drives[2], self.bias, self.loops.viscous, self.loops.coulomb, v, strict=True
-                )
-            ]
-        )
-        if self.contact is not None:
-            push = self.contact.push(state[:6], v)
-            if push is not None:
-                net += push
-        out = np.empty(18)
-        out[:6] = v
-        out[12:] = [i * e - unwind * (a - g) for i, e, a, g in zip(self.loops.integral, *drives, strict=True)]
-        np.matmul(self.mass()[1], net, out=out[6:12])
-        return out
+    def _rate(self, v: Array, drives: Drives, push: Array | None) -> Array:
+        loops = self.loops
+        net = drives.given - self.bias - loops.viscous * v - loops.coulomb * np.tanh(v / STICTION_RATE)
+        if push is not None:
+            net += push
+        wound = loops.integral * drives.error - loops.unwind * (drives.asked - drives.given)
+        return np.concatenate((v, self.inverse @ net, wound))
 
     def drift(self, t: float, y: Array) -> Array:
         """Partial derivative of f by t: the reference moves on."""
-        return self._drift(self.loops.slopes(y.tolist()[6:12], self.loops.drives(t, y.tolist())))
+        by_error, _, sum_by_error, _ = self.loops.slopes(y.reshape(3, -1)[1], self.loops.drives(t, y))
+        return self._drift(by_error, sum_by_error)
 
-    def _drift(self, motors: LoopSlopes) -> Array:
-        pull = np.array(self.loops.slope) * self.loops.position
-        out = np.zeros(18)
-        np.matmul(self.mass()[1], motors.gain * pull, out=out[6:12])
-        out[12:] = pull * motors.sum_by_error
-        return out
+    def _drift(self, by_error: Array, sum_by_error: Array) -> Array:
+        pull = self.loops.slope * self.loops.position
+        return np.concatenate((np.zeros(self.positions), self.inverse @ (by_error * pull), sum_by_error * pull))
 
     def jacobian(self, t: float, y: Array) -> Array:
-        """(18, 18) of f by y; mass matrix, bias and contact geometry held."""
-        state = y.tolist()
-        m = self.loops.slopes(state[6:12], self.loops.drives(t, state))
-        theta, rate = np.diag(m.by_theta), np.diag(m.by_rate)
-        push = self.contact.slopes(state[:6], state[6:12]) if self.contact is not None else None
-        if push is not None:
-            theta -= push.rows.T @ push.by_theta @ push.rows
-            rate -= push.rows.T @ push.by_rate @ push.rows
-        J, inverse = np.zeros((18, 18)), self.mass()[1]
-        J[:6, 6:12] = np.eye(6)
-        J[6:12, :6], J[6:12, 6:12], J[6:12, 12:] = inverse @ theta, inverse @ rate, inverse * m.by_sum
-        J[12:, :6], J[12:, 6:12] = np.diag(-self.loops.position * m.sum_by_error), np.diag(-m.sum_by_error)
-        J[12:, 12:] = np.diag(m.sum_by_sum)
+        """(3n, 3n) of f by y; mass matrix, bias and contact geometry held."""
+        n, kp = self.positions, self.loops.position
+        x, v, _ = y.reshape(3, -1)
+        drives = self.loops.drives(t, y)
+        by_error, drag, sum_by_error, sum_by_sum = self.loops.slopes(v, drives)
+        by_sum = np.diag((drives.asked == drives.given) * 1.0)
+        theta, rate = np.diag(-kp * by_error), np.diag(-by_error - drag)
+        pushed = self.contact.linearised(x, v) if self.contact is not None else None
+        if pushed is not None:
+            theta, rate = theta - pushed[1], rate - pushed[2]
+        J = np.zeros((3 * n, 3 * n))
+        J[:n, n : 2 * n] = np.eye(n)
+        J[n : 2 * n] = self.inverse @ np.hstack((theta, rate, by_sum))
+        J[2 * n :] = np.hstack((np.diag(-kp * sum_by_error), np.diag(-sum_by_error), np.diag(sum_by_sum)))
         return J
 
     def linearised(self, t: float, y: Array, g: float) -> Linearised:
-        """Rate, drift, and the solver of (I - g J) x = r by elimination: one 6 x 6 system for the rates."""
+        """Rate, drift, and the solver of (I - g J) x = r by elimination: one n x n system for the rates."""
         if not self.held:
             self.hold(y)
-        state, kp, mass = y.tolist(), self.loops.position, self.mass()[0]
-        drives = self.loops.drives(t, state)
-        m = self.loops.slopes(state[6:12], drives)
-        leak = 1.0 / (1.0 - g * m.sum_by_sum)
-        fed = g * m.by_sum * leak  # torque per right-hand side of the integrator
-        back = (g * (1.0 + g * kp)) * m.sum_by_error
-        first_back, by_theta = (g * kp) * m.sum_by_error, g * m.by_theta
-        inner = mass.copy()
-        inner.flat[::7] += fed * back - g * m.by_rate - g * by_theta
-        push = self.contact.slopes(state[:6], state[6:12]) if self.contact is not None else None
-        if push is not None:
-            inner += push.rows.T @ ((g * push.by_rate + (g * g) * push.by_theta) @ push.rows)
-            springs = g * push.by_theta
+        n, kp = self.positions, self.loops.position
+        x, v, _ = y.reshape(3, -1)
+        drives = self.loops.drives(t, y)
+        by_error, drag, sum_by_error, sum_by_sum = self.loops.slopes(v, drives)
+        leak = 1.0 / (1.0 - g * sum_by_sum)
+        fed = (g * leak) * (drives.asked == drives.given)  # torque per right-hand side of the integrator
+        back = (g * (1.0 + g * kp)) * sum_by_error
+        first_back, by_theta = (g * kp) * sum_by_error, (g * kp) * by_error
+        inner = self.mass.copy()
+        inner.flat[:: n + 1] += fed * back + g * (by_error + drag) + g * by_theta
+        pushed = self.contact.linearised(x, v) if self.contact is not None else None
+        if pushed is not None:
+            springs = g * pushed[1]
+            inner += g * (pushed[2] + springs)
         inverse = np.linalg.inv(inner)
 
         def solve(r: Array) -> Array:
-            x = np.empty(18)
-            first, third = r[:6], r[12:] - first_back * r[:6]
-            torque = mass @ r[6:12] + by_theta * first + fed * third
-            if push is not None:
-                torque -= (springs @ (push.rows @ first)) @ push.rows
-            v = np.matmul(inverse, torque, out=x[6:12])
-            np.add(first, g * v, out=x[:6])
-            np.multiply(leak, third - back * v, out=x[12:])
-            return x
+            first, second, third = r.reshape(3, -1)
+            third = third - first_back * first
+            torque = fed * third - by_theta * first
+            if pushed is not None:
+                torque -= springs @ first
+            rates = inverse @ (self.mass @ second + torque)
+            return np.concatenate((first + g * rates, rates, leak * (third - back * rates)))
 
-        return Linearised(self._rate(state, drives), self._drift(m), solve)
+        rate = self._rate(v, drives, None if pushed is None else pushed[0])
+        return Linearised(rate, self._drift(by_error, sum_by_error), solve)

@@ -235,7 +235,8 @@ class IdealArm:
             acceleration += share * (stiffness * (r - q) - damping * v)
         torque: float = joint.rotor_inertia * acceleration + joint.viscous * rate
         torque += joint.coulomb * tanh(rate / STICTION_RATE)
-        permille = round(1000.0 * torque / joint.rated_torque)
+        rated = joint.rated_torque if self.model.units_per_q[axis, axis] > 0.0 else -joint.rated_torque
+        permille = round(1000.0 * torque / rated)  # in the drive's own sense
         if -PEAK_PERMILLE <= permille <= PEAK_PERMILLE:
             return permille
         return max(-PEAK_PERMILLE, min(PEAK_PERMILLE, permille))

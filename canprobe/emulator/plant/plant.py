@@ -22,7 +22,6 @@ from canprobe.emulator.plant.taxels import SIDE, Image, TaxelArray, Vec, pad_coo
 from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, point_on_flange, point_velocity, posture
 from canprobe.robot.model import ArmModel, units_to_joints
-from canprobe.robot.straight_line import matrix_product
 from canprobe.touch.shapes import Nearest, Touches
 
 Truth = dict[str, float | bool | Array]
@@ -72,7 +71,8 @@ class Plant:
         # None where the probe's axes are the flange's, the usual case.
         self._tool_axes: Array | None = None if np.array_equal(T_tool[:3, :3], np.eye(3)) else T_tool[:3, :3]
         self._base: Vec = tuple(config.base_offset_m.tolist())
-        self._rates = _at_rest if config.model is None else matrix_product(config.model.q_per_unit.tolist())
+        rows = [] if config.model is None else config.model.q_per_unit.tolist()
+        self._shares = [[(motor, share) for motor, share in enumerate(row) if share] for row in rows]
         self._at_zero = _joints_at_zero(config.model)
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
@@ -254,9 +254,19 @@ class Plant:
         b0, b1, b2 = self._base
         return Probe((centre[0] + b0, centre[1] + b1, centre[2] + b2), axes, point_velocity(c, centre, qd))
 
+    def _joints(self, motors: Sequence[float]) -> tuple[float, ...]:
+        """What the joints do where the motors do something; none without an arm."""
+        joints = []
+        for row in self._shares:
+            value = 0.0
+            for motor, share in row:
+                value += share * motors[motor]
+            joints.append(value)
+        return tuple(joints)
+
     def _solve(self, state: PlantState) -> _Solution:
         config = self.config
-        q, qd = self._rates(state.counts), self._rates(state.rates)
+        q, qd = self._joints(state.counts), self._joints(state.rates)
         if self._at_zero is not None:
             q = tuple([a + b for a, b in zip(q, self._at_zero, strict=True)])
         probe = self._probe(state.t_ns, q, qd)
@@ -298,11 +308,6 @@ def _joints_at_zero(model: ArmModel | None) -> list[float] | None:
         return None
     q: list[float] = units_to_joints(model, np.zeros(model.n)).tolist()
     return q
-
-
-def _at_rest(motors: Sequence[float]) -> tuple[float, ...]:
-    """Joints without an arm."""
-    return (0.0,) * 6
 
 
 @dataclass(slots=True, eq=False)

@@ -8,7 +8,7 @@ from canprobe.eds.packaged import load_eds
 from canprobe.emulator.drive.drive import make_drive_node
 from canprobe.emulator.plant.config import PlantConfig
 from canprobe.emulator.plant.plant import Plant
-from canprobe.robot.puma import UPENN
+from canprobe.robot.puma import BODIES, UPENN
 from canprobe.scene.setup import Quirks
 
 CSP, CSV, CST = 8, 9, 10
@@ -17,7 +17,7 @@ HOLD = "0f0000000000"
 
 @pytest.fixture
 def dynamic():
-    return Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity="dynamic"))
+    return Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None, fidelity="dynamic", bodies=BODIES["upenn"]))
 
 
 def at_work(rig, mode, *words):

@@ -12,12 +12,12 @@ from canprobe.emulator.plant.dynamic_arm import make_equations
 from canprobe.emulator.plant.equations import Effects, rosenbrock2
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.probe import elastic_contact
-from canprobe.emulator.plant.pushing import OneTouch, force_laws, total_force
+from canprobe.emulator.plant.pushing import force_laws, total_force
 from canprobe.emulator.plant.taxels import IDEAL_TAXELS, SIDE
 from canprobe.robot.chain import forward, forward_jacobian, tool_z_offset
 from canprobe.robot.inverse import start_posture
 from canprobe.robot.model import joints_per_motor, joints_to_units
-from canprobe.robot.puma import UPENN
+from canprobe.robot.puma import BODIES, UPENN
 from canprobe.scene.setup import Dynamics
 from canprobe.touch.objects import make_object
 from canprobe.touch.shapes import LIP_M
@@ -113,13 +113,13 @@ def test_pieces_of_a_lip_add_up_to_the_law_of_a_point():
 
 def arm_over(shape, depth=2e-4, *, friction=0.0, point=POINT, **config):
     q0 = start_posture(UPENN, point, (0, 0, 1), ELBOW_FORM, radius_m=R, T_flange_probe=TOOL, clearance_m=-depth)
-    settings = Dynamics(friction=friction)
-    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, **config)
+    settings, bodies = Dynamics(friction=friction), BODIES["upenn"]
+    return PlantConfig(UPENN, q0, object=shape, fidelity="dynamic", dynamics=settings, bodies=bodies, **config)
 
 
 def equations_of(config, held=False):
     found = make_equations(config, Effects(gravity=False, coriolis=True, friction=False), held=held)
-    found.loops.gain, found.loops.integral, found.loops.unwind = [0.0] * 6, [0.0] * 6, 0.0
+    found.loops.gain, found.loops.integral, found.loops.unwind = np.zeros(6), np.zeros(6), 0.0
     return found
 
 
@@ -128,20 +128,20 @@ def bounced(config, steps=700, h=4e-4, speed=0.05):
     e = equations_of(config)
     theta = joints_to_units(UPENN, config.q0) / np.diag(UPENN.units_per_q)
     e.hold(e.resting(theta))
-    away = e.contact.rows[0] if isinstance(e.contact, OneTouch) else e.contact._normal.mean(axis=0)
-    v = -e.mass()[1] @ away
+    away = e.contact.rows[0].mean(axis=0)
+    v = -e.inverse @ away
     v *= speed / abs(float(away @ v))
     y = np.concatenate((theta, v, np.zeros(6)))
 
     def kinetic(y):
         e.hold(y)
-        return 0.5 * float(y[6:12] @ e.mass()[0] @ y[6:12])
+        return 0.5 * float(y[6:12] @ e.mass @ y[6:12])
 
     before, deepest = kinetic(y), 0.0
     for i in range(steps):
         y = rosenbrock2(e, i * h, y, h)
         e.hold(y)
-        push = e.contact.push(y[:6].tolist(), y[6:12].tolist()) if e.contact is not None else None
+        push = e.contact.push(y[:6], y[6:12]) if e.contact is not None else None
         deepest = max(deepest, 0.0 if push is None else float(np.abs(push).max()))
         if push is None and i > 20:
             break
@@ -201,7 +201,7 @@ def test_push_is_that_of_points_of_the_probe_moved_by_finite_differences(kind, h
         force = elastic * max(0.0, 1.0 - 1.5 * 5.0 * (normal @ v))
         slip = v - (normal @ v) * normal
         expected += J.T @ (force * normal - 0.3 * force * slip / math.sqrt(slip @ slip + 1e-6))
-    push = e.contact.push(theta.tolist(), rate.tolist())
+    push = e.contact.push(theta, rate)
     assert push == pytest.approx(expected, rel=2e-5, abs=2e-5 * np.abs(expected).max())
     assert np.abs(expected).max() > 0.1
 
@@ -214,8 +214,8 @@ def test_a_touch_that_is_left_quickly_does_not_pull(kind, height):
     theta = np.linalg.solve(back, config.q0)
     e.hold(e.resting(theta))
     up = np.linalg.solve(forward_jacobian(UPENN.chain, config.q0, TOOL)[1] @ back, (0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
-    assert not e.contact.push(theta.tolist(), up.tolist()).any()
-    assert np.abs(e.contact.push(theta.tolist(), (0.01 * up).tolist())).max() > 0.1
+    assert not e.contact.push(theta, up).any()
+    assert np.abs(e.contact.push(theta, 0.01 * up)).max() > 0.1
 
 
 def test_slopes_of_several_touches_are_those_of_their_push():
@@ -225,16 +225,14 @@ def test_slopes_of_several_touches_are_those_of_their_push():
     rate = np.array((0.05, -0.04, 0.06, 0.2, -0.3, 0.1))
     e.hold(e.resting(theta))
 
-    def push(*state):
-        return e.contact.push(*(x.tolist() for x in state))
-
-    found = e.contact.slopes(theta.tolist(), rate.tolist())
+    push, (pushed, by_theta, by_rate) = e.contact.push, e.contact.linearised(theta, rate)
+    assert pushed == pytest.approx(push(theta, rate))
     for given, at in (
-        (found.by_theta, lambda d: push(theta + d, rate)),
-        (found.by_rate, lambda d: push(theta, rate + d)),
+        (by_theta, lambda d: push(theta + d, rate)),
+        (by_rate, lambda d: push(theta, rate + d)),
     ):
         slope = np.array([(at(d) - at(-d)) / 2e-6 for d in 1e-6 * np.eye(6)]).T
-        assert -found.rows.T @ given @ found.rows == pytest.approx(slope, abs=1e-4 * np.abs(slope).max())
+        assert -given == pytest.approx(slope, abs=1e-4 * np.abs(slope).max())
 
 
 @pytest.mark.parametrize("speed", [-0.05, 0.05])
