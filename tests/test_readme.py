@@ -25,7 +25,10 @@ ROOT = Path(__file__).resolve().parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 TEXTS = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in PAGES}
 PATHS = ("canprobe/", "docs/", "tests/", ".ci/")
-SECTIONS = {name: next(iter(typing.get_args(hint)), hint) for name, hint in typing.get_type_hints(Scene).items()}
+SECTIONS = {
+    name: typing.get_args(hint)[-1] if name == "joints" else next(iter(typing.get_args(hint)), hint)
+    for name, hint in typing.get_type_hints(Scene).items()
+}
 
 
 def blocks(language):
@@ -54,6 +57,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("pages")
     shutil.copy(scenes_folder() / "cylinder.toml", folder / "mine.toml")
     shutil.copy(eds_path("puma260_joint"), folder / "drive.eds")
+    assert main(["init", str(folder / "my-cell"), "--eds", str(folder / "drive.eds")]) == 0
     undrawn_run(load_scene("cylinder"), out=folder / "runs" / "first", duration_s=0.5)
     shutil.copy(folder / "runs" / "first" / "bus.log", folder / "candump.log")
     return folder
@@ -93,7 +97,8 @@ def test_cheap_command_runs(line, folder, monkeypatch, capsys):
 
 @pytest.mark.parametrize("block", blocks("toml"))
 def test_keys_exist_and_take_the_values(block):
-    for section, keys in tomllib.loads(block).items():
+    sections = tomllib.loads(block)
+    for section, keys in [*sections.items(), *(("joints", joint) for joint in sections.pop("joints", {}).values())]:
         annotations = typing.get_type_hints(SECTIONS[section], include_extras=True)
         for key, value in keys.items():
             convert(value, annotations[key])

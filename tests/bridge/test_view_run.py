@@ -259,14 +259,14 @@ def test_the_page_holds_the_whole_run(page, run):
 
 def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
     from canprobe.robot.chain import forward
-    from canprobe.robot.puma import MODELS
+    from canprobe.robot.puma import UPENN
 
     places = [
         m["position"]
         for _, m in embedded(page)["messages"]
         if m["type"] == "SetPositionMessage" and m["name"] == "/arm/6"
     ]
-    flange = forward(MODELS[run.scene.arm.model].chain, run.at(run.duration_s).q)
+    flange = forward(UPENN.chain, run.at(run.duration_s).q)
     assert places[-1] == pytest.approx(flange[:3, 3].tolist(), abs=1e-6)
 
 

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from scenes import without_torque
+from scenes import with_joints, without_torque
 from undrawn import undrawn_run
 
 import canprobe
@@ -574,8 +574,7 @@ def test_drives_that_send_no_torque_are_run_and_logged_without(tmp_path, fixed):
 def test_swapped_drives_are_told_by_their_serial_numbers(tmp_path):
     """The scene names each drive's serial number; the nodes have others."""
     session = open_session(tmp_path, change=lambda node: node.dictionary.set_default(0x1018, 4, 1000 + node.node_id))
-    arm = replace(session.scene.arm, serial_numbers=(1001, 1002, 1004, 1003, 1005, 1006))
-    swapped = Session(replace(session.scene, arm=arm))
+    swapped = Session(with_joints(session.scene, serial_number=(1001, 1002, 1004, 1003, 1005, 1006)))
     swapped.world.participants[:] = session.world.participants
     with (
         pytest.raises(NodeError, match=r"1018h:04 serial number expected 0x3ec, got 0x3eb; node 4: ") as failed,

@@ -140,7 +140,7 @@ def test_help_imports_not_even_numpy():
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"bodies": None}, r"the masses of arm 'upenn' are not known; give .* or set plant.fidelity = \"ideal\""),
+        ({"bodies": None}, r"the masses of arm 'puma260' are not known; give .* or set plant.fidelity = \"ideal\""),
         ({}, r"pip install 'canprobe\[dynamics\]'"),
     ],
     ids=["no bodies", "no extra"],

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from scenes import change, reasons
+from scenes import change, reasons, with_joints
 
 import canprobe
 from canprobe.planning.motion import surface_path
@@ -52,7 +52,7 @@ def test_object_out_of_reach_names_point_and_why(cylinder):
     far = (-400.0, -400.0, 374.0)
     (problem,) = reasons(change(cylinder, object={"position_mm": far}, task={"start_mm": far}))
     assert "contact at (-4" in problem
-    assert "out of reach of the upenn arm" in problem
+    assert "out of reach of the puma260 arm" in problem
 
 
 def test_joint_at_its_stop_is_named(cylinder):
@@ -62,9 +62,9 @@ def test_joint_at_its_stop_is_named(cylinder):
 
 
 def test_start_posture_outside_the_range(cylinder):
-    problems = reasons(change(cylinder, arm={"start_deg": (109.5, 65.0, 15.0, 0.0, 100.0, 300.0)}))
-    assert any("arm.start_deg: joint 1 at 109.5 deg, allowed -179 to 109" in problem for problem in problems)
-    assert any("joint 6 at 300" in problem for problem in problems)
+    problems = reasons(with_joints(cylinder, start_deg=(109.5, 65.0, 15.0, 0.0, 100.0, 300.0)))
+    assert any("joints.joint1.start_deg: at 109.5 deg, allowed -179 to 109" in problem for problem in problems)
+    assert any("joints.joint6.start_deg: at 300" in problem for problem in problems)
 
 
 def test_speed_beyond_the_joints_is_refused_with_a_speed_that_fits(cylinder):
@@ -89,7 +89,7 @@ def test_swing_of_a_free_scene():
     scene = load_scene("free")
     speeds = canprobe.plan(scene).joint_speeds
     assert speeds.needed_deg_s[0] == pytest.approx(5 * 2 * math.pi / 4, abs=1e-3)
-    assert any("joint 1 would move" in p for p in reasons(change(scene, task={"swing_deg": (25.0, 5, 5, 5, 5, 5)})))
+    assert any("joint 1 would move" in p for p in reasons(with_joints(scene, swing_deg=(25.0, 5, 5, 5, 5, 5))))
     assert any("swing slower" in p for p in reasons(change(scene, task={"swing_period_s": 0.1})))
 
 
@@ -141,8 +141,8 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
 
 def test_all_reasons_come_at_once(cylinder):
     scene = change(cylinder, sensor={"mode": "image"}, cycle={"rate_hz": 400.0}, task={"length_mm": 80.0})
-    problems = reasons(change(scene, arm={"start_deg": (200.0, 65.0, 15.0, 0.0, 100.0, 0.0)}))
-    for word in ("worst-case load", "leaves the object", "arm.start_deg"):
+    problems = reasons(with_joints(scene, start_deg=(200.0, 65.0, 15.0, 0.0, 100.0, 0.0)))
+    for word in ("worst-case load", "leaves the object", "joints.joint1.start_deg"):
         assert any(word in problem for problem in problems)
 
 

@@ -7,7 +7,7 @@ import re
 from types import SimpleNamespace
 
 import pytest
-from scenes import change, reasons, refused, ways_out, without_torque
+from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
 from canprobe.planning.devices import Abilities, identifier_problems
@@ -241,7 +241,7 @@ def test_frames_that_may_be_on_the_bus(cylinder_plan):
 
 
 def test_order_of_node_ids_is_the_order_of_joints():
-    plan = canprobe.plan(change(load_scene("free"), arm={"node_ids": (16, 5, 4, 3, 2, 1)}))
+    plan = canprobe.plan(with_joints(load_scene("free"), node_id=(16, 5, 4, 3, 2, 1)))
     assert {node.node_id: node.role for node in plan.nodes}[16] == "joint 1"
     assert plan.node_ids == (1, 2, 3, 4, 5, 16)
 

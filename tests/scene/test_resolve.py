@@ -25,7 +25,6 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     scene = change(
         load_scene("cylinder"),
         task={"start_mm": (-121.0, -122.0, 374.0), "clearance_mm": 2.5, "speed_mm_s": 20.0, "heading_deg": 90.0},
-        arm={"start_deg": (90.0, 65.0, 15.0, 0.0, 100.0, 45.0)},
         sensor={"full_scale_kpa": 300.0},
         probe={"centre_offset_mm": 70.0, "centre_lateral_mm": (1.0, -2.0)},
         limits={"joint_margin_deg": 2.0, "workspace_min_mm": (-200.0, -200.0, 300.0)},

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,15 @@ def change(scene: Scene, /, **sections: dict[str, Any]) -> Scene:
     """A scene with some fields of some sections replaced."""
     changed = {name: dataclasses.replace(getattr(scene, name), **fields) for name, fields in sections.items()}
     return dataclasses.replace(scene, **changed)
+
+
+def with_joints(scene: Scene, /, **keys: Sequence[Any]) -> Scene:
+    """A scene with some keys of its joints replaced, a value for each joint from the base."""
+    joints = {
+        name: dataclasses.replace(joint, **{key: values[i] for key, values in keys.items()})
+        for i, (name, joint) in enumerate(scene.joints.items())
+    }
+    return dataclasses.replace(scene, joints=joints)
 
 
 def without_torque(scene: Scene, folder: Path, *, fixed: bool) -> Scene:

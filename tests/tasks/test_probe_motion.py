@@ -6,7 +6,8 @@ from serial_arms import five, gantry, scara, seven
 
 from canprobe.robot.chain import forward, tool_z_offset
 from canprobe.robot.inverse import task_rows
-from canprobe.tasks.probing import MotionBounds, ProbeMotion
+from canprobe.scene.setup import Arm, Probe, SafetyLimits
+from canprobe.tasks.probing import ProbeMotion
 from canprobe.touch.servo import ProbePose
 
 TOOL = tool_z_offset(80.0)
@@ -18,10 +19,15 @@ START = {
 }
 
 
+def motion_of(model, q, margin=0.0):
+    safety = SafetyLimits(5.0, 0.15, margin, 1.0, 0.1, None)
+    return ProbeMotion(Arm(model, (), q, 5, False), Probe(TOOL, 0.04, 1e8, 0.3), safety, 2.5e-3, q)
+
+
 @pytest.mark.parametrize("model", [gantry(), scara(), five(), seven()], ids=lambda model: model.name)
 def test_a_line_is_followed_in_the_rows_of_the_arm(model):
     q = np.array(START[model.name])
-    motion, T = ProbeMotion(model, TOOL, q, 2.5e-3, MotionBounds(margin=0.02)), forward(model.chain, q) @ TOOL
+    motion, T = motion_of(model, q, 0.02), forward(model.chain, q) @ TOOL
     along, lean = np.array((0.6, -0.3, 0.2)), np.array((0.3, 0.2, -0.1)) if task_rows(model) > 3 else np.zeros(3)
     for k in range(400):
         pole = T[:3, 2] + k / 400 * lean
@@ -35,7 +41,7 @@ def test_a_line_is_followed_in_the_rows_of_the_arm(model):
 
 def test_seven_joints_stay_near_the_posture_that_they_began_with():
     model, q = seven(), np.array(START["seven"])
-    motion, T = ProbeMotion(model, TOOL, q, 2.5e-3, MotionBounds()), forward(seven().chain, q) @ TOOL
+    motion, T = motion_of(model, q), forward(seven().chain, q) @ TOOL
     for k in range(2400):
         turn = 2 * np.pi * k / 800
         offset = 0.02 * np.array((np.cos(turn) - 1.0, np.sin(turn), 0.0))
@@ -46,7 +52,7 @@ def test_seven_joints_stay_near_the_posture_that_they_began_with():
 def test_a_slide_stops_at_its_end_in_mm():
     model = gantry()
     q = np.array((0.59, 0.3, 0.3))
-    motion, T = ProbeMotion(model, TOOL, q, 2.5e-3, MotionBounds(margin=0.01)), forward(model.chain, q) @ TOOL
+    motion, T = motion_of(model, q, 0.01), forward(model.chain, q) @ TOOL
     for k in range(200):
         motion.step(ProbePose(T[:3, 3] + 1e-4 * k * np.array((1.0, 0.0, 0.0)), T[:3, 2]))
         if motion.limit is not None:
