@@ -393,7 +393,7 @@ class BringUp:
                     if write.absence is None:
                         raise
                     reason = refused.reason.removeprefix(f"({setup.name}) ")
-                    report.remarks.append(f"{reason}: {write.purpose} is left as the device has it: {write.absence}")
+                    report.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
             elif write is times[0][0]:
                 yield from self._write_one_of(report, times)
 

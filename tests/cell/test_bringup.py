@@ -214,10 +214,10 @@ def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(
         assert done_to(session) == ["configured, software 1.0"] * 6
     remarks = [line for line in session.said if "left as the device has it" in line]
     assert remarks == [
-        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: the node"
-        " notices a dead master is left as the device has it: the device will not notice a dead master",
-        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: following error time-out is left as the"
-        " device has it: a drive that lags is given as long as the device has it",
+        "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
+        " the device has it (the node notices a dead master): the device will not notice a dead master",
+        "node 4: (joint 4) 6066h:00 reads back 0x7 after 0x32 was written: left as the device has it (following error"
+        " time-out): a drive that lags is given as long as the device has it",
     ]
 
 
