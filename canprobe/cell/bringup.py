@@ -108,6 +108,7 @@ class BringUp:
         self._say = say
         self._booted: dict[int, int] = {}
         self._history: dict[int, str] = {}
+        self._refused: set[tuple[int, int]] = set()
         self._listened = False
         self.took_over = False
 
@@ -354,7 +355,10 @@ class BringUp:
         failures: list[NodeError] = []
 
         def consumer_off(setup: NodeSetup) -> Dialogue:
-            if setup.node_id not in self._booted or HEARTBEAT_CONSUMER not in setup.dictionary:
+            has_one = any(write.index == HEARTBEAT_CONSUMER for write in setup.writes)
+            if setup.node_id not in self._booted or not has_one:
+                return
+            if (setup.node_id, HEARTBEAT_CONSUMER) in self._refused:
                 return
             try:
                 yield from self._write(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
@@ -392,6 +396,7 @@ class BringUp:
                 except RefusedError as refused:
                     if write.absence is None:
                         raise
+                    self._refused.add((setup.node_id, write.index))
                     reason = refused.reason.removeprefix(f"({setup.name}) ")
                     report.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
             elif write is times[0][0]:

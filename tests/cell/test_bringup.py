@@ -212,6 +212,7 @@ def test_a_wished_value_that_the_device_refuses_or_changes_is_reported_and_left(
 
     with open_session(tmp_path, change=change) as session:
         assert done_to(session) == ["configured, software 1.0"] * 6
+    assert session.cell.faults == []
     remarks = [line for line in session.said if "left as the device has it" in line]
     assert remarks == [
         "node 2: (joint 2) write of 1016h:01 = 0x7f00fa failed: Code 0x06090011, Subindex does not exist: left as"
