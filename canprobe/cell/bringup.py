@@ -108,6 +108,7 @@ class BringUp:
         self._say = say
         self._booted: dict[int, int] = {}
         self._history: dict[int, str] = {}
+        self._refused: set[tuple[int, int]] = set()
         self._listened = False
         self.took_over = False
 
@@ -354,7 +355,10 @@ class BringUp:
         failures: list[NodeError] = []
 
         def consumer_off(setup: NodeSetup) -> Dialogue:
-            if setup.node_id not in self._booted or HEARTBEAT_CONSUMER not in setup.dictionary:
+            has_one = any(write.index == HEARTBEAT_CONSUMER for write in setup.writes)
+            if setup.node_id not in self._booted or not has_one:
+                return
+            if (setup.node_id, HEARTBEAT_CONSUMER) in self._refused:
                 return
             try:
                 yield from self._write(setup, Write(HEARTBEAT_CONSUMER, 1, 0, "the master leaves"))
@@ -396,8 +400,9 @@ class BringUp:
                         yield from self._need_held(setup, final[write.index, write.subindex], refused)
                         held.append(final[write.index, write.subindex])
                         continue
+                    self._refused.add((setup.node_id, write.index))
                     reason = refused.reason.removeprefix(f"({setup.name}) ")
-                    report.remarks.append(f"{reason}: {write.purpose} is left as the device has it: {write.absence}")
+                    report.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
             elif write is times[0][0]:
                 yield from self._write_one_of(report, times)
         if held:
@@ -412,7 +417,7 @@ class BringUp:
             ) from refused
 
     def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
-        """The first of several sets of writes that mean the same and that the device takes, or else holds."""
+        """The first of several sets of writes that mean the same and that the device takes."""
         first: RefusedError | None = None
         for writes in options:
             try:
@@ -422,27 +427,31 @@ class BringUp:
                 first = first or refused
             else:
                 if first is not None:
-                    report.remarks.append(f"takes {_values(writes)}, which means the same as what it refused")
-                return
-        for writes in options:
-            held = []
-            for write in writes:
-                held.append((yield from self._read(report.setup, write.index, write.subindex)) == write.value)
-            if all(held):
-                report.remarks.append(f"refuses to be written {_values(writes)}, and holds it")
+                    values = ", ".join(f"{write.place} = {write.value}" for write in writes)
+                    report.remarks.append(f"takes {values}, which means the same as what it refused")
                 return
         assert first is not None
         raise first
 
     def _write(self, setup: NodeSetup, write: Write) -> Dialogue:
+        """Write a value and read it back; one that the device refuses and holds already is as good.
+
+        Raises:
+            RefusedError: the device refuses it, or holds another one.
+            NodeError: there is no answer.
+        """
         variable = _variable(setup, write.index, write.subindex)
         value = write.value
         try:
             yield from download(write.index, write.subindex, variable.encode_raw(value))
         except SdoAbortedError as error:
-            if not write.own_bits:
+            try:
+                held = int((yield from read_value(variable)))
+            except (SdoAbortedError, SdoCommunicationError):
                 raise _refused(setup, write, error) from error
-            value = _with_own_bits(write, (yield from self._read(setup, write.index, write.subindex)))
+            value = _with_own_bits(write, held)
+            if held == value and write.read_back:
+                return
             if value == write.value:
                 raise _refused(setup, write, error) from error
             try:
@@ -479,10 +488,6 @@ class BringUp:
 
 class RefusedError(NodeError):
     """A device refused a value, or holds another one."""
-
-
-def _values(writes: Sequence[Write]) -> str:
-    return ", ".join(f"{write.place} = {write.value}" for write in writes)
 
 
 def _refused(setup: NodeSetup, write: Write, error: Exception) -> RefusedError:

@@ -250,7 +250,7 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
     writes = []
     if not pdo.fixed_id:
         off = f"{name} off while it is changed"
-        writes.append(Write(communication, 1, cob_id | INVALID, off, own_bits=OWN_BITS))
+        writes.append(Write(communication, 1, cob_id | INVALID, off, "it stays on", own_bits=OWN_BITS))
     writes.append(Write(communication, 2, pdo.transmission_type, f"transmission type of {name}"))
     if pdo.event_timer_ms:
         absence = "the device does not notice that its controlword stays away"
@@ -259,7 +259,7 @@ def _one_pdo(pdo: PlannedPdo, device: Abilities) -> list[Write]:
         writes.append(Write(communication, 6, SYNC_START_VALUE, f"first SYNC of {name}"))
     if device.capacity(pdo.direction, pdo.number):
         entries = enumerate(pdo.entries, start=1)
-        writes.append(Write(mapping, 0, 0, f"mapping of {name} off while it is changed"))
+        writes.append(Write(mapping, 0, 0, f"mapping of {name} off while it is changed", "it stays on"))
         writes += [Write(mapping, sub, entry.word, f"mapping of {name}") for sub, entry in entries]
         writes.append(Write(mapping, 0, len(pdo.entries), f"mapping of {name} on"))
     return (

@@ -243,7 +243,8 @@ def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
         name = [f"{pdo.cob_id:03X}h", str(pdo.node_id), f"{pdo.direction.upper()}{pdo.number}"]
         frame = [str(pdo.transmission_type), f"{pdo.rate_hz:g}", str(pdo.layout.length), str(pdo.bits_worst)]
         times = [_us(pdo.response_ns), _us(pdo.deadline_ns), _us(pdo.slack_ns)]
-        yield [*[pdo.channel] * several, *name, *frame, *times, _content(pdo.entries)]
+        content = _content(pdo.entries) if pdo.used else f"not used: {_content(pdo.entries)}"
+        yield [*[pdo.channel] * several, *name, *frame, *times, content]
 
 
 def _speed_rows(plan: Plan) -> Iterator[list[str]]:
@@ -406,6 +407,7 @@ def _pdo(pdo: PlannedPdo) -> dict[str, Any]:
         "response_us": _microseconds(pdo.response_ns),
         "slack_us": _microseconds(pdo.slack_ns),
         "event_timer_ms": pdo.event_timer_ms or None,
+        "used": pdo.used,
     }
 
 

@@ -127,14 +127,14 @@ def test_what_a_bare_drive_lacks_is_listed_with_the_consequence(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("make", "entry", "why"),
+    ("make", "entry"),
     [
-        ("milliseconds_only", "605A", None),  # 0 to 6, 2 is among them
-        ("microsecond_index", "605A", None),  # read-only, but it is 2
-        ("late_target", "6065", None),
+        ("milliseconds_only", "605A"),  # 0 to 6, 2 is among them
+        ("microsecond_index", "605A"),  # read-only, but it is 2
+        ("late_target", "6065"),
     ],
 )
-def test_what_limits_and_access_allow_is_no_lack(tmp_path, make, entry, why):
+def test_what_limits_and_access_allow_is_no_lack(tmp_path, make, entry):
     rows = [row for row in canprobe.plan(scene_of(make, tmp_path)).not_available if f"{entry}h" in row[0]]
     assert rows == []
 

@@ -12,7 +12,7 @@ import canprobe.eds.packaged
 from canprobe.emulator.plant.probe import elastic_contact
 from canprobe.errors import PlanError, SceneError
 from canprobe.planning.configuration import make_setups
-from canprobe.planning.devices import tactile_objects
+from canprobe.planning.pdos import tactile_objects
 from canprobe.planning.window import patch_radius_m, taxels_needed, window_choices
 from canprobe.scene.load import dump_scene, parse_scene
 from canprobe.scene.resolve import resolve
@@ -86,9 +86,13 @@ def test_the_smallest_that_holds_the_patch_comes_first_then_smaller_then_larger_
 
 def test_auto_takes_what_fits_and_says_why():
     cylinder = change(canprobe.load_scene("cylinder"), sensor={"window": "auto"})
-    tight = canprobe.plan(cylinder)
+    full = canprobe.plan(cylinder)
+    assert full.scene.sensor.window == 10
+    assert "motor torque (6077h)" in dict(full.left_out), "it goes before the window is cut"
+    tight = canprobe.plan(change(cylinder, cycle={"rate_hz": 1e6 / 2400}, sensor={"rate_hz": 1e6 / 4800}))
     assert tight.scene.sensor.window == 8
     assert "the largest that fits, cutting its rim" in tight.choices[0].why
+    assert "motor torque (6077h)" not in dict(tight.left_out)
     grouped = canprobe.plan(change(cylinder, arm={"grouped_rpdo": True}, bus={"cob_ids": "by_deadline"}))
     assert grouped.scene.sensor.window == 10 and len(tactile(grouped)) == 14
     assert "the smallest that holds it" in grouped.choices[0].why
