@@ -406,7 +406,8 @@ class BringUp:
             elif write is times[0][0]:
                 yield from self._write_one_of(report, times)
         if held:
-            report.remarks.append(f"refuses to be written {_values(list(dict.fromkeys(held)))}, and holds it")
+            held_ones = ", ".join(f"{write.place} = {write.value:#x}" for write in dict.fromkeys(held))
+            report.remarks.append(f"refuses to be written {held_ones}, and holds it")
 
     def _need_held(self, setup: NodeSetup, final: Write, refused: RefusedError) -> Dialogue:
         """Accept a refusal where the entry holds already what it shall hold in the end."""
