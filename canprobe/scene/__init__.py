@@ -3,14 +3,17 @@
 What comes in is TOML text; what goes out is a `Scene` (the user's words and units) and from that a `Setup` (SI units,
 whole for its task).
 
-    TOML ── load ──► Scene ── resolve ──► Setup
+    cell file  ┐
+    scene file ┴ load ──► Scene ── resolve ──► Setup
 
 - `model` is the scene as frozen dataclasses: one field a key, its type and checks in the annotation, its meaning
   below. `checks` has the checks, `rules` what goes together across keys, and which sections a task needs.
+- `hardware` has the sections of a cell file: chain, joints and drives, what makes emulated drives difficult. A scene
+  names a cell and takes from it what it does not say itself; a scene with a section `[cell]` is whole.
 - `load` reads a file and reports every mistake at once; `dump_scene` writes a scene back. Scenes cross processes as
   text.
 - `resolve` is the only place where millimetres, degrees and kilopascals become SI and defaults become values. `setup`
-  is its result: planning, cell, tasks and emulator read a `Setup` and never a `Scene`.
+  is its result; `arms` makes chain, joints and drive units: planning, cell, tasks and emulator read a `Setup` and never a `Scene`.
 - `geometry` turns the object, the probe and the path of a scene into frames and surfaces; it is used by `resolve` and
   by those who show a scene.
 
