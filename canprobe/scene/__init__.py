@@ -13,7 +13,8 @@ whole for its task).
 - `load` reads a file and reports every mistake at once; `dump_scene` writes a scene back. Scenes cross processes as
   text.
 - `resolve` is the only place where millimetres, degrees and kilopascals become SI and defaults become values. `setup`
-  is its result; `arms` makes chain, joints and drive units: planning, cell, tasks and emulator read a `Setup` and never a `Scene`.
+  is its result; `arms` makes chain, joints and drive units. Planning, cell, tasks and emulator read a `Setup` and
+  never a `Scene`.
 - `geometry` turns the object, the probe and the path of a scene into frames and surfaces; it is used by `resolve` and
   by those who show a scene.
 

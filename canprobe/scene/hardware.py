@@ -15,18 +15,15 @@ from canprobe.scene.checks import DISTINCT, OneOf, Only, Pattern, Range, ScenePa
 Auto = Literal["auto"]  # the plan chooses
 JointKind = Literal["revolute", "prismatic"]
 Convention = Literal["standard", "modified"]
-Zero = Literal["absolute", "homing"]
 Vec3 = tuple[float, float, float]
 Vec6 = tuple[float, float, float, float, float, float]
 Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
 MOST_JOINTS = 8
-HOMING_METHODS = (1, 2, 17, 18, 33, 34, 35, 37)
 
 TURNS = Only("kind", ("revolute",))
 SLIDES = Only("kind", ("prismatic",))
-HOMES = Only("zero", ("homing",))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,28 +156,6 @@ class JointSettings:
     """Centre of mass of the link, in the frame of its Denavit-Hartenberg row."""
     inertia_kg_m2: Vec6 = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     """Inertia of the link about its centre of mass: xx, yy, zz, xy, xz, yz."""
-    zero: Zero = "absolute"
-    """How the drive knows its zero: its encoder is absolute, or it must be homed after power-up."""
-    homing_method: Annotated[int, OneOf(HOMING_METHODS), HOMES] = 35
-    """Homing method (6098h): 1, 2 limit switch and index; 17, 18 limit switch; 33, 34 index; 35, 37 present place."""
-    homing_order: Annotated[int, Range(1, 100), HOMES] = 1
-    """Joints home in ascending order, those of equal order one after the other as they stand."""
-    homing_speed_deg_s: Annotated[float, Range(0, 3600, open_low=True), TURNS, HOMES] = 5.0
-    """Speed towards the switch."""
-    homing_zero_speed_deg_s: Annotated[float, Range(0, 3600, open_low=True), TURNS, HOMES] = 1.0
-    """Speed towards the zero."""
-    homing_acceleration_deg_s2: Annotated[float, Range(0, 36_000, open_low=True), TURNS, HOMES] = 50.0
-    """Acceleration of homing."""
-    homing_offset_deg: Annotated[float, Range(-3600, 3600), TURNS, HOMES] = 0.0
-    """Position of the joint where homing finds its zero."""
-    homing_speed_mm_s: Annotated[float, Range(0, 10_000, open_low=True), SLIDES, HOMES] = 20.0
-    """Speed towards the switch."""
-    homing_zero_speed_mm_s: Annotated[float, Range(0, 10_000, open_low=True), SLIDES, HOMES] = 2.0
-    """Speed towards the zero."""
-    homing_acceleration_mm_s2: Annotated[float, Range(0, 100_000, open_low=True), SLIDES, HOMES] = 200.0
-    """Acceleration of homing."""
-    homing_offset_mm: Annotated[float, Range(-100_000, 100_000), SLIDES, HOMES] = 0.0
-    """Position of the joint where homing finds its zero."""
 
 
 @dataclass(frozen=True, slots=True)

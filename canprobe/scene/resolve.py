@@ -100,7 +100,6 @@ def _arm(scene: Scene) -> Arm | None:
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
-            incremental=joint.zero == "homing",
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
         for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
