@@ -30,7 +30,7 @@ from canprobe.bridge.view.meshes import (
 from canprobe.protocol.tactile import SIDE
 from canprobe.robot.chain import Chain
 from canprobe.robot.model import ArmModel
-from canprobe.robot.puma import DH_ROWS, dh_rows
+from canprobe.robot.puma import dh_rows
 from canprobe.touch.contact import pad_to_direction
 from canprobe.touch.linear_algebra import tangent_rotation
 from canprobe.touch.objects import Cylinder, Sphere
@@ -85,7 +85,7 @@ def link_frames(chain: Chain, q: ArrayLike) -> Array:
 
 def arm_parts(model: ArmModel) -> list[Part]:
     """Solids of base and links."""
-    if model.name not in DH_ROWS:
+    if dh_rows(model) is None:
         return _plain(model.chain)
     return [*_trunk(model), *_upper_arm(model), *_forearm(model), *_wrist(model)]
 
@@ -107,9 +107,15 @@ def _plain(chain: Chain) -> list[Part]:
     return parts
 
 
+def _rows(model: ArmModel) -> Array:
+    rows = dh_rows(model)
+    assert rows is not None
+    return rows
+
+
 def _lengths(model: ArmModel) -> tuple[float, float, float, float, float, float]:
     """d1, a2, d2 + d3, a3, d4 and d6 of a PUMA, m: d2 and d3 lie on parallel axes."""
-    a, _, d, _ = dh_rows(model).T.tolist()
+    a, _, d, _ = _rows(model).T.tolist()
     return d[0], a[1], d[1] + d[2], a[2], d[3], d[5]
 
 
@@ -138,7 +144,7 @@ def _reach(model: ArmModel) -> float:
 def _upper_arm(model: ArmModel) -> list[Part]:
     _, a2, offset, _, _, _ = _lengths(model)
     side = math.copysign(1.0, offset)
-    shift = float(dh_rows(model)[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
+    shift = float(_rows(model)[2, 2])  # frame 2 lies this far before the plane of the forearm, along axis 2
     trunk = shift - offset
     near, far = trunk + side * _reach(model), trunk + side * (_reach(model) + UPPER_ARM)
     shoulder, elbow = (-a2, 0.0), (0.0, 0.0)

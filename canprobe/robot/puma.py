@@ -16,7 +16,6 @@ from types import MappingProxyType
 
 import numpy as np
 
-from canprobe.errors import PlanError
 from canprobe.robot.chain import Array, from_dh
 from canprobe.robot.model import ArmModel, Body, Joint
 
@@ -97,19 +96,16 @@ The elbow offset is taken as the DH length a3, at right angles to the forearm.
 MODELS: Mapping[str, ArmModel] = MappingProxyType({"upenn": UPENN, "unimate": UNIMATE})
 
 
-def dh_rows(model: ArmModel) -> Array:
-    """(6, 4) standard Denavit-Hartenberg rows of a PUMA 260, for what is written for it alone.
+def dh_rows(model: ArmModel) -> Array | None:
+    """(6, 4) standard Denavit-Hartenberg rows of a PUMA 260, by its geometry; None of another arm.
 
     Args:
-        model: one of `MODELS`.
-
-    Raises:
-        PlanError: it is another arm.
+        model: the arm.
     """
-    puma = MODELS.get(model.name)
-    if puma is None or not np.array_equal(puma.chain.fixed, model.chain.fixed):
-        raise PlanError([f"arm {model.name!r}: expected a PUMA 260 ({', '.join(MODELS)}) here"])
-    return DH_ROWS[model.name]
+    for name, puma in MODELS.items():
+        if model.n == puma.n and np.allclose(puma.chain.fixed, model.chain.fixed, rtol=0.0, atol=1e-9):
+            return DH_ROWS[name]
+    return None
 
 
 def _bodies(name: str) -> tuple[Body, ...]:
