@@ -49,7 +49,7 @@ ALLOWED = {
     "package": {*MASTER, "api", "cli", "session", "results", "recorded"},
 }
 ROOT = {"__init__", "__main__", "api", "errors"}
-MOST_MODULES = 16
+MOST_MODULES = 17
 
 # module → packages of its extra; it is imported only where the extra is asked for
 EXTRAS = {

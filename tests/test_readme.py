@@ -98,7 +98,8 @@ def test_cheap_command_runs(line, folder, monkeypatch, capsys):
 @pytest.mark.parametrize("block", blocks("toml"))
 def test_keys_exist_and_take_the_values(block):
     sections = tomllib.loads(block)
-    for section, keys in [*sections.items(), *(("joints", joint) for joint in sections.pop("joints", {}).values())]:
+    joints = [("joints", joint) for joint in sections.pop("joints", {}).values()]
+    for section, keys in [*sections.items(), *joints]:
         annotations = typing.get_type_hints(SECTIONS[section], include_extras=True)
         for key, value in keys.items():
             convert(value, annotations[key])

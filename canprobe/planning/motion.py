@@ -260,16 +260,16 @@ def _check_touch(task: Touch, path: SurfacePath, stops: _Stops) -> tuple[JointSp
 
 
 def _off_array(task: Touch, path: SurfacePath) -> list[str]:
-    """That the contact leaves the array where the pole does not follow the normal."""
+    """That the contact leaves the array of a probe whose pole does not follow the normal."""
+    if task_rows(task.arm.model) != FIXED_POLE:
+        return []  # the servo turns the probe, as far as task.rolling_share lets it
     along = np.clip(np.sum(path.normals * _poles(task, path), axis=1), -1.0, 1.0)
     most, reach = float(np.arccos(along).max()), 0.5 * SIDE * PITCH_M / task.probe.radius
     if most <= reach:
         return []
-    held = task_rows(task.arm.model) == FIXED_POLE
-    mend = "use an arm that tilts the probe" if held else "lower task.rolling_share"
     return [
         f"task: the contact would leave the array: the normal of the object is up to {math.degrees(most):.1f} deg from "
-        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or {mend}"
+        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or use an arm that tilts the probe"
     ]
 
 

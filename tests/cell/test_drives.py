@@ -275,11 +275,11 @@ def test_a_slow_motion_is_no_rest():
 
 
 def test_a_milliradian_in_the_counts_of_each_drive():
-    milliradians = np.abs(np.diag(MODEL.counts)) / 1000
+    milliradians = np.abs(np.diag(MODEL.units_per_q)) / 1000
     assert milliradians.min() < REST_COUNTS_LEAST < milliradians.max(), "the PUMA's encoders are coarse at the wrist"
     assert rest_counts(MODEL) == pytest.approx(np.maximum(milliradians, REST_COUNTS_LEAST))
-    fine = dataclasses.replace(MODEL, counts=100 * MODEL.counts)
-    assert rest_counts(fine) == pytest.approx(np.abs(np.diag(fine.counts)) / 1000)
+    fine = dataclasses.replace(MODEL, units_per_q=100 * MODEL.units_per_q)
+    assert rest_counts(fine) == pytest.approx(100 * milliradians)
 
 
 def test_a_start_and_a_stop_are_believed():

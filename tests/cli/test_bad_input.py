@@ -223,7 +223,7 @@ def test_a_terminal_without_our_letters(tmp_path, monkeypatch):
     ("words", "status", "out"),
     [
         ("eds list >&-", 0, ""),
-        ("eds list <&- 2>&-", 0, "puma260_joint\ntactile_array\ntactile_array_fd\n"),
+        ("eds list <&- 2>&-", 0, "prbt_joint\npuma260_joint\ntactile_array\ntactile_array_fd\n"),
         ("plan cylindre 2>&-", 2, ""),  # a complaint does not go to stdout instead
     ],
 )

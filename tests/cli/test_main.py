@@ -161,7 +161,7 @@ def test_an_error_that_nobody_foresaw_is_no_safety_stop(monkeypatch, capsys):
 
 
 def test_a_run_hears_sigterm_from_its_beginning(monkeypatch, tmp_path):
-    def load(_):
+    def load(*_):
         signal.raise_signal(signal.SIGTERM)
 
     monkeypatch.setattr("canprobe.scene.load.load_scene", load)

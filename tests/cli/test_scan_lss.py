@@ -89,7 +89,7 @@ def test_a_scene_gives_its_nodes_their_ids(serve, capsys, tmp_path):
     """Serial numbers in the scene: ids as they stand there, whoever had which before; bring-up then checks them."""
     text = (scenes_folder() / "free.toml").read_text()
     scene = tmp_path / "mine.toml"
-    scene.write_text(text + "".join(f"\n[joints.joint{n}]\nserial_number = {1000 + n}\n" for n in range(1, 7)))
+    scene.write_text(text + "".join(f"\n[joints.joint_{n}]\nserial_number = {1000 + n}\n" for n in range(1, 7)))
     nodes = serve(str(scene), "--without-id", "1-6")
     assert ids(nodes) == [255] * 6
     nodes[0].lss.pending = 21  # one has an id of its own already
@@ -166,6 +166,6 @@ def test_a_wrong_emulate_line_is_one_clear_line(words, what, capsys):
 def test_a_scene_whose_serial_numbers_are_wrong_is_refused(tmp_path):
     scene = tmp_path / "mine.toml"
     text = (scenes_folder() / "free.toml").read_text()
-    scene.write_text(text + "\n[joints.joint2]\nserial_number = -1\n")
-    with pytest.raises(canprobe.errors.SceneError, match=r"joints\.joint2\.serial_number: expected an integer from 0"):
+    scene.write_text(text + "\n[joints.joint_2]\nserial_number = -1\n")
+    with pytest.raises(canprobe.errors.SceneError, match=r"joints\.joint_2\.serial_number: expected an integer from 0"):
         canprobe.load_scene(str(scene))

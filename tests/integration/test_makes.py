@@ -307,8 +307,8 @@ def test_targets_of_interpolated_position_go_to_60c1h(tmp_path):
 
 
 def test_the_packaged_prbt_joint_is_planned_at_100_hz():
-    scene = change(canprobe.load_scene("free"), arm={"eds": "prbt_joint.eds", "node_ids": (3, 4, 5, 6, 7, 8)})
-    plan = canprobe.plan(change(scene, cycle={"rate_hz": 100.0}))
+    scene = canprobe.load_scene("free", "prbt")
+    plan = canprobe.plan(scene)
     assert {(node.mode, node.interpolation) for node in plan.nodes} == {(IP, (Interpolation(10, -3),))}
     assert [pdo.number for pdo in (*plan.pdos_of(3, "rpdo"), *plan.pdos_of(3, "tpdo"))] == [1, 1]
     assert "what a quick stop does (605Ah:00)" in dict(plan.not_available)

@@ -187,6 +187,14 @@ def test_an_interrupt_waits_until_the_results_are_written(free, tmp_path, monkey
             write(path, content)
 
         monkeypatch.setattr(results, write.__name__, interrupted)
+    if name == "scene.toml":
+        written = results.write_scene
+
+        def interrupted_scene(scene, folder):
+            signal.raise_signal(signal.SIGINT)
+            written(scene, folder)
+
+        monkeypatch.setattr(results, "write_scene", interrupted_scene)
     with pytest.raises(KeyboardInterrupt):
         undrawn_run(free, out=tmp_path, duration_s=0.1)
     assert {path.name for path in tmp_path.iterdir()} >= {"summary.json", "log.npz", "scene.toml", "bus.log"}

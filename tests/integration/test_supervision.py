@@ -394,7 +394,7 @@ def test_the_workspace_ends_a_press():
 def test_the_workspace_ends_an_own_controllers_motion():
     scene = canprobe.load_scene("free")
     T_base_tip_of = JointGuard(canprobe.plan(scene)).T_base_tip
-    start = 1e3 * T_base_tip_of(np.radians(scene.arm.start_deg))[:3, 3]
+    start = 1e3 * T_base_tip_of(canprobe.plan(scene).setup.arm.q_start)[:3, 3]
     up = own_target(lambda q: q + np.array([0, 0.02, 0, 0, 0, 0]))
     run = up("free", FREE_CYCLE, lambda _: None, own=True, limits={"workspace_max_mm": tuple(start + 15.0)})
     assert isinstance(run.error, SafetyStop) and "workspace ends at" in str(run.error)

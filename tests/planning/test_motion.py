@@ -63,8 +63,8 @@ def test_joint_at_its_stop_is_named(cylinder):
 
 def test_start_posture_outside_the_range(cylinder):
     problems = reasons(with_joints(cylinder, start_deg=(109.5, 65.0, 15.0, 0.0, 100.0, 300.0)))
-    assert any("joints.joint1.start_deg: at 109.5 deg, allowed -179 to 109" in problem for problem in problems)
-    assert any("joints.joint6.start_deg: at 300" in problem for problem in problems)
+    assert any("joints.joint_1.start_deg: at 109.5 deg, allowed -179 to 109" in problem for problem in problems)
+    assert any("joints.joint_6.start_deg: at 300" in problem for problem in problems)
 
 
 def test_speed_beyond_the_joints_is_refused_with_a_speed_that_fits(cylinder):
@@ -142,7 +142,7 @@ def test_without_an_object_the_expected_plane_is_checked(cylinder):
 def test_all_reasons_come_at_once(cylinder):
     scene = change(cylinder, sensor={"mode": "image"}, cycle={"rate_hz": 400.0}, task={"length_mm": 80.0})
     problems = reasons(with_joints(scene, start_deg=(200.0, 65.0, 15.0, 0.0, 100.0, 0.0)))
-    for word in ("worst-case load", "leaves the object", "joints.joint1.start_deg"):
+    for word in ("worst-case load", "leaves the object", "joints.joint_1.start_deg"):
         assert any(word in problem for problem in problems)
 
 

@@ -45,9 +45,9 @@ def test_every_scene_reads_with_every_cell_and_is_written_whole(scene, cell):
 
 
 def test_a_scene_changes_single_keys_of_its_cell():
-    scene = parse_scene(f'cell = "puma560"\n{FREE}[joints.joint2]\nnode_id = 12\n[bus]\nbitrate = 500000\n')
+    scene = parse_scene(f'cell = "puma560"\n{FREE}[joints.joint_2]\nnode_id = 12\n[bus]\nbitrate = 500000\n')
     assert list(scene.drives) == [1, 12, 3, 4, 5, 6]
-    assert scene.joints["joint2"].a_mm == 431.8
+    assert scene.joints["joint_2"].a_mm == 431.8
     assert scene.bus.bitrate == 500_000
 
 
@@ -98,12 +98,12 @@ def test_a_task_takes_only_the_hardware_that_it_uses():
         ('cell = "puma2600"\n' + FREE, "puma2600: no such cell or file; did you mean puma260"),
         ("cell = 5\n" + FREE, "cell: expected the name or the path of a cell, got 5"),
         (FREE + '[cell]\nname = "bare"\n', 'joints: missing: task.kind = "free" needs'),
-        (FREE + "[joints.joint2]\nnode_id = 1\n", "joints.joint2.node_id: expected node ids all different"),
-        (FREE + "[joints.joint2]\nmin_mm = 1\n", 'joints.joint2.min_mm: only with kind = "prismatic"'),
-        (FREE + "[joints.joint2]\ncoupling = { joint9 = 1 }\n", "joints.joint2.coupling: expected names of other"),
+        (FREE + "[joints.joint_2]\nnode_id = 1\n", "joints.joint_2.node_id: expected node ids all different"),
+        (FREE + "[joints.joint_2]\nmin_mm = 1\n", 'joints.joint_2.min_mm: only with kind = "prismatic"'),
+        (FREE + "[joints.joint_2]\ncoupling = { joint_9 = 1 }\n", "joints.joint_2.coupling: expected names of other"),
         (FREE + GANTRY.replace("counts_per_m = 1000", ""), "joints.x.counts_per_m: missing"),
         (FREE + GANTRY.replace("max_deg = 90", ""), "joints.turn.max_deg: missing"),
-        (FREE + "[joints]\njoint2 = 3\n", "joints.joint2: expected a section [joints.joint2], got 3"),
+        (FREE + "[joints]\njoint_2 = 3\n", "joints.joint_2: expected a section [joints.joint_2], got 3"),
     ],
 )
 def test_what_is_wrong_is_named_with_its_key(text, said):

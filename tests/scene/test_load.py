@@ -112,7 +112,7 @@ def test_sections_that_a_task_does_not_need_are_absent(kind, sections, absent):
         ("cycle", "compute_us = 2500", "cycle.compute_us", ("less than the 2500 µs of a cycle", "got 2500")),
         ("arm", "convention = 'standart'", "arm.convention", ("standard, modified", "did you mean standard?")),
         ("arm", "emulated = 1", "arm.emulated", ("true or false", "got 1")),
-        ("sensor", "node_id = 6", "sensor.node_id", ("that no joint has", "got 6, as joints.joint6")),
+        ("sensor", "node_id = 6", "sensor.node_id", ("that no joint has", "got 6, as joints.joint_6")),
         ("sensor", "node_id = 127", "sensor.node_id", ("from 1 to 126", "got 127")),
         ("sensor", "node_id = 0", "sensor.node_id", ("from 1 to 126", "got 0")),
         ("sensor", "mode = 'windw'", "sensor.mode", ("window, image, features", "did you mean window?")),
@@ -136,7 +136,6 @@ def test_one_wrong_line_is_one_problem(section, line, path, words):
 @pytest.mark.parametrize(
     ("text", "path", "word"),
     [
-        (SCAN.replace("[arm]\n[sensor]\n", "[cell]\n[sensor]\n"), "arm", "a scan moves the probe"),
         (SCAN.replace('[object]\nkind = "plane"\n', ""), "object", "touches nothing without an [object]"),
         (SCAN.replace('name = "test"\n', ""), "scene.name", "missing"),
         (SCAN.replace('kind = "scan"\n', ""), "task.kind", "one of scan, press, calibrate, listen, free"),

@@ -38,7 +38,7 @@ def test_millimetres_degrees_and_kilopascals_become_si():
     np.testing.assert_allclose(task.approach.axes, ((0, 1, 0), (-1, 0, 0), (0, 0, 1)), atol=1e-15)
     assert (task.approach.clearance, task.scan.speed) == pytest.approx((2.5e-3, 0.020))
     assert (task.shape.memory, task.shape.every_s) == pytest.approx((0.015, 0.05))
-    assert setup.arm.q_start[5] == pytest.approx(math.pi / 4)
+    assert setup.arm.q_start[0] == pytest.approx(math.pi / 2)
     assert setup.array.full_scale == pytest.approx(300e3)
     np.testing.assert_allclose(setup.probe.T_flange_probe[:3, 3], (1e-3, -2e-3, 0.070))
     assert setup.limits.joint_margin == pytest.approx(math.radians(2.0))

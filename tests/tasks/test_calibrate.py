@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 import canprobe
@@ -19,7 +18,7 @@ def seconds_to_give_up(periods):
     scene = canprobe.load_scene("calibrate")
     plan = canprobe.plan(replace(scene, task=replace(scene.task, touches=2, clearance_mm=1.0, search_mm=1.0)))
     task = make_task(plan)
-    q = np.radians(plan.scene.arm.start_deg)
+    q = plan.setup.arm.q_start
     for cycle in range(20_000):
         t_ns = periods * cycle * PERIOD_NS
         command = task.step(Measurement(cycle, t_ns, q, tactile_age=0))

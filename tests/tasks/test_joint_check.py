@@ -12,7 +12,7 @@ import pytest
 import canprobe
 from canprobe.cell.controller import Measurement
 from canprobe.cell.supervisor import JointGuard
-from canprobe.cli.up import TerminalOperator
+from canprobe.cli.operator import TerminalOperator
 from canprobe.robot.model import joints_to_units, units_to_joints
 from canprobe.robot.puma import UPENN
 from canprobe.tasks.untouched import Answer, JointCheck

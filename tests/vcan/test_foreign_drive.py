@@ -115,7 +115,7 @@ emulated = false
     ("cell", "joint", "eds", "mode", "node_id", "position", "word"),
     [
         pytest.param(
-            *("puma260", "joint2", "puma260_joint", 8, 2, 12634, 0x0F),
+            *("puma260", "joint_2", "puma260_joint", 8, 2, 12634, 0x0F),
             marks=pytest.mark.skipif(not (CELLS / "puma260.toml").is_file(), reason="needs cells with mixed drives"),
         ),
         pytest.param(

@@ -264,7 +264,7 @@ def test_cia402_55_a_lagging_wrist_motor_stands_on_its_pulse():
 @pytest.mark.parametrize(("method", "end"), [(17, "q_min"), (18, "q_max")])
 def test_cia402_55_a_coupled_wrist_joint_finds_its_switch_where_the_joint_really_is(rig, method, end):
     """Axis 5 of the ideal arm counts from 0 at power on, and lags 8 ms behind its reference."""
-    rig.plant = plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    rig.plant = plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
     rig.drive.node = make_drive_node(load_eds("puma260_joint", 1), 1, 4, plant, incremental=True)
     rig.drive.node.start(0)
     assert rig.signed(0x6064) == 0

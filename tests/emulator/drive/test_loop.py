@@ -115,7 +115,7 @@ def test_torque_fed_forward_pushes_at_once(dynamic):
 
 @pytest.mark.parametrize(("early_ms", "falls"), [(0, False), (60, True)])
 def test_a_brake_that_opens_before_the_torque_comes_lets_a_vertical_axis_fall(rig, early_ms, falls):
-    stretched = Plant(PlantConfig(UPENN, np.zeros(6), taxels=None, fidelity="dynamic"))
+    stretched = Plant(PlantConfig(UPENN, np.zeros(6), taxels=None, fidelity="dynamic", bodies=BODIES["upenn"]))
     quirks = Quirks(brake_early_ns=early_ms * 1_000_000)
     node = make_drive_node(load_eds("puma260_joint", 1), 1, 1, stretched, quirks=quirks)
     rig.drive.node, rig.plant = node, stretched

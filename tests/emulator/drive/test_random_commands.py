@@ -77,7 +77,7 @@ def test_random_orders(rig, seed, arm):
 @pytest.mark.parametrize("make", [*MAKES, "prbt_joint"])
 def test_random_orders_to_other_makes(rig, make, tmp_path):
     od = load_eds(make if make not in MAKES else write_eds(make, tmp_path), 1)
-    rig.plant = Plant(PlantConfig(model=UPENN, taxels=None))
+    rig.plant = Plant(PlantConfig(UPENN, ELBOW_FORM, taxels=None))
     rig.drive.node = node = make_drive_node(od, 1, 0, rig.plant, incremental=True, seed=1)
     node.start(0)
     rng, dictionary = random.Random(make), node.dictionary

@@ -1,0 +1,61 @@
+"""An operator at the terminal: questions on stderr, answers from stdin, without ever waiting for one."""
+
+from __future__ import annotations
+
+import os
+import select
+import sys
+
+from canprobe.cli.output import say
+from canprobe.tasks.untouched import Answer
+
+_CHOICES = "Enter or y: yes, n: no, q: end"
+_WORDS = {"": Answer.YES, "y": Answer.YES, "yes": Answer.YES, "n": Answer.NO, "no": Answer.NO, "q": Answer.QUIT}
+_LOOK_EVERY = 20
+"""Cycles between two looks at the terminal: each costs a system call."""
+
+
+class TerminalOperator:
+    """Reads whole lines from a file descriptor.
+
+    Args:
+        descriptor: of a terminal or pipe; stdin by default. At its end the answer is `QUIT`.
+    """
+
+    def __init__(self, descriptor: int | None = None) -> None:
+        self._descriptor = sys.stdin.fileno() if descriptor is None else descriptor
+        self._text = b""
+        self._left = 0
+
+    def ask(self, question: str) -> None:
+        """Put a question; what was typed before it is no answer to it."""
+        self._read()
+        self._text = b""
+        self._left = 0
+        say(f"{question} [{_CHOICES}]")
+
+    def answer(self) -> Answer | None:
+        """What the next whole line says; one that says nothing is asked for again."""
+        self._left -= 1
+        if self._left > 0:
+            return None
+        self._left = _LOOK_EVERY
+        if not self._read():
+            return Answer.QUIT
+        line, newline, rest = self._text.partition(b"\n")
+        if not newline:
+            return None
+        self._text = rest
+        answer = _WORDS.get(line.decode(errors="replace").strip().lower())
+        if answer is None:
+            say(f"[{_CHOICES}]")
+        return answer
+
+    def _read(self) -> bool:
+        """Take what is there; False at the end of the file."""
+        while select.select([self._descriptor], [], [], 0)[0]:
+            data = os.read(self._descriptor, 4096)
+            if not data:
+                return bool(self._text)
+            self._text += data
+        return True
