@@ -269,7 +269,8 @@ def _off_array(task: Touch, path: SurfacePath) -> list[str]:
         return []
     return [
         f"task: the contact would leave the array: the normal of the object is up to {math.degrees(most):.1f} deg from "
-        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or use an arm that tilts the probe"
+        f"the probe's pole, and the array reaches {math.degrees(reach):.1f} deg; shorten the path, or use an arm that "
+        "tilts the probe"
     ]
 
 
