@@ -287,7 +287,7 @@ def _check_swing(task: Free, stops: _Stops, *, starts: bool) -> tuple[JointSpeed
     speeds = stops.speeds(swing * 2 * math.pi / task.period_s)
     problems = stops.problems(np.array((start - swing, start + swing))) if starts else []
     slower = task.period_s * max(speeds.worst_share, 1.0) * 1.01
-    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (task.swing_deg)"
+    way_out = f"swing slower (task.swing_period_s = {slower:.3g}) or less (swing_deg of the joints)"
     return speeds, problems + _too_fast(task.arm, speeds, way_out)
 
 

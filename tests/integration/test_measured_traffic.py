@@ -127,7 +127,7 @@ def real_bus(monkeypatch):
     scene = dataclasses.replace(scene, arm=arm, bus=dataclasses.replace(scene.bus, interface="socketcan"))
     scene = resolve_scene(scene, duration_s=0.3)
     bus, reports = LockstepBus(VirtualClock()), []
-    for node in make_world(canprobe.plan(scene), scene.arm.node_ids).nodes:
+    for node in make_world(canprobe.plan(scene), scene.drives).nodes:
         bus.attach(node)
 
     def open_port(*_, **options):

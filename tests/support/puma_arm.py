@@ -3,5 +3,5 @@
 import numpy as np
 
 ELBOW_FORM = np.radians((90.0, 65.0, 15.0, 0.0, 100.0, 0.0))
-"""Well-conditioned, the flange pointing down at the scan region, rad: `arm.start_deg` of the packaged scenes."""
+"""Well-conditioned, the flange pointing down at the scan region, rad: the start posture of the packaged cell."""
 ELBOW_FORM.setflags(write=False)
