@@ -274,7 +274,8 @@ def _configured(bus: str | None) -> ConfiguredBus | None:
 
 
 def _has_real_nodes(scene: Scene) -> bool:
-    return any(part is not None and not part.emulated for part in (scene.arm, scene.sensor))
+    real_array = scene.sensor is not None and not scene.sensor.emulated
+    return real_array or not all(scene.drives.values())
 
 
 def _channels(given: list[tuple[str | None, str]], main: str, sensors: str | None) -> dict[str, str]:

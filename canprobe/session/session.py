@@ -503,5 +503,6 @@ def shortened(scene: Scene) -> Scene:
         bus=replace(scene.bus, interface=LOCKSTEP, timed=False, bit_error_rate=0.0),
         task=task,
         arm=replace(scene.arm, emulated=True) if scene.arm is not None else None,
+        joints={name: replace(joint, emulated=None) for name, joint in scene.joints.items()},
         sensor=replace(scene.sensor, emulated=True) if scene.sensor is not None else None,
     )
