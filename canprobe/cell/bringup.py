@@ -387,8 +387,6 @@ class BringUp:
         """The configuration; what is wished and refused is left out with a remark."""
         setup = report.setup
         times = [tuple(write for write in setup.writes if write.index == INTERPOLATION_TIME), *setup.otherwise]
-        final = {(write.index, write.subindex): write for write in setup.writes}
-        held: list[Write] = []
         for write in setup.writes:
             if report.kept and write.read_back:
                 continue
@@ -397,25 +395,12 @@ class BringUp:
                     yield from self._write(setup, write)
                 except RefusedError as refused:
                     if write.absence is None:
-                        yield from self._need_held(setup, final[write.index, write.subindex], refused)
-                        held.append(final[write.index, write.subindex])
-                        continue
+                        raise
                     self._refused.add((setup.node_id, write.index))
                     reason = refused.reason.removeprefix(f"({setup.name}) ")
                     report.remarks.append(f"{reason}: left as the device has it ({write.purpose}): {write.absence}")
             elif write is times[0][0]:
                 yield from self._write_one_of(report, times)
-        if held:
-            held_ones = ", ".join(f"{write.place} = {write.value:#x}" for write in dict.fromkeys(held))
-            report.remarks.append(f"refuses to be written {held_ones}, and holds it")
-
-    def _need_held(self, setup: NodeSetup, final: Write, refused: RefusedError) -> Dialogue:
-        """Accept a refusal where the entry holds already what it shall hold in the end."""
-        holds = yield from self._read(setup, final.index, final.subindex)
-        if (holds ^ final.value) & ~final.own_bits:
-            raise RefusedError(
-                setup.node_id, f"{refused.reason}; it holds {holds:#x}, needed for {final.purpose}: {final.value:#x}"
-            ) from refused
 
     def _write_one_of(self, report: NodeReport, options: Sequence[Sequence[Write]]) -> Dialogue:
         """The first of several sets of writes that mean the same and that the device takes."""

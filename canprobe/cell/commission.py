@@ -117,10 +117,6 @@ def _choose(
     return fits[0] if fits else None
 
 
-def _spelled(want: Wanted) -> str:
-    return ":".join("any" if number is None else f"{number:#x}" for number in want.numbers)
-
-
 # Ask nodes for their ids and tell them new ones over the bus.
 #
 # Source: CiA 305.

@@ -63,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
         if path.resolve() != (folder / path.name).resolve():
             shutil.copy(path, folder / path.name)
     (folder / "cell.toml").write_text(cell, encoding="utf-8")
-    first = _first_scene(folder, args.folder.resolve().name)
+    first = _first_scene(folder)
     (folder / "first.toml").write_text(first, encoding="utf-8")
     print(f"wrote {folder / 'cell.toml'} and {folder / 'first.toml'}")
     print(f"next: canprobe plan {folder / 'first.toml'}")
@@ -202,7 +202,7 @@ def _rounded(found: UrdfArm) -> list[float]:
     return [round(value) for value in shown]
 
 
-def _first_scene(folder: Path, name: str) -> str:
+def _first_scene(folder: Path) -> str:
     """The first of some scenes, from demanding to plain, that the cell can do as it stands."""
     from canprobe.api import plan
     from canprobe.scene.load import parse_scene

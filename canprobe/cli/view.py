@@ -72,9 +72,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _is_scene(what: str) -> bool:
     """A packaged scene's name goes before a folder that is called like it; `./cylinder` is the folder."""
-    from canprobe.scene.load import packaged_scenes
+    from canprobe.scene.load import packaged_files
 
-    return not Path(what).is_dir() or what in dict(packaged_scenes())
+    return not Path(what).is_dir() or what in packaged_files("scenes")
 
 
 def _run_scene(args: argparse.Namespace, browser: _Browser) -> Path:

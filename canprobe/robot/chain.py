@@ -379,6 +379,24 @@ def dh_step(a: float, alpha: float, d: float, theta: float, *, convention: Conve
     return np.array((*rows, (0.0, 0.0, 0.0, 1.0)))
 
 
+def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
+    """Rotation about the fixed axes x, then y, then z: Rz(yaw) Ry(pitch) Rx(roll), (3, 3).
+
+    Args:
+        roll: about x, rad.
+        pitch: about y, rad.
+        yaw: about z, rad.
+    """
+    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (cos, sin))
+    return np.array(
+        (
+            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+            (-sp, cp * sr, cp * cr),
+        )
+    )
+
+
 def tool_z_offset(offset_mm: float) -> Array:
     """A tool frame along the flange's z axis, axes parallel.
 

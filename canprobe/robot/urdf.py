@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from canprobe.errors import PlanError
-from canprobe.robot.chain import Array, Chain
+from canprobe.robot.chain import Array, Chain, rotation_rpy
 from canprobe.robot.model import Body, Joint
 
 CONTINUOUS_RAD = 2 * math.pi
@@ -246,13 +246,7 @@ class _Tree:
         T = np.eye(4)
         if element is None:
             return T
-        r, p, y = self._three(name, element, "rpy", "0 0 0")
-        cr, sr, cp, sp, cy, sy = math.cos(r), math.sin(r), math.cos(p), math.sin(p), math.cos(y), math.sin(y)
-        T[:3, :3] = (
-            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-            (-sp, cp * sr, cp * cr),
-        )
+        T[:3, :3] = rotation_rpy(*self._three(name, element, "rpy", "0 0 0"))
         T[:3, 3] = self._three(name, element, "xyz", "0 0 0")
         return T
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
@@ -132,19 +133,14 @@ def _body(section: JointSettings, row: tuple[float, float, float, float], arm: A
     T = np.eye(4) if arm.convention == "modified" else dh_step(*row)
     xx, yy, zz, xy, xz, yz = section.inertia_kg_m2
     tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
-    R = T[:3, :3]
-    return Body(section.mass_kg or 0.0, R @ (np.array(section.com_mm) * _MM) + T[:3, 3], R @ tensor @ R.T)
+    return Body(section.mass_kg or 0.0, np.array(section.com_mm) * _MM, tensor).moved(T)
 
 
-def start_posture(sections: Mapping[str, JointSettings]) -> Array:
-    """(n,) start of each joint, rad or m."""
+def per_joint(sections: Mapping[str, JointSettings], key: Literal["start", "swing"]) -> Array:
+    """(n,) rad or m of a key that is in degrees or in millimetres, as the joint turns or slides."""
     return np.array(
-        [s.start_mm * _MM if s.kind == "prismatic" else math.radians(s.start_deg) for s in sections.values()]
-    )
-
-
-def swing(sections: Mapping[str, JointSettings]) -> Array:
-    """(n,) amplitude of each joint in free motion, rad or m."""
-    return np.array(
-        [s.swing_mm * _MM if s.kind == "prismatic" else math.radians(s.swing_deg) for s in sections.values()]
+        [
+            getattr(s, f"{key}_mm") * _MM if s.kind == "prismatic" else math.radians(getattr(s, f"{key}_deg"))
+            for s in sections.values()
+        ]
     )

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from canprobe.errors import SceneError
-from canprobe.robot.chain import tool_z_offset
+from canprobe.robot.chain import rotation_rpy, tool_z_offset
 from canprobe.robot.tool_calibration import ToolEstimate
 from canprobe.scene.hardware import Vec3
 from canprobe.scene.load import Reader, read_toml
@@ -21,24 +21,6 @@ from canprobe.touch.objects import OBJECT_PARAMETERS, make_object
 from canprobe.touch.shapes import PlacedShape
 
 Array = NDArray[np.float64]
-
-
-def rotation_rpy(roll: float, pitch: float, yaw: float) -> Array:
-    """Rotation about the fixed axes x, then y, then z: Rz(yaw) Ry(pitch) Rx(roll), (3, 3).
-
-    Args:
-        roll: about x, rad.
-        pitch: about y, rad.
-        yaw: about z, rad.
-    """
-    cr, sr, cp, sp, cy, sy = (f(angle) for angle in (roll, pitch, yaw) for f in (math.cos, math.sin))
-    return np.array(
-        (
-            (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
-            (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
-            (-sp, cp * sr, cp * cr),
-        )
-    )
 
 
 def transform(position_mm: Vec3, rotation_deg: Vec3) -> Array:

@@ -20,7 +20,6 @@ Vec6 = tuple[float, float, float, float, float, float]
 Channel = Annotated[str, Pattern(r"[!-~]+", "without spaces, in ASCII")]  # as it stands in a candump log
 NodeId = Annotated[int, Range(1, 126)]  # 127 is the master
 SerialNumber = Annotated[int, Range(0, 0xFFFFFFFF)]
-MOST_JOINTS = 8
 
 TURNS = Only("kind", ("revolute",))
 SLIDES = Only("kind", ("prismatic",))

@@ -182,12 +182,17 @@ def scenes_folder() -> Path:
 
 def packaged_scenes() -> list[tuple[str, str]]:
     """Name and title of every packaged scene, by name."""
-    return [(name, load_scene(name).title) for name in packaged_files("scenes")]
+    return _titles("scenes", "scene")
 
 
 def packaged_cells() -> list[tuple[str, str]]:
     """Name and title of every packaged cell, by name."""
-    return [(name, read_cell(name).cell.title) for name in packaged_files("cells")]
+    return _titles("cells", "cell")
+
+
+def _titles(folder: str, section: str) -> list[tuple[str, str]]:
+    files = packaged_files(folder)
+    return [(name, read_toml(path, path.name)[section].get("title", "")) for name, path in files.items()]
 
 
 def packaged_files(folder: str) -> dict[str, Path]:

@@ -11,7 +11,7 @@ from canprobe.errors import PlanError
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.arms import Bodies, arm_model, start_posture, swing
+from canprobe.scene.arms import Bodies, arm_model, per_joint
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
@@ -63,7 +63,7 @@ def resolve(scene: Scene) -> Setup:
         PlanError: the scene describes an object without a surface.
     """
     need_scene(scene)
-    arm = _arm(scene)
+    arm, bodies = _arm(scene)
     array = _array(scene.sensor) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()
     probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
@@ -85,15 +85,16 @@ def resolve(scene: Scene) -> Setup:
         probe=probe,
         kind=scene.task.kind,
         task=_task(scene, arm, array, probe),
-        truth=_truth(scene, arm, probe),
+        truth=_truth(scene, arm, bodies, probe),
     )
 
 
-def _arm(scene: Scene) -> Arm | None:
+def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
+    """The arm, and the bodies of its links."""
     if scene.arm is None:
-        return None
+        return None, None
     settings, joints = scene.arm, scene.joints
-    model, _ = arm_model(scene.cell.name, settings, joints)
+    model, bodies = arm_model(scene.cell.name, settings, joints)
     drives = [
         Drive(
             node_id=node_id,
@@ -104,9 +105,9 @@ def _arm(scene: Scene) -> Arm | None:
         )
         for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
     ]
-    return Arm(
-        model, tuple(drives), start_posture(joints), settings.missed_syncs, settings.grouped_rpdo, settings.torque
-    )
+    q_start = per_joint(joints, "start")
+    arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque)
+    return arm, bodies
 
 
 def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Quirks | None:
@@ -158,7 +159,7 @@ def _task(scene: Scene, arm: Arm | None, array: Array | None, probe: Probe) -> T
     settings = scene.task
     if settings.kind == "free":
         assert arm is not None
-        return Free(arm, swing(scene.joints), settings.swing_period_s, settings.duration_s)
+        return Free(arm, per_joint(scene.joints, "swing"), settings.swing_period_s, settings.duration_s)
     assert array is not None
     if settings.kind == "listen":
         return Listen(array, probe, settings.duration_s)
@@ -213,20 +214,20 @@ def _shape(settings: ShapeSettings) -> Shape:
     return Shape(settings.method, settings.also, settings.memory_mm * MM, settings.every_ms * 1e-3, settings.patch)
 
 
-def _true_arm(scene: Scene, arm: Arm | None) -> tuple[ArmModel | None, Bodies]:
+def _true_arm(scene: Scene, arm: Arm | None, bodies: Bodies) -> tuple[ArmModel | None, Bodies]:
     """The arm that is emulated, and the bodies of its links."""
-    if scene.arm is None or arm is None:
+    if arm is None:
         return None, None
     other = scene.plant.true_cell if scene.plant is not None else None
     if other is None:
-        return arm.model, arm_model(scene.cell.name, scene.arm, scene.joints)[1]
+        return arm.model, bodies
     cell = read_cell(other)
     if cell.arm is None or len(cell.joints) != arm.model.n:
         raise PlanError([f"plant.true_cell: expected a cell with an arm of {arm.model.n} joints, got {other}"])
     return arm_model(cell.cell.name, cell.arm, cell.joints)
 
 
-def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
+def _truth(scene: Scene, arm: Arm | None, bodies: Bodies, probe: Probe) -> Truth:
     plant = scene.plant or PlantSettings()
     try:
         shape = true_object(scene.object) if scene.object is not None else None
@@ -234,7 +235,7 @@ def _truth(scene: Scene, arm: Arm | None, probe: Probe) -> Truth:
         raise PlanError([f"object: {error}"]) from error
     T_flange_there = probe.T_flange_probe.copy()
     T_flange_there[:3, 3] += np.array(plant.tool_error_mm) * MM
-    model, bodies = _true_arm(scene, arm)
+    model, bodies = _true_arm(scene, arm, bodies)
     return Truth(
         object=shape,
         model=model,

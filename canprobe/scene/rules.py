@@ -12,8 +12,9 @@ from typing import Any, TypeVar
 import numpy as np
 
 from canprobe.errors import UsageError
+from canprobe.robot.chain import MOST_JOINTS
 from canprobe.scene.checks import MismatchError, convert
-from canprobe.scene.hardware import MOST_JOINTS, JointSettings
+from canprobe.scene.hardware import JointSettings
 from canprobe.scene.model import TOUCH_KINDS, Scene
 
 _USUALLY = {
@@ -44,7 +45,6 @@ _BESIDES = {
     },
     "listen": {
         "arm": ("never", "listening moves nothing"),
-        "joints": ("never", "listening moves nothing"),
         "sensor": ("must", "there is nothing else to listen to"),
         "shape": ("never", "without motion there is no shape to estimate"),
         "servo": ("never", "listening moves nothing"),

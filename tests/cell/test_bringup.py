@@ -185,8 +185,8 @@ def test_all_that_failed_is_told(tmp_path):
     with pytest.raises(NodeError) as failed:
         open_session(tmp_path, change=refuse).__enter__()
     text = str(failed.value)
-    assert text.startswith("node 2: (joint 2) read of 6060h:00 failed")
-    assert "; node 5: (joint 5) read of 6060h:00 failed" in text and text.count("failed: Code 0x06090011") == 2
+    assert text.startswith("node 2: (joint 2) write of 6060h:00 = ")
+    assert "; node 5: (joint 5) write of 6060h:00 = " in text and text.count("failed: Code 0x06090011") == 2
 
 
 def forgetting(index, value):

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from canprobe.scene.geometry import T_base_object, T_flange_probe, rotation_rpy, scan_axes, true_object
+from canprobe.robot.chain import rotation_rpy
+from canprobe.scene.geometry import T_base_object, T_flange_probe, scan_axes, true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import ObjectSettings, ProbeSettings, TaskSettings
 

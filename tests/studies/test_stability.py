@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from canprobe.emulator.plant.ideal_arm import natural_frequency
-from canprobe.robot.chain import forward
+from canprobe.robot.chain import forward, rotation_rpy
 from canprobe.robot.puma import MODELS
-from canprobe.scene.geometry import T_flange_probe, rotation_rpy
+from canprobe.scene.geometry import T_flange_probe
 from canprobe.studies import stability
 from canprobe.studies.fault_scores import longest_above
 from canprobe.studies.harness import write_study
