@@ -10,12 +10,12 @@ from canprobe.touch.pad import Pad
 
 
 def test_a_wrapped_grid_covers_the_cap_of_its_sphere() -> None:
-    pad = Pad(rows=40, columns=40, pitch_m=1e-3, mount_radius_m=0.03)
+    pad = Pad(rows=160, columns=160, pitch_m=0.25e-3, mount_radius_m=0.03)
     half, R = 0.015, 0.03
     inside = np.hypot(*pad.uv.T) <= half
     cap = 2 * math.pi * R**2 * (1 - math.cos(half / R))  # closed form of a spherical cap of this arc
-    assert pad.areas[inside].sum() == pytest.approx(cap, rel=0.01)
-    assert pad.uv[0].tolist() == [-0.0195, -0.0195] and pad.reach_m == 0.02
+    assert pad.areas[inside].sum() == pytest.approx(cap, rel=0.005)
+    assert pad.uv[0] == pytest.approx([-0.019875, -0.019875]) and pad.reach_m == 0.02
 
 
 def test_columns_run_along_u_and_rows_along_v() -> None:
