@@ -101,6 +101,7 @@ def make_tactile(plan: Plan, sync_overflow: int | None = None) -> TactileReceive
         DEADLINE_CYCLES * plan.sync.period_ns,
         [pdo.layout.length for pdo in pdos],
         window=int(array.window),
+        shape=array.pad.shape,
     )
     return TactileReceiver(assembler, cob_ids, sync_overflow or plan.sync.overflow)
 
@@ -119,5 +120,5 @@ def patch_from(setup: Setup) -> Callable[[TactileSample], Patch] | None:
         return None
     from canprobe.touch.patch.array_model import array_calibration
 
-    calibration = array_calibration(setup.array.full_scale, setup.probe.radius)
+    calibration = array_calibration(setup.array.pad)
     return lambda sample: patch_of(sample, calibration)

@@ -28,6 +28,7 @@ from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
 from canprobe.robot.inverse import start_posture
 from canprobe.scene.setup import Arm, Setup
+from canprobe.touch.pad import Pad
 
 
 class TruthRecorder(Participant):
@@ -145,7 +146,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
         )
     else:
         assert setup.array is not None
-        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)
+        node = make_tactile_node(dictionary, node_id, plant, od_of=od_of, pad=setup.array.pad)
         if has_full_scale(dictionary):
             node.dictionary.set_default(FULL_SCALE, 0, round(setup.array.full_scale))
     serial = planned.identity.serial_number
@@ -167,6 +168,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         taxels=None
         if array is None
         else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
+        pad=array.pad if array is not None else Pad(),
         bandwidth_hz=truth.bandwidth_hz,
         press=PressMotion(force_n=touch.force) if touch is not None else PressMotion(),
         seed=setup.seed,

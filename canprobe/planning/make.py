@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from canprobe.errors import EdsError, PlanError
+from canprobe.planning.array import array_problems, as_supported, plan_raw_frames, raw_frame_problems
 from canprobe.planning.bridges import unavailable_bridges
 from canprobe.planning.choices import candidates, left_out, outputs, warnings, ways_out
 from canprobe.planning.configuration import make_setups
@@ -23,6 +24,7 @@ from canprobe.planning.model import (
     NodeKind,
     Plan,
     PlannedBus,
+    PlannedFrames,
     PlannedNode,
     PlannedPdo,
     SyncPlan,
@@ -51,7 +53,9 @@ def make_plan(setup: Setup) -> Plan:
     Raises:
         PlanError: with every reason why the setup does not fit, its numbers and the ways out.
     """
+    setup = as_supported(setup)
     devices, problems = _devices(setup)
+    problems += array_problems(setup)
     bus = _choose(setup, devices, problems) if not problems else None
     ways: list[str] = []
     if bus is not None:
@@ -76,6 +80,7 @@ def make_plan(setup: Setup) -> Plan:
         setup=setup,
         nodes=_nodes(setup, devices, bus.pdos, bus.sync),
         pdos=bus.pdos,
+        raw=bus.raw,
         sync=bus.sync,
         buses=bus.buses,
         choices=bus.choices,
@@ -116,6 +121,7 @@ class _BusPlan:
     choices: tuple[Choice, ...]
     sync: SyncPlan
     pdos: tuple[PlannedPdo, ...]
+    raw: tuple[PlannedFrames, ...]
     buses: tuple[PlannedBus, ...]
     problems: list[str]
     overload: list[str]
@@ -161,21 +167,30 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
     plan_tactile_pdos(planning, ratio)
     planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
     planning.problems += identifier_problems(planned)
+    frames = plan_raw_frames(setup)
+    if setup.array is not None:
+        planning.problems += raw_frame_problems(frames, planned, _channels(setup), setup.array.name)
     buses: list[PlannedBus] = []
     pdos: list[PlannedPdo] = []
+    raw: list[PlannedFrames] = []
     overload: list[str] = []
     for channel, node_ids in _channels(setup).items():
         mine = [replace(pdo, channel=channel) for pdo in planned if pdo.node_id in node_ids]
         settings = replace(setup.bus, channel=channel)
-        traffic, timed, late = plan_traffic(mine, sync, node_ids, settings, setup.compute_ns)
+        its = [one for one in frames if one.channel == channel]
+        traffic, timed, raw_timed, late = plan_traffic(
+            mine, sync, node_ids, settings, compute_ns=setup.compute_ns, raw=its
+        )
         buses.append(PlannedBus(channel, node_ids, traffic))
         pdos += timed
+        raw += raw_timed
         overload += late
     return _BusPlan(
         setup=setup,
         choices=choices,
         sync=sync,
         pdos=tuple(pdos),
+        raw=tuple(raw),
         buses=tuple(buses),
         problems=planning.problems,
         overload=overload,
@@ -196,7 +211,8 @@ def _channels(setup: Setup) -> dict[str, tuple[int, ...]]:
         channels[setup.bus.channel] = tuple(sorted(setup.arm.node_ids))
     if setup.array is not None:
         channel = setup.array.channel or setup.bus.channel
-        channels[channel] = tuple(sorted((*channels.get(channel, ()), setup.array.node_id)))
+        own = (setup.array.node_id,) if setup.array.raw is None else ()
+        channels[channel] = tuple(sorted((*channels.get(channel, ()), *own)))
     return channels
 
 
@@ -217,7 +233,8 @@ def _roles(setup: Setup) -> list[tuple[NodeKind, str, Node]]:
     roles: list[tuple[NodeKind, str, Node]] = [
         ("drive", f"joint {axis}", drive) for axis, drive in enumerate(drives, start=1)
     ]
-    return [*roles, ("tactile", "tactile array", setup.array)] if setup.array is not None else roles
+    array = setup.array
+    return roles if array is None or array.raw is not None else [*roles, ("tactile", "tactile array", array)]
 
 
 def _devices(setup: Setup) -> tuple[dict[int, Abilities], list[str]]:

@@ -13,6 +13,7 @@ from canprobe.planning.model import (
     SYNC_OVERFLOW,
     CycleBudget,
     Demand,
+    PlannedFrames,
     PlannedPdo,
     SyncPlan,
     Traffic,
@@ -151,9 +152,15 @@ def wire_ns(bits: int, bitrate: int) -> int:
 
 
 def plan_traffic(
-    pdos: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus, compute_ns: int = 0
-) -> tuple[Traffic, list[PlannedPdo], list[str]]:
-    """Traffic of a set of PDOs, the PDOs with their response times, and what does not fit.
+    pdos: Sequence[PlannedPdo],
+    sync: SyncPlan,
+    node_ids: Sequence[int],
+    bus: Bus,
+    *,
+    compute_ns: int = 0,
+    raw: Sequence[PlannedFrames] = (),
+) -> tuple[Traffic, list[PlannedPdo], list[PlannedFrames], list[str]]:
+    """Traffic of a set of PDOs and raw frames, both with their response times, and what does not fit.
 
     Args:
         pdos: of all nodes.
@@ -161,14 +168,18 @@ def plan_traffic(
         node_ids: everything that produces a heartbeat, besides the master.
         bus: its bit rate.
         compute_ns: what the controller takes of a cycle at most.
+        raw: of an array that is no CANopen node.
     """
     wire = on_the_wire(pdos)
-    analysis, budget = _analyse(_messages(wire, sync, node_ids, bus), compute_ns, bus.bitrate)
+    messages = _messages(wire, sync, node_ids, bus)
+    messages = replace(messages, strangers=(*messages.strangers, *_raw_messages(raw, bus)))
+    analysis, budget = _analyse(messages, compute_ns, bus.bitrate)
     response_ns = {response.message.cob_id: response.response_ns for response in analysis.responses}
     bits_per_s = {
         "SYNC": SYNC_BITS * sync.rate_hz,
         "drives": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "drive"),
-        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile"),
+        "tactile": sum(pdo.bits_worst * pdo.rate_hz for pdo in wire if pdo.kind == "tactile")
+        + sum(frames.bits_worst * frames.rate_hz for frames in raw),
         "heartbeats": worst_case_bits(1) * 1000 / HEARTBEAT_PRODUCED_MS * (len(node_ids) + 1),
     }
     traffic = Traffic(
@@ -180,7 +191,21 @@ def plan_traffic(
     )
     timed = [replace(pdo, response_ns=response_ns[pdo.cob_id]) for pdo in pdos]
     timed.sort(key=lambda pdo: (pdo.cob_id, pdo.node_id))
-    return traffic, timed, _problems(traffic, analysis.responses, bus)
+    raw_timed = [replace(frames, response_ns=response_ns.get(frames.can_id)) for frames in raw]
+    return traffic, timed, raw_timed, _problems(traffic, analysis.responses, bus)
+
+
+def _raw_messages(raw: Sequence[PlannedFrames], bus: Bus) -> Iterator[Message]:
+    """Raw frames that repeat, as one message an identifier: its frames go one behind the other."""
+    repeated: dict[int, list[PlannedFrames]] = {}
+    for frames in raw:
+        if frames.rate_hz > 0:
+            repeated.setdefault(frames.can_id, []).append(frames)
+    for can_id, all_of_it in repeated.items():
+        bits = sum(frames.bits_worst for frames in all_of_it)
+        period = round(1e9 / all_of_it[0].rate_hz)
+        length = max(frames.length for frames in all_of_it)
+        yield Message(f"raw frames {can_id:03X}h", can_id, length, period, frame_ns=wire_ns(bits, bus.bitrate))
 
 
 def _messages(wire: Sequence[PlannedPdo], sync: SyncPlan, node_ids: Sequence[int], bus: Bus) -> _Messages:

@@ -474,6 +474,11 @@ class Setup:
         nodes = (*(self.arm.drives if self.arm is not None else ()), *arrays)
         return tuple(sorted(node.node_id for node in nodes if node.emulated))
 
+    @property
+    def emulates(self) -> bool:
+        """Something of it is emulated."""
+        return bool(self.emulated_node_ids) or (self.array is not None and self.array.emulated)
+
     def changed(self, part: Literal["bus", "arm", "array"], **values: Any) -> Setup:
         """With other values of one part, in the task too."""
         new = {part: replace(getattr(self, part), **values)}

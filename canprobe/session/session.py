@@ -110,7 +110,8 @@ def open_ports(
 
 def channel_routes(plan: Plan) -> dict[int, str]:
     """Which bus each identifier belongs to, of those that one node alone sends or reads."""
-    routes = {pdo.cob_id: pdo.channel for pdo in plan.pdos}
+    routes = {frames.can_id: frames.channel for frames in plan.raw if not frames.sent}
+    routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
     for node in plan.nodes:
         for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
             routes[base + node.node_id] = node.channel

@@ -10,6 +10,7 @@ from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.robot.chain import Array, tool_z_offset
 from canprobe.robot.model import ArmModel, Body
 from canprobe.scene.setup import Dynamics, Fidelity
+from canprobe.touch.pad import Pad
 from canprobe.touch.shapes import PlacedShape
 
 
@@ -41,6 +42,7 @@ class PlantConfig:
         damping_s_m: Hunt-Crossley alpha (assumed).
         object: what can be touched; None for nothing.
         taxels: the array's imperfections; None where there is no array.
+        pad: the array's taxels.
         bandwidth_hz: -3 dB frequency of every drive.
         damping_ratio: of every drive.
         press: motion of a probe without an arm.
@@ -60,6 +62,7 @@ class PlantConfig:
     damping_s_m: float = 0.3
     object: PlacedShape | None = None
     taxels: TaxelConfig | None = field(default_factory=TaxelConfig)
+    pad: Pad = field(default_factory=Pad)
     bandwidth_hz: float = 30.0
     damping_ratio: float = 1.0
     press: PressMotion = PressMotion()
