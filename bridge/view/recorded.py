@@ -52,7 +52,7 @@ class RecordedRun:
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
-        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time on the clock of the log.
+        taxels: (t_s, (rows, columns) uint8 counts) of each tactile frame, by rising time on the clock of the log.
     """
 
     scene: Scene
@@ -142,7 +142,7 @@ def _read_taxels(file: Path, scene: Scene) -> Iterator[tuple[float, NDArray[np.u
     receiver = make_tactile(make_plan(resolve(scene)))
     assert receiver is not None
     for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
-        frame = receiver.assembler.push(can_id, data, t_ns)
+        frame = receiver.assemble(can_id, data, t_ns)
         if frame is not None:
             yield t_ns * 1e-9, frame.taxels
 

@@ -23,6 +23,7 @@ from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
+from canprobe.emulator.raw_array import RawArray
 from canprobe.planning.model import Plan, PlannedNode
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
@@ -92,6 +93,7 @@ class World:
         nodes: the slaves, ascending by node id.
         plant: arm, probe, object and array.
         recorder: notes the truth at every SYNC; None where nobody wants it, as it grows with time.
+        raw_array: an array that is no node; None without one.
         participants: what is put on the bus: the nodes, or what stands between them and it (`FaultyNode`), and the
             recorder, which listens only.
     """
@@ -99,11 +101,12 @@ class World:
     nodes: tuple[SlaveNode, ...]
     plant: Plant
     recorder: TruthRecorder | None
+    raw_array: RawArray | None = None
     participants: list[Any] = field(init=False)
 
     def __post_init__(self) -> None:
-        recorders = () if self.recorder is None else (self.recorder,)
-        object.__setattr__(self, "participants", [*self.nodes, *recorders])
+        others = [one for one in (self.raw_array, self.recorder) if one is not None]
+        object.__setattr__(self, "participants", [*self.nodes, *others])
 
 
 def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
@@ -123,7 +126,15 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, wit
         if node.node_id not in node_ids:
             continue
         nodes.append(_node(plan.setup, node, UNCONFIGURED if node.node_id in without_id else node.node_id, plant))
-    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
+    return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None, _raw_array(plan.setup, plant))
+
+
+def _raw_array(setup: Setup, plant: Plant) -> RawArray | None:
+    """The emulated array of a setup where it is no node."""
+    array = setup.array
+    if array is None or array.raw is None or not array.emulated:
+        return None
+    return RawArray(array, plant, sync_ratio=max(1, round(setup.rate_hz / array.rate_hz)), seed=setup.seed)
 
 
 def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:

@@ -36,18 +36,23 @@ class Support:
 
     Attributes:
         taxels: under the patch on a plane at the task's force; all of them where nothing is pressed.
-        centroid, curvature: what so many support; force is always there.
+        centroid: there is one.
+        no_curvature: why there is no curvature; None where there is one. Force is always there.
     """
 
     taxels: float
     centroid: bool
-    curvature: bool
+    no_curvature: str | None
+
+    @property
+    def curvature(self) -> bool:
+        """The patch shows it."""
+        return self.no_curvature is None
 
     def __str__(self) -> str:
         has = ["force", *(["centroid"] if self.centroid else []), *(["curvature"] if self.curvature else [])]
         text = " and ".join([", ".join(has[:-1]), has[-1]] if len(has) > 1 else has)
-        lacks = "" if self.curvature else f"; fewer than {CURVATURE_TAXELS} taxels show no curvature"
-        return f"{text}{lacks}"
+        return text if self.curvature else f"{text}; no curvature: {self.no_curvature}"
 
 
 def support_of(setup: Setup) -> Support | None:
@@ -59,8 +64,14 @@ def support_of(setup: Setup) -> Support | None:
     if touch is not None and not array.pad.is_flat:
         patch = math.pi * patch_radius_m(touch.force, touch.probe) ** 2
         taxels = min(taxels, patch / array.pad.pitch_m**2)
-    grid = array.pad.is_grid
-    return Support(taxels, taxels >= CENTROID_TAXELS, grid and not array.pad.is_flat and taxels >= CURVATURE_TAXELS)
+    lacks = None
+    if array.pad.is_flat:
+        lacks = "the array is flat"
+    elif not array.pad.is_grid:
+        lacks = "the taxels are no grid"
+    elif taxels < CURVATURE_TAXELS:
+        lacks = f"fewer than {CURVATURE_TAXELS} taxels under the patch"
+    return Support(taxels, taxels >= CENTROID_TAXELS, lacks)
 
 
 def as_supported(setup: Setup) -> Setup:

@@ -229,6 +229,8 @@ def _titled(title: str, rows: Iterable[Sequence[str]]) -> Iterator[str]:
 
 def _node_rows(plan: Plan) -> Iterator[list[str]]:
     several = len(plan.buses) > 1
+    if not plan.nodes:
+        return
     yield ["id", "role", "identity (vendor product revision)", "EDS", "", *["bus"] * several]
     for node in plan.nodes:
         numbers = " ".join("any" if number is None else f"{number:08X}h" for number in node.identity.numbers[:3])
@@ -240,6 +242,8 @@ def _node_rows(plan: Plan) -> Iterator[list[str]]:
 
 def _pdo_rows(plan: Plan) -> Iterator[list[str]]:
     several = len(plan.buses) > 1
+    if not plan.pdos:
+        return
     times = ["response µs", "deadline µs", "slack µs"]
     yield [*["bus"] * several, "COB-ID", "node", "PDO", "type", "Hz", "bytes", "bits", *times, "content"]
     for pdo in plan.pdos:
@@ -333,9 +337,9 @@ def _use_rows(plan: Plan) -> Iterator[list[str]]:
 
 def _measured(setup: Setup) -> str:
     """What the array measures of the task's contact."""
-    support = support_of(setup)
-    assert support is not None  # there is an array
-    if setup.touch is None:
+    support, array = support_of(setup), setup.array
+    assert support is not None and array is not None
+    if setup.touch is None or array.pad.is_flat:
         return f"it measures {support}"
     return f"at {setup.touch.force:g} N on a plane about {support.taxels:.0f} taxels are pressed: {support}"
 

@@ -290,6 +290,7 @@ class TactileFrame:
         window: (first row, first column, rows, columns) that the taxels cover; (0, 0, 0, 0) in features mode.
         features: contact features, in features mode only.
         t_ns: arrival of the header.
+        raw: (rows, columns, axes) values as they came, of a device of raw frames, whose header is made up; else None.
     """
 
     header: TactileHeader
@@ -297,6 +298,7 @@ class TactileFrame:
     window: tuple[int, int, int, int]
     features: Features | None
     t_ns: int
+    raw: NDArray[np.int64] | None = None
 
 
 class FrameAssembler:

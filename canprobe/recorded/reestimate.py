@@ -95,15 +95,14 @@ def _truth(path: Path) -> dict[str, Array]:
 
 def _cycle(cycles: LogCycles, recording: Recording, unplaced: int) -> dict[str, int]:
     assert cycles.drives is not None and cycles.tactile is not None
-    assembler = cycles.tactile.assembler
     return {
         "cycles": len(cycles.sync_times_s),
         "lost_syncs": cycles.lost_syncs,
         "missed_pdos": cycles.drives.missed,
         "late_pdos": cycles.drives.late,
         "malformed_pdos": recording.malformed,
-        "torn_frames": assembler.torn + assembler.crc_errors + assembler.orphans,
-        "lost_frames": assembler.lost,
+        "torn_frames": cycles.tactile.torn,
+        "lost_frames": cycles.tactile.lost,
         "stale_frames": cycles.tactile.stale,
         "unplaced_contacts": unplaced,
         "error_frames": recording.error_frames,

@@ -221,6 +221,11 @@ def _raw_frames(wire: WireSettings, rows: int, columns: int, mode: str) -> _Comp
     if (wire.sampling == "polled") != bool(wire.poll):
         needs = "missing: a polled device needs it" if not wire.poll else 'only with wire.sampling = "polled"'
         yield "wire.poll", needs
+    if wire.tare_images and wire.sampling == "sync":
+        yield (
+            "wire.tare_images",
+            'not with wire.sampling = "sync": nothing is sampled before the cycle; give unloaded_counts',
+        )
     try:
         image_format(wire, rows, columns)
     except ProtocolError as error:

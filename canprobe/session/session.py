@@ -110,7 +110,7 @@ def open_ports(
 
 def channel_routes(plan: Plan) -> dict[int, str]:
     """Which bus each identifier belongs to, of those that one node alone sends or reads."""
-    routes = {frames.can_id: frames.channel for frames in plan.raw if not frames.sent}
+    routes = {frames.can_id: frames.channel for frames in plan.raw}
     routes |= {pdo.cob_id: pdo.channel for pdo in plan.pdos}
     for node in plan.nodes:
         for base in (SDO_RX_BASE, SDO_TX_BASE, EMCY_BASE, HEARTBEAT_BASE):
@@ -402,6 +402,8 @@ class Session:
         missing = set(self.plan.node_ids) - set(self.scene.emulated_node_ids)
         if missing:
             raise UsageError(f"a lockstep bus has emulated nodes only: node {min(missing)} is marked emulated = false")
+        if self.plan.setup.array is not None and not self.plan.setup.array.emulated:
+            raise UsageError("a lockstep bus has emulated devices only: sensor.emulated = false")
         clock = VirtualClock()
         buses = {bus.channel: lockstep_bus(self.scene, clock, bus.channel) for bus in self.plan.buses}
         for channel, bus in buses.items():
@@ -411,8 +413,12 @@ class Session:
         participants = self.world.participants
         self._stack.callback(self._keep_truth)
         bus_of = {node.node_id: buses[node.channel] for node in self.plan.nodes}
+        array = self.plan.setup.array
         for participant in participants:
-            bus_of.get(getattr(participant, "node_id", 0), self.lockstep).attach(participant)
+            bus = bus_of.get(getattr(participant, "node_id", 0), self.lockstep)
+            if participant is self.world.raw_array and array is not None and array.channel is not None:
+                bus = buses[array.channel]
+            bus.attach(participant)
         return self._join({channel: bus.port() for channel, bus in buses.items()})
 
     def _keep_truth(self) -> None:

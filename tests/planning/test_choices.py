@@ -17,7 +17,6 @@ from canprobe.planning.devices import order_by_deadline
 from canprobe.planning.make import make_plan
 from canprobe.planning.report import plan_dict, plan_text
 from canprobe.planning.window import (
-    PITCH_M,
     cut_patch,
     measured_share,
     patch_radius_m,
@@ -190,7 +189,7 @@ def test_share_against_points_on_a_grid(side, off, force):
     contact = elastic_contact(radius**2 / 0.08, (0.0, 0.0), 0.04, PROBE.stiffness)
     x, y = np.meshgrid(*[np.linspace(-1.0, 1.0, 1001)] * 2)
     pressure = np.clip(1.0 - x**2 - y**2, 0.0, None)
-    half, middle = side / 2 * PITCH_M / contact.a, off * PITCH_M / contact.a
+    half, middle = side / 2 * PITCH / contact.a, off * PITCH / contact.a
     inside = pressure[(np.abs(x - middle) <= half) & (np.abs(y) <= half)].sum() / pressure.sum()
     assert measured_share(force, PROBE, side, PITCH, off) == pytest.approx(inside, abs=5e-3)
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from canprobe.emulator.plant.probe import depth_for_force
 from canprobe.emulator.plant.taxels import (
     IDEAL_TAXELS,
-    PITCH_M,
     PressureField,
     TaxelArray,
     TaxelConfig,
@@ -22,6 +21,7 @@ from canprobe.emulator.plant.taxels import (
 
 K, R = 1.27e8, 0.040
 PLANE, CYLINDER, SADDLE = (0.0, 0.0), (1 / 0.036, 0.0), (1 / 0.06, -1 / 0.08)
+PITCH_M = 1.5875e-3
 AXIS = (np.arange(16) - 7.5) * PITCH_M
 ALONG_U = np.eye(2)
 LINEAR_TAXELS = IDEAL_TAXELS.without("threshold")
