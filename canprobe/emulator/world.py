@@ -168,7 +168,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
 
 
 def _plant_config(setup: Setup) -> PlantConfig:
-    truth, array, touch = setup.truth, setup.array, setup.touch
+    truth, array = setup.truth, setup.array
     config = PlantConfig(
         model=truth.model,
         T_flange_probe_centre=truth.T_flange_probe,
@@ -181,7 +181,7 @@ def _plant_config(setup: Setup) -> PlantConfig:
         else TaxelConfig(full_scale_pa=array.full_scale, adc_bits=truth.adc_bits).without(*truth.without),
         pad=array.pad if array is not None else Pad(),
         bandwidth_hz=truth.bandwidth_hz,
-        press=PressMotion(force_n=touch.force) if touch is not None else PressMotion(),
+        press=PressMotion(after_s=_tared_s(setup)),
         seed=setup.seed,
     )
     if setup.arm is None or truth.model is None:
@@ -205,6 +205,15 @@ def _base_offset(believed: Chain, real: Chain, q: Array, T_flange_probe: Array) 
     """
     offset: Array = ((forward(believed, q) - forward(real, q)) @ T_flange_probe)[:3, 3]
     return offset
+
+
+def _tared_s(setup: Setup) -> float:
+    """How long an array that takes its tare at the beginning takes for it, with some to spare, s; 0 for others."""
+    raw = setup.array.raw if setup.array is not None else None
+    if raw is None or not raw.tare_images:
+        return 0.0
+    assert setup.array is not None
+    return 1.5 * raw.tare_images / setup.array.rate_hz
 
 
 def _first_posture(setup: Setup, arm: Arm) -> Array:

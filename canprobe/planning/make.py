@@ -55,7 +55,8 @@ def make_plan(setup: Setup) -> Plan:
     """
     setup = as_supported(setup)
     devices, problems = _devices(setup)
-    problems += array_problems(setup)
+    unsuited = [*array_problems(setup)]
+    problems += unsuited
     bus = _choose(setup, devices, problems) if not problems else None
     ways: list[str] = []
     if bus is not None:
@@ -67,7 +68,7 @@ def make_plan(setup: Setup) -> Plan:
         if cut is not None and not cut.safe:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
-    joint_speeds, unreachable = check_motion(setup)
+    joint_speeds, unreachable = check_motion(setup) if not unsuited else (None, [])
     problems += unreachable
     truth, arm = setup.truth, setup.arm
     if arm is not None and truth.fidelity == "dynamic" and any(drive.emulated for drive in arm.drives):

@@ -193,8 +193,13 @@ def _taxel_positions(rows: int, columns: int, positions: object, normals: object
         yield "sensor.normals", "expected directions, got one that is all zero"
 
 
-@_across("wire", "sensor.rows", "sensor.columns", "sensor.mode", "sensor.window")
-def _array_fits_wire(wire: WireSettings, rows: int, columns: int, mode: str, window: int | str) -> _Complaint:
+_WIRE = ("ids", "frames", "byte_order", "axes", "normal_axis", "unloaded_counts", "full_scale_counts", "poll")
+
+
+@_across("wire", "sensor.rows", "sensor.columns", "sensor.mode", "sensor.window", *(f"wire.{key}" for key in _WIRE))
+def _array_fits_wire(
+    wire: WireSettings, rows: int, columns: int, mode: str, window: int | str, *_read: object
+) -> _Complaint:
     if wire.kind == "frames":
         yield from _raw_frames(wire, rows, columns, mode)
         return

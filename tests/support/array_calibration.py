@@ -267,4 +267,4 @@ def _press(
 def calibrate(full_scale_pa: float, seeds: Sequence[int], forces: Sequence[float]) -> PatchCalibration:
     """The mean calibration of arrays with this full scale."""
     sums, true = zip(*pressed_sums(full_scale_pa, forces, seeds), strict=True)
-    return replace(calibrate_force(sums, true), full_scale_pa=full_scale_pa)
+    return replace(calibrate_force(sums, true), pad=Pad(full_scale_pa=full_scale_pa))

@@ -22,11 +22,13 @@ class PressMotion:
         force_n: force at the mean depth.
         swing: amplitude of the depth over its mean.
         frequency_hz: of the swing.
+        after_s: from the first image; until then the probe is off the object, as an array that is tared has to be.
     """
 
     force_n: float = 2.0
     swing: float = 0.4
     frequency_hz: float = 0.5
+    after_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)

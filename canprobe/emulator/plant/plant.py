@@ -82,6 +82,7 @@ class Plant:
         self._at_zero = _joints_at_zero(config.model)
         self._solved: _Solution | None = None
         self._image: tuple[int, Image] | None = None
+        self._first_image_s: float | None = None
 
     def advance(self, t_ns: int) -> None:
         """Move the present time on; earlier times and repeats change nothing.
@@ -177,6 +178,8 @@ class Plant:
         self.advance(t_ns)
         if self.array is None:
             return np.zeros(self.config.pad.shape, dtype=np.uint8)
+        if self._image is None:
+            self._first_image_s = 1e-9 * self.t_ns
         if self._image is None or self._image[0] != self.t_ns:
             self._image = (self.t_ns, self._sampled(self.array, self._solution()))
         return self._image[1].copy()
@@ -251,7 +254,7 @@ class Plant:
 
     def _probe(self, t_ns: int, q: tuple[float, ...], qd: tuple[float, ...]) -> Probe:
         if self._pressed is not None:
-            return self._pressed.at(1e-9 * t_ns)
+            return self._pressed.at(1e-9 * t_ns, self._first_image_s)
         if self.arm is None:
             return Probe((0.0, 0.0, 0.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)), (0.0, 0.0, 0.0))
         c = posture(self.arm.model.chain, q)
