@@ -354,6 +354,15 @@ class Plan:
         return round((self.setup.task.duration_s + AROUND_S) * self.sync.rate_hz)
 
     @property
+    def emulated_channels(self) -> tuple[str, ...]:
+        """Of the buses on which something is emulated."""
+        channels = dict.fromkeys(node.channel for node in self.nodes if node.emulated)
+        array = self.setup.array
+        if array is not None and array.raw is not None and array.emulated:
+            channels[array.channel or self.setup.bus.channel] = None
+        return tuple(channels)
+
+    @property
     def node_ids(self) -> tuple[int, ...]:
         """Ids of the nodes that are brought up."""
         return tuple(node.node_id for node in self.nodes)

@@ -201,7 +201,7 @@ def _serve(
     port.drain()  # what passed meanwhile
     ask_for_processor()
     favour = realtime(DEVICE_PRIORITY, say, processor_from_last=1) if in_realtime else contextlib.nullcontext()
-    say(f"serving {_named(nodes)} on {port.channel}; Ctrl-C stops them")
+    say(f"serving {_named(nodes) or 'the array'} on {port.channel}; Ctrl-C stops them")
     with favour:
         serve(participants, port, lambda: False)
 

@@ -432,12 +432,12 @@ class Session:
 
     def _open_real(self) -> Port:
         bus = self.scene.bus
-        if bus.interface == "virtual" and self.scene.emulated_node_ids:
+        if bus.interface == "virtual" and self.plan.setup.emulates:
             raise UsageError(
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
             )
-        if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
+        if len(self.plan.emulated_channels) > 1:
             raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
@@ -452,10 +452,10 @@ class Session:
         from canprobe.session.children import EmulatorChild
 
         child = None
-        if self.scene.emulated_node_ids:
+        if self.plan.setup.emulates:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
-            emulated = next(node.channel for node in self.plan.nodes if node.emulated)
+            emulated = self.plan.emulated_channels[0]
             child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()

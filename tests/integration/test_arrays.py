@@ -113,7 +113,7 @@ def test_a_flat_array_is_pressed_and_holds_the_force(tmp_path):
     cell = 'array = "uskin4x4"\nchannel = "can1"'
     scene = parse_scene(TOUCH.format(sensor=cell, kind="press").replace('"cylinder"', '"sphere"'))
     summary = canprobe.run(scene, out=tmp_path / "run").summary
-    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
+    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.5
     # the start frame has the identifier of an RPDO on the other bus: each goes where it belongs
     lines = (tmp_path / "run" / "bus.log").read_text().splitlines()
     assert [line.split()[1] for line in lines if line.endswith(" 201#0700")] == ["can1"]
