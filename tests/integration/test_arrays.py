@@ -42,7 +42,7 @@ position_mm = [-120, -122.5, 374]
 rotation_deg = [0, 0, 20]
 [task]
 kind = "{kind}"
-duration_s = 1.5
+duration_s = 1
 """
 RAW = ("uskin4x4", "uskin4x6", "linker12x6", "icub-triangles", "poweron6x6")
 
@@ -131,13 +131,21 @@ def test_a_flat_array_is_no_probe(kind):
     assert len(caught.value.problems) == 1 and "uskin4x4 is flat" in caught.value.problems[0]
 
 
+FREE = """rows = 10
+columns = 12
+pitch_mm = 2
+mode = "image"
+channel = "can1"
+[wire]
+kind = "frames"
+ids = ["510h-51Eh"]
+frames = ["ss tt uu vv ww xx yy zz"]
+latency_ms = 4
+latency_sigma_ms = 0.5"""
+
+
 @pytest.mark.parametrize(
-    ("sensor", "curvature"),
-    [
-        ("rows = 8\ncolumns = 8\npitch_mm = 3", False),
-        ('rows = 12\ncolumns = 12\npitch_mm = 2\nmode = "image"\nchannel = "can1"', True),
-        ('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', True),
-    ],
+    ("sensor", "curvature"), [("rows = 8\ncolumns = 8\npitch_mm = 3", False), (FREE, True)], ids=["canopen", "free"]
 )
 def test_arrays_of_other_sizes_scan(sensor, curvature):
     scene = touch(sensor)
@@ -147,6 +155,11 @@ def test_arrays_of_other_sizes_scan(sensor, curvature):
     summary = canprobe.run(scene).summary
     assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.2
     assert summary["shape"]["kappa_est_per_m"][0] == pytest.approx(1 / 0.036, abs=5.0)
+
+
+def test_a_node_of_another_size_computes_features():
+    summary = canprobe.run(touch('rows = 10\ncolumns = 12\npitch_mm = 2\nmode = "features"', "press")).summary
+    assert summary["completed"] and summary["contact"]["force_rms_error_n"] < 0.3
 
 
 def test_a_node_that_has_fewer_taxels_than_the_file_is_refused(tmp_path):
