@@ -1,4 +1,4 @@
-"""List the packaged cells and print the folder of their files."""
+"""List the packaged cells and arrays, and print the folders of their files."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import argparse
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options
 
-HELP = "list the packaged cells"
+HELP = "list the packaged cells and arrays"
 EXAMPLE = """\
 examples:
   canprobe cells
@@ -21,13 +21,24 @@ def add_arguments(parser: Parser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print name and title of every packaged cell, and the folder of their files."""
-    from canprobe.scene.load import packaged_cells, packaged_files
+    """Print name and title of every packaged cell and array, and the folders of their files."""
+    from canprobe.scene.load import packaged_arrays, packaged_cells, packaged_files
 
-    cells, paths = packaged_cells(), packaged_files("cells")
+    found = {"cell": packaged_cells(), "array": packaged_arrays()}
+    paths = {kind: packaged_files(f"{kind}s") for kind in found}
     if args.json:
-        print_json([{"name": name, "title": title, "path": str(paths[name])} for name, title in cells])
-    else:
-        print_table(cells)
-        print(f"in {next(iter(paths.values())).parent}; copy one to change it, or let `canprobe init` write one")
+        print_json(
+            [
+                {"kind": kind, "name": name, "title": title, "path": str(paths[kind][name])}
+                for kind, files in found.items()
+                for name, title in files
+            ]
+        )
+        return 0
+    folders = {kind: next(iter(files.values())).parent for kind, files in paths.items()}
+    print_table(found["cell"])
+    print(f"in {folders['cell']}; copy one to change it, or let `canprobe init` write one")
+    print("arrays, for `array` in [sensor] of a cell:")
+    print_table(found["array"])
+    print(f"in {folders['array']}; copy one to change it")
     return 0

@@ -14,6 +14,7 @@ from canprobe.protocol.raw_image import ImageAssembler
 from canprobe.scene.load import parse_scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.session import Session
+from canprobe.tasks.from_plan import make_task
 
 LISTEN = """
 [scene]
@@ -212,6 +213,21 @@ def test_an_array_that_is_silent_is_named(tmp_path):
     session.world.raw_array.receive = lambda *_: []  # deaf
     with pytest.raises(canprobe.BusError, match=r"sent 0 of 1 images of its frames 4D0h-4D1h"), session:
         pass
+
+
+def test_an_array_that_falls_silent_ends_the_run():
+    with Session(listen("linker12x6", duration=3.0)) as session:
+        array = session.world.raw_array
+        cycles = []
+
+        def mute(measurement):
+            cycles.append(measurement.cycle)
+            if measurement.cycle == 200:
+                array.running = False
+
+        with pytest.raises(canprobe.SafetyStop, match="no tactile frame for 49 cycles"):
+            session.run(make_task(session.plan), mute)
+    assert cycles[-1] == pytest.approx(200 + 48, abs=8)  # six images of eight cycles, from the last one
 
 
 def test_a_saved_scene_takes_its_array_file_along(tmp_path):
