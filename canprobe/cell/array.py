@@ -205,6 +205,10 @@ class RawReceiver(ArrayReceiver):
         """Whole images so far."""
         return self.assembler.frames
 
+    def has(self, images: int) -> bool:
+        """Whether so many whole images have come."""
+        return self.images >= images
+
     def assemble(self, can_id: int, data: bytes, t_ns: int) -> TactileFrame | None:
         """Take one frame; the image that it completes, once the array is tared."""
         image = self.assembler.push(can_id, data, t_ns)

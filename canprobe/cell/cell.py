@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from functools import partial
 from types import TracebackType
 from typing import TypeVar
 
@@ -95,6 +96,7 @@ class Cell:
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
         self._bring_up = BringUp(self._network, self.watch, make_setups(plan), setup.bring_up, self._say)
+        self._array_started = False
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -175,9 +177,8 @@ class Cell:
         if not isinstance(array, RawReceiver):
             return
         wire, clock = array.wire, self._port.clock
-        self._say(
-            f"start the array on {array.channel}{f' and tare {wire.tare_images} images' * bool(wire.tare_images)}"
-        )
+        self._say(f"start the array on {array.channel}")
+        self._array_started = True
         send_on(self._port, array.channel, wire.start)
         if wire.sampling == "sync":
             return  # its images begin with the cycle
@@ -196,10 +197,10 @@ class Cell:
                 )
             if wire.poll:
                 send_on(self._port, array.channel, wire.poll)
-            self._network.pump_until(lambda before=array.images: array.images > before, 1.5 * period_s)  # type: ignore[misc]
+            self._network.pump_until(partial(array.has, array.images + 1), 1.5 * period_s)
 
     def _stop_array(self) -> None:
-        if isinstance(self.tactile, RawReceiver) and self.tactile.wire.stop:
+        if isinstance(self.tactile, RawReceiver) and self._array_started:
             send_on(self._port, self.tactile.channel, self.tactile.wire.stop)
 
     def __exit__(

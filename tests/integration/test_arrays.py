@@ -185,6 +185,21 @@ def test_the_speed_of_a_scan_is_limited_by_the_image_rate():
         plan_of(touch(slow))
 
 
+def test_only_a_free_running_array_has_any_rate():
+    assert plan_of(listen("uskin4x4", "rate_hz = 90")).raw[0].rate_hz == 90
+    with pytest.raises(
+        PlanError, match=r"an image every 5\.714 cycles cannot be asked for; take 66\.6667 or 57\.1429 Hz"
+    ):
+        plan_of(listen("linker12x6", "rate_hz = 70"))
+
+
+def test_an_array_may_come_on_its_own_sphere(tmp_path):
+    file = tmp_path / "ball.toml"
+    file.write_text("[array]\n[sensor]\nrows = 8\ncolumns = 8\npitch_mm = 2\n[probe]\nradius_mm = 20\n")
+    setup = resolve(touch(f'array = "{file}"'))
+    assert (setup.array.pad.mount_radius_m, setup.probe.radius) == (0.02, 0.02)
+
+
 @pytest.mark.parametrize(
     ("sensor", "problem"),
     [
