@@ -70,7 +70,7 @@ class Stage:
             self._add_object(self._shape)
         if self._model is not None:
             self._links = [self._api.add_frame(f"/arm/{i}", show_axes=False) for i in range(self._model.n + 1)]
-            for part in arm_parts(self._model):
+            for part in arm_parts(self._model.chain):
                 self._add(f"/arm/{part.frame}/{part.name}", part.mesh, part.colour)
         if scene.probe is not None:
             self._add_probe(scene.probe.radius_mm * 1e-3, taxels=scene.sensor is not None)

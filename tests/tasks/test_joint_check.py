@@ -8,13 +8,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from puma_arm import UPENN
 
 import canprobe
 from canprobe.cell.controller import Measurement
 from canprobe.cell.supervisor import JointGuard
 from canprobe.cli.operator import TerminalOperator
 from canprobe.robot.model import joints_to_units, units_to_joints
-from canprobe.robot.puma import UPENN
 from canprobe.tasks.untouched import Answer, JointCheck
 
 PERIOD_S = 0.02
