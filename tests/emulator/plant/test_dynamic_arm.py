@@ -344,5 +344,5 @@ def test_an_ideal_arm_of_any_kind_follows_too(made):
 
 
 def test_an_arm_without_bodies_has_no_dynamics():
-    with pytest.raises(PlanError, match="the masses of arm 'upenn' are not known"):
+    with pytest.raises(PlanError, match="the masses of arm 'puma260' are not known"):
         make_arm(replace(config(), bodies=None))
