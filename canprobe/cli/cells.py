@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.scenes import add_arguments as add_arguments
-from canprobe.cli.scenes import print_packaged
+from canprobe.cli import scenes
 
 HELP = "list the packaged cells"
 EXAMPLE = """\
@@ -14,7 +13,9 @@ examples:
   canprobe run cylinder --cell puma560
 """
 
+add_arguments = scenes.add_arguments
+
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged cell, and the folder of their files."""
-    return print_packaged("cells", args, "copy one to change it, or let `canprobe init` write one")
+    return scenes.print_packaged("cells", args, "copy one to change it, or let `canprobe init` write one")
