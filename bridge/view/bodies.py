@@ -61,12 +61,14 @@ class Part:
         frame: 0 for the base, i for the frame behind joint i.
         mesh: in that frame, m.
         colour: RGB, 0–255.
+        flat: its triangles are shaded apart: edges stay sharp without doubled vertices.
     """
 
     name: str
     frame: int
     mesh: Mesh
     colour: tuple[int, int, int]
+    flat: bool = False
 
 
 def link_frames(chain: Chain, q: ArrayLike) -> Array:

@@ -323,8 +323,8 @@ class PlantSettings:
     fidelity: Fidelity = "ideal"
     """Model of the arm."""
     true_cell: Annotated[str | None, ScenePath()] = None
-    """Cell whose chain the emulated arm has where it differs from the one that the controller uses. Its base is placed
-    so that the start point stays where it is."""
+    """Cell whose chain the emulated arm has where it differs from the one that the controller uses: a packaged name, or
+    a path relative to the file. Its base is placed so that the start point stays where it is."""
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
     """Integrator of the equations of motion."""
     step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0

@@ -58,12 +58,18 @@ def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys
 def test_a_run_takes_the_files_of_its_cell_along(tmp_path, urdf, capsys):
     folder, out = tmp_path / "cell", tmp_path / "run"
     assert main(["init", str(folder), "--urdf", str(urdf)]) == 0
+    text = (folder / "cell.toml").read_text().replace("mount_mm = [0, 0, 0]", "mount_mm = [0, 0, 1]")
+    (folder / "scene.toml").write_text(text)  # a name that the scene of a run has too
+    with (folder / "first.toml").open("a") as first:
+        first.write('[plant]\ntrue_cell = "scene.toml"\n')
     assert main(["run", str(folder / "first.toml"), "--duration", "0.5", "--out", str(out)]) == 0
     before = resolve(load_scene(folder / "first.toml"))
     shutil.rmtree(folder)
     out.rename(tmp_path / "moved")
     again = resolve(load_scene(tmp_path / "moved" / "scene.toml"))
     assert (again.arm.model.chain.fixed == before.arm.model.chain.fixed).all()
+    assert (again.truth.model.chain.fixed == before.truth.model.chain.fixed).all()
+    assert (again.truth.model.chain.fixed != again.arm.model.chain.fixed).any()
     assert main(["replay", str(tmp_path / "moved")]) == 0
 
 
