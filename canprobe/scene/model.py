@@ -264,7 +264,9 @@ class LimitSettings:
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15
     """Highest force before the run. The tare of the array would take it for zero."""
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
-    """Angle that is kept from every joint stop."""
+    """Angle that is kept from the stops of revolute joints."""
+    joint_margin_mm: Annotated[float, Range(0, 1000)] = 3.5
+    """Travel that is kept from the stops of prismatic joints."""
     joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0
     """Share of the speed limits of the arm."""
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0

@@ -6,6 +6,7 @@ import json
 import shutil
 import tomllib
 
+import numpy as np
 import pytest
 
 from canprobe.cli import main
@@ -49,6 +50,10 @@ def test_the_first_scene_of_an_arm_on_a_rail_runs_at_once(tmp_path, urdf, capsys
     summary = json.loads(capsys.readouterr().out)
     assert summary["completed"]
     assert summary["contact"]["contact_fraction"] == 1.0
+    log = np.load(out / "log.npz")  # the rail in m, the others in rad
+    for name in ("q", "q_target"):
+        slides, turns = np.isfinite(log[f"{name}_m"]).any(axis=0), np.isfinite(log[f"{name}_rad"]).any(axis=0)
+        assert slides.tolist() == [True] + 6 * [False] and turns.tolist() == [False] + 6 * [True]
     cell = tomllib.loads((folder / "cell.toml").read_text())
     assert list(cell["joints"]) == ["rail", "j1", "j2", "j3", "j4", "j5", "j6"]
     assert cell["joints"]["rail"]["kind"] == "prismatic"
