@@ -15,7 +15,7 @@ from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.results.summary import RunResult, log_columns, summarise, write_files
+from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
@@ -280,6 +280,7 @@ class OpenCell(Session):
             self.truth,
             {name: on_run_clock(records, start_s) for name, records in estimates.items()},
             record.taxels,
+            tactile_columns(self.cell),
             surface_map,
             consistency,
             self.out,
