@@ -156,8 +156,10 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    if not len(result.log["t_s"]):
+    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
+    if not len(result.log["t_s"]) or not drawn:
         return
+    say(f"draw {', '.join(drawn)}")
     if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
@@ -261,6 +263,8 @@ class OpenCell(Session):
 
     def _conclude(self, failure: BaseException | None) -> None:
         record, start_s = record_of(self._last), self.cell.start_ns * 1e-9
+        if record.shape is not None and self.scene.shape is not None and self.scene.shape.also:
+            self._say(f"estimate again with {', '.join(self.scene.shape.also)}")
         estimates = _estimates(self.scene, record.shape)
         surface_map, consistency, map_summary = _mapped(self.scene, record.shape, start_s)
         summary = summarise(
