@@ -1,8 +1,8 @@
 """From a silent bus to operational nodes, step by step; `BringUp.run` is the order, the steps follow below it.
 
 1. Listen: where another master is at work nothing is sent.
-2. Reset all nodes, of drives that are homed only the communication, and wait for their boot-ups. The reset takes the nodes over: before it no way out sends anything,
-   after it every way out leaves them pre-operational.
+2. Reset all nodes, of drives that are homed only the communication, and wait for their boot-ups. The reset takes the
+   nodes over: before it no way out sends anything, after it every way out leaves them pre-operational.
 3. Identify and configure all nodes side by side, each in its own order (`BringUp._configure`): identity, what the
    device must hold by itself, the writes with read-back, and where asked for storage.
 4. Start all nodes and wait for their heartbeats.
