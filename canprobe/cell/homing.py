@@ -2,7 +2,8 @@
 
 Homing goes by SDO, after bring-up: the nodes are operational, there is no SYNC, and one drive at a time is enabled, in
 mode 6. The master's heartbeat goes on, so that a drive notices when the master dies. On every way out the drive is
-stopped and disabled, and has its mode of the cycle again.
+stopped and disabled, and has its mode of the cycle again. Limit switches are beyond the range of a joint, where a run
+could not begin: a joint whose home is there goes back inside in profile position (mode 1), where the drive has it.
 
 A drive keeps its zero until its power goes; bring-up therefore resets its communication only. What a drive cannot say
 is whether its zero is that of this cell. So a record on the master's disk has, by node: the identity, what homing
@@ -13,9 +14,10 @@ Source: CiA 402-2, "Homing mode", objects 607Ch, 6098h, 6099h, 609Ah; statusword
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,15 +27,20 @@ import numpy as np
 from canprobe.bus.disk import write_text
 from canprobe.bus.network import Dialogue, Dialogues, PumpedNetwork
 from canprobe.cell.bringup import MODE_DISPLAY, read_entry, write_entry
+from canprobe.cell.supervisor import JointGuard
 from canprobe.cell.watch import NodeWatch
+from canprobe.eds.description import Description
 from canprobe.errors import CanprobeError, NodeError, UsageError
 from canprobe.planning.configuration import HOME_OFFSET, MODE, NodeSetup, Write
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import (
+    CHANGE_IMMEDIATELY,
     HOMING_ATTAINED,
     HOMING_ERROR,
     HOMING_START,
+    NEW_SETPOINT,
     POWERED_STATES,
+    SETPOINT_ACKNOWLEDGE,
     TARGET_REACHED,
     DriveState,
     OperationMode,
@@ -50,7 +57,8 @@ POLL_S = 0.01
 TOLERANCE = math.radians(1.0)
 """By which a position may differ from the record, and at home from the home offset, rad; a slide's is in proportion."""
 CONTROLWORD, STATUSWORD, POSITION, IDENTITY = 0x6040, 0x6041, 0x6064, 0x1018
-_DONE = 1 << HOMING_ATTAINED | 1 << TARGET_REACHED
+TARGET, PROFILE_SPEED = 0x607A, 0x6081
+_ENABLE = 0x0F
 _OFF = frozenset(DriveState) - POWERED_STATES
 _DISABLED = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON})
 _HERE = frozenset({35, 37})
@@ -135,6 +143,8 @@ class Homing:
         self._setups = [by_id[drive.node_id] for drive in self._drives]
         self._network, self._watch, self._supervise = network, watch, supervise
         self._record, self._say = ZeroRecord(record), say
+        guard = JointGuard(plan)
+        self._low, self._high = guard.low + TOLERANCE * self._model.radian, guard.high - TOLERANCE * self._model.radian
         self._heartbeat_ns = 0
         zeros = {axis: drive.zero for axis, drive in enumerate(self._drives) if drive.zero is not None}
         self.order = tuple(sorted(zeros, key=lambda axis: (zeros[axis].order, axis)))
@@ -178,7 +188,7 @@ class Homing:
         """What a drive answers now, and the settings by which its zero would be right, as JSON gives it back."""
         setup, drive, model = self._setups[axis], self._drives[axis], self._model
         assert drive.zero is not None
-        there = [sub for sub in range(1, 5) if _has(setup, IDENTITY, sub)]
+        there = [sub for sub in range(1, 5) if Description(setup.dictionary).entry(IDENTITY, sub) is not None]
         entries = {write.place: (write.index, write.subindex) for write in setup.homing}
         return {
             "identity": [self._read(setup, IDENTITY, sub) for sub in there],
@@ -217,32 +227,32 @@ class Homing:
             NodeError: the drive reports an error, is lost, or does not find its home position in time.
         """
         setup, zero = self._setups[axis], self._zero(axis)
-        home = round(drive_position_at(self._model, axis, zero.home, self._positions(axis)))
+        units = self._positions(axis)
+        home = round(drive_position_at(self._model, axis, zero.home, units))
         self.known.discard(axis)
         if axis in self._recorded:
             self._record.put(setup.node_id, None)
-        try:
-            self._run(setup, zero, home)
-        except BaseException:
-            failure = self._stop(setup)
-            done = "is stopped and disabled" if failure is None else f"could not be stopped ({failure})"
-            self._say(f"{setup.name} ({self._model.joints[axis].name}) {done}; it is not homed")
-            raise
-        if failure := self._stop(setup):
-            raise failure
+        with self._left_disabled(setup):
+            self._find_home(setup, zero, home)
         found, braking = self._read(setup, POSITION, 0), zero.zero_speed**2 / (2.0 * zero.acceleration)
-        units = abs(float(self._model.units_per_q[axis, axis]))
-        if abs(found - home) > self._tolerance(axis) + braking * units:
+        if abs(found - home) > self._tolerance(axis) + braking * abs(float(self._model.units_per_q[axis, axis])):
             raise self._error(
                 setup,
                 f"homed, but is at {found} (6064h) where {home} was expected with 607Ch = {-home}: the drive may count"
                 " the home offset the other way round",
             )
+        inside = float(np.clip(zero.home, self._low[axis], self._high[axis]))
+        joint, stands = self._model.joints[axis], "it stands there"
+        if inside != zero.home and _has_profile_position(setup):
+            with self._left_disabled(setup):
+                self._move(setup, zero, round(drive_position_at(self._model, axis, inside, units)))
+            stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
+        elif inside != zero.home:
+            stands = "it stands there, outside its range: move it inside by hand before a run"
         self.known.add(axis)
         if axis in self._recorded:
             self._record.put(setup.node_id, self._evidence(axis))
-        joint = self._model.joints[axis]
-        return f"{setup.name} ({joint.name}) is homed: home is at {joint.text(zero.home, '.2f')}, 6064h = {found}"
+        return f"{setup.name} ({joint.name}) is homed: home is at {joint.text(zero.home, '.2f')}; {stands}"
 
     def keep_alive(self) -> None:
         """Let a little time pass, with heartbeats, as while an operator thinks.
@@ -270,38 +280,71 @@ class Homing:
             units[other] = self._read(self._setups[other], POSITION, 0)
         return units
 
-    def _run(self, setup: NodeSetup, zero: Settings, home: int) -> None:
-        """From the mode to the home position."""
-        for write in (Write(MODE, 0, OperationMode.HOMING, "mode of operation"), *setup.homing):
+    def _find_home(self, setup: NodeSetup, zero: Settings, home: int) -> None:
+        for write in setup.homing:
             self._write(setup, replace(write, value=-home) if write.index == HOME_OFFSET else write)
+        self._enable(setup, OperationMode.HOMING)
+        self._command(setup, _ENABLE | 1 << HOMING_START)
+        what = f"find its home position by method {zero.method}"
+        self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, error=HOMING_ERROR)
+
+    def _move(self, setup: NodeSetup, zero: Settings, target: int) -> None:
+        """Profile position."""
+        speed = next(write.value for write in setup.homing if (write.index, write.subindex) == (0x6099, 1))
+        self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
+        self._enable(setup, OperationMode.PROFILE_POSITION)
+        self._write(setup, Write(TARGET, 0, target, "target position"))
+        self._command(setup, _ENABLE | 1 << NEW_SETPOINT | 1 << CHANGE_IMMEDIATELY)
+        what = "move back into its range"
+        self._await_bits(setup, (SETPOINT_ACKNOWLEDGE,), self._times.enable_s, what)
+        self._command(setup, _ENABLE)
+        self._await_bits(setup, (TARGET_REACHED,), zero.timeout_s, what)
+
+    def _enable(self, setup: NodeSetup, mode: OperationMode) -> None:
+        self._write(setup, Write(MODE, 0, mode, "mode of operation"))
         self._await(
-            lambda: self._read(setup, MODE_DISPLAY, 0) == OperationMode.HOMING,
+            lambda: self._read(setup, MODE_DISPLAY, 0) == mode,
             self._times.enable_s,
-            lambda: self._error(setup, "does not go into homing (6061h) after 6060h = 6 was written"),
+            lambda: self._error(setup, f"is not in mode {mode} (6061h) after it was written to 6060h"),
         )
         self._lead(setup, DriveState.OPERATION_ENABLED, frozenset({DriveState.OPERATION_ENABLED}), self._times.enable_s)
-        self._command(setup, 0x0F | 1 << HOMING_START)
-        limit = f"in {zero.timeout_s:g} s (homing_timeout_s)"
-        self._await(
-            lambda: self._attained(setup, zero),
-            zero.timeout_s,
-            lambda: self._error(setup, f"did not find its home position by method {zero.method} {limit}"),
-        )
 
-    def _attained(self, setup: NodeSetup, zero: Settings) -> bool:
-        word = self._read(setup, STATUSWORD, 0)
-        if word >> HOMING_ERROR & 1:
-            raise self._error(setup, f"homing error (6041h bit 13), method {zero.method}")
-        if known_state(word) is not DriveState.OPERATION_ENABLED:
-            raise self._error(setup, f"is {describe_state(word)} while it is homed")
-        return word & _DONE == _DONE
+    def _await_bits(
+        self, setup: NodeSetup, bits: tuple[int, ...], timeout_s: float, what: str, *, error: int | None = None
+    ) -> None:
+        """Until the statusword has these bits; the time limit, the error bit and a drive that is off are errors."""
+        wanted = sum(1 << bit for bit in bits)
+
+        def reached() -> bool:
+            word = self._read(setup, STATUSWORD, 0)
+            if error is not None and word >> error & 1:
+                raise self._error(setup, f"could not {what}: its statusword (6041h) has bit {error}")
+            if known_state(word) is not DriveState.OPERATION_ENABLED:
+                raise self._error(setup, f"could not {what}: it is {describe_state(word)}")
+            return word & wanted == wanted
+
+        self._await(reached, timeout_s, lambda: self._error(setup, f"did not {what} in {timeout_s:g} s"))
+
+    @contextlib.contextmanager
+    def _left_disabled(self, setup: NodeSetup) -> Iterator[None]:
+        """On every way out the drive is stopped, disabled, and in its mode of the cycle."""
+        try:
+            yield
+        except BaseException:
+            failure = self._stop(setup)
+            done = "is stopped and disabled" if failure is None else f"could not be stopped ({failure})"
+            self._say(f"{setup.name} {done}; it is not homed")
+            raise
+        if failure := self._stop(setup):
+            raise failure
 
     def _stop(self, setup: NodeSetup) -> CanprobeError | None:
         """Stop, disable, and leave homing; an interrupt repeats it once. What went wrong is returned."""
         for _ in range(2):
             try:
                 stop_s = self._times.stop_s
-                self._lead(setup, DriveState.QUICK_STOP_ACTIVE, _OFF, stop_s, supervised=False)
+                with contextlib.suppress(NodeError):  # by 605Ah it may stay in quick stop
+                    self._lead(setup, DriveState.QUICK_STOP_ACTIVE, _OFF, stop_s, supervised=False)
                 self._lead(setup, DriveState.SWITCH_ON_DISABLED, _DISABLED, stop_s, supervised=False)
                 if setup.mode is not None:
                     self._write(setup, Write(MODE, 0, setup.mode, "mode of operation"))
@@ -390,5 +433,7 @@ class Homing:
         self._network.pump_until(done, timeout_s)
 
 
-def _has(setup: NodeSetup, index: int, subindex: int) -> bool:
-    return index in setup.dictionary and subindex in setup.dictionary[index]
+def _has_profile_position(setup: NodeSetup) -> bool:
+    drive = Description(setup.dictionary)
+    listed = drive.modes is None or OperationMode.PROFILE_POSITION in drive.modes
+    return listed and drive.entry(TARGET) is not None and drive.entry(PROFILE_SPEED) is not None

@@ -36,7 +36,7 @@ def switch(joint, method):
 
 
 def scene_of(methods, *, emulated=False, **keys):
-    """A PUMA 260 whose joints are homed by the methods; 0: it is absolute. Index pulses are not where a cell has them."""
+    """A PUMA 260 whose joints are homed by the methods, from the base; 0: it has an absolute encoder."""
     scene = canprobe.load_scene("free")
     joints = dict(scene.joints)
     for (name, joint), method in zip(scene.joints.items(), methods, strict=False):
@@ -118,7 +118,7 @@ def test_joints_in_their_order_each_alone_with_heartbeats_and_without_sync(tmp_p
     assert 0x80 not in {can_id for can_id, _ in bench.frames}
     assert sum(can_id == 0x77F for can_id, _ in bench.frames) > 50
     modes = [data[4] for i, data in bench.frames if i == 0x602 and data[:4].hex() == "2f606000"]
-    assert modes == [8, 6, 8]
+    assert modes == [8, 6, 8, 1, 8], "homing, and back inside its range"
 
 
 def test_a_coupled_wrist(tmp_path):
@@ -246,15 +246,17 @@ def failure(bench):
 def test_a_switch_that_is_never_found(tmp_path, monkeypatch):
     monkeypatch.setattr(Plant, "limit_switches", lambda *_: (-np.inf, np.inf))
     bench = Bench(scene_of([17], homing_timeout_s=5.0), tmp_path)
-    assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s (homing_timeout_s)")
-    assert bench.words(1)[-2:] == [0x02, 0x00]
-    assert "joint 1 (joint_1) is stopped and disabled; it is not homed" in bench.said
+    assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s")
+    assert bench.words(1)[-1] == 0x02
+    assert "joint 1 is stopped and disabled; it is not homed" in bench.said
 
 
 def test_a_homing_error_of_the_drive(tmp_path, monkeypatch):
     monkeypatch.setattr("canprobe.emulator.drive.homing.SEARCH_S", 0.5)
     bench = Bench(scene_of([17]), tmp_path)
-    assert failure(bench) == "node 1: (joint 1) homing error (6041h bit 13), method 17"
+    assert failure(bench) == (
+        "node 1: (joint 1) could not find its home position by method 17: its statusword (6041h) has bit 13"
+    )
 
 
 class Once(Participant):
@@ -314,6 +316,6 @@ def test_a_drive_that_cannot_be_homed_is_refused_with_what_it_has(tmp_path, chan
     make = MAKES["late_target"]()
     changed(make.objects, 0x6502, 0, default=1 << 7 | 1 << 5)
     change_objects(make.objects)
-    eds = write_eds("variant", tmp_path, make)
+    eds = write_eds(make, tmp_path)
     scene = change(scene_of([17]), arm={"eds": str(eds)}, cycle={"rate_hz": 333.333})
     assert any(told in problem for problem in reasons(scene))
