@@ -110,6 +110,20 @@ def test_the_index_pulse_behind_the_positive_switch(tmp_path):
     assert q[1:] == pytest.approx(truth[1:], abs=2e-4)
 
 
+def test_a_slide_whose_drive_counts_backwards_finds_its_negative_switch_at_its_upper_end(tmp_path):
+    scene = canprobe.load_scene("free", "gantry")
+    x = replace(scene.joints["x"], sign=-1, zero="homing", homing_method=17, home_mm=404.0, homing_speed_mm_s=100.0)
+    scene = replace(scene, joints={**scene.joints, "x": x})
+    bench = Bench(change(scene, arm={"emulated": False}, scene={"figures": False}), tmp_path)
+    with bench.cell(to_home=True) as cell:
+        assert "move in positive direction to the negative limit switch, at 100 and 2 mm/s" in cell.homing.question(0)
+        told = cell.homing.home(0)
+    assert told.startswith("joint 1 (x) is homed: home is at 404.00 mm; it stands at 39")
+    q, truth = bench.run()
+    assert q == pytest.approx(truth, abs=1e-5)
+    assert 0.39 < q[0] < 0.4
+
+
 def test_joints_in_their_order_each_alone_with_heartbeats_and_without_sync(tmp_path):
     bench = Bench(scene_of([35, 18, 35], homing_speed_deg_s=20.0), tmp_path)
     bench.home()

@@ -39,7 +39,7 @@ def test_a_run_after_up_home(bench: Any, monkeypatch: pytest.MonkeyPatch) -> Non
     assert "joint 6 (joint_6) is homed: home is at 0.00 deg; it stands there" in told
     record = bench.folder / "state" / "canprobe" / "zeros-puma260.json"
     assert list(json.loads(record.read_text())["nodes"]) == ["1", "6"]
-    for _ in range(2):
-        assert bench.start("run", scene, *ON_VCAN0, "--duration", 0.5, "--out", "results").end(0) == []
-    bench.assert_left_safe(bench.results("results").last, *range(1, 7))
+    for out in ("once", "again"):
+        assert bench.start("run", scene, *ON_VCAN0, "--duration", 0.5, "--out", out).end(0) == []
+    bench.assert_left_safe(bench.results("again").last, *range(1, 7))
     assert served.running
