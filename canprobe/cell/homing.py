@@ -31,7 +31,7 @@ from canprobe.cell.supervisor import JointGuard
 from canprobe.cell.watch import NodeWatch
 from canprobe.eds.description import Description
 from canprobe.errors import CanprobeError, NodeError, UsageError
-from canprobe.planning.configuration import HOME_OFFSET, MODE, NodeSetup, Write
+from canprobe.planning.configuration import HOME_OFFSET, HOMES_HERE, MODE, NodeSetup, Write
 from canprobe.planning.model import HEARTBEAT_PRODUCED_MS, MASTER_NODE_ID, Plan
 from canprobe.protocol.cia402 import (
     CHANGE_IMMEDIATELY,
@@ -61,7 +61,6 @@ TARGET, PROFILE_SPEED = 0x607A, 0x6081
 _ENABLE = 0x0F
 _OFF = frozenset(DriveState) - POWERED_STATES
 _DISABLED = frozenset({DriveState.SWITCH_ON_DISABLED, DriveState.FAULT, DriveState.NOT_READY_TO_SWITCH_ON})
-_HERE = frozenset({35, 37})
 _MOVES = {
     **{1: (-1, "the index pulse at the negative limit switch"), 2: (1, "the index pulse at the positive limit switch")},
     **{17: (-1, "the negative limit switch"), 18: (1, "the positive limit switch")},
@@ -145,7 +144,7 @@ class Homing:
         self._record, self._say = ZeroRecord(record), say
         guard = JointGuard(plan)
         self._low, self._high = guard.low + TOLERANCE * self._model.radian, guard.high - TOLERANCE * self._model.radian
-        self._heartbeat_ns = 0
+        self._beats, self._heartbeat_ns = False, 0
         zeros = {axis: drive.zero for axis, drive in enumerate(self._drives) if drive.zero is not None}
         self.order = tuple(sorted(zeros, key=lambda axis: (zeros[axis].order, axis)))
         self._recorded = tuple(axis for axis in self.order if not self._drives[axis].emulated)
@@ -180,6 +179,7 @@ class Homing:
 
     def keep(self) -> None:
         """Write down where the drives are left, as far as their zeros are known."""
+        self._beats = True
         for axis in self._recorded:
             if axis in self.known:
                 self._record.put(self._drives[axis].node_id, self._evidence(axis))
@@ -208,7 +208,7 @@ class Homing:
         joint, zero, setup = self._model.joints[axis], self._zero(axis), self._setups[axis]
         up = 1 if self._model.units_per_q[axis, axis] > 0.0 else -1
         speeds = f"{joint.shown(zero.speed):g} and {joint.shown(zero.zero_speed):g} {joint.unit}/s"
-        if zero.method in _HERE:
+        if zero.method in HOMES_HERE:
             way = f"take the place where it stands for {joint.text(zero.home, '.2f')}"
         elif zero.method in _MOVES:
             direction, goal = _MOVES[zero.method]
@@ -227,6 +227,7 @@ class Homing:
             NodeError: the drive reports an error, is lost, or does not find its home position in time.
         """
         setup, zero = self._setups[axis], self._zero(axis)
+        self._beats = True
         units = self._positions(axis)
         home = round(drive_position_at(self._model, axis, zero.home, units))
         self.known.discard(axis)
@@ -235,7 +236,8 @@ class Homing:
         with self._left_disabled(setup):
             self._find_home(setup, zero, home)
         found, braking = self._read(setup, POSITION, 0), zero.zero_speed**2 / (2.0 * zero.acceleration)
-        if abs(found - home) > self._tolerance(axis) + braking * abs(float(self._model.units_per_q[axis, axis])):
+        per_q = abs(float(self._model.units_per_q[axis, axis]))
+        if abs(found - home) > self._tolerance(axis) + braking * per_q:
             raise self._error(
                 setup,
                 f"homed, but is at {found} (6064h) where {home} was expected with 607Ch = {-home}: the drive may count"
@@ -245,7 +247,8 @@ class Homing:
         joint, stands = self._model.joints[axis], "it stands there"
         if inside != zero.home and _has_profile_position(setup):
             with self._left_disabled(setup):
-                self._move(setup, zero, round(drive_position_at(self._model, axis, inside, units)))
+                target = round(drive_position_at(self._model, axis, inside, units))
+                self._move(setup, zero, target, max(1, round(zero.speed * per_q)))
             stands = f"it stands at {joint.text(inside, '.2f')}, inside its range"
         elif inside != zero.home:
             stands = "it stands there, outside its range: move it inside by hand before a run"
@@ -286,19 +289,19 @@ class Homing:
         self._enable(setup, OperationMode.HOMING)
         self._command(setup, _ENABLE | 1 << HOMING_START)
         what = f"find its home position by method {zero.method}"
-        self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, error=HOMING_ERROR)
+        late = f"did not {what} in {zero.timeout_s:g} s (homing_timeout_s)"
+        self._await_bits(setup, (HOMING_ATTAINED, TARGET_REACHED), zero.timeout_s, what, late, error=HOMING_ERROR)
 
-    def _move(self, setup: NodeSetup, zero: Settings, target: int) -> None:
+    def _move(self, setup: NodeSetup, zero: Settings, target: int, speed: int) -> None:
         """Profile position."""
-        speed = next(write.value for write in setup.homing if (write.index, write.subindex) == (0x6099, 1))
         self._write(setup, Write(PROFILE_SPEED, 0, speed, "profile velocity"))
         self._enable(setup, OperationMode.PROFILE_POSITION)
         self._write(setup, Write(TARGET, 0, target, "target position"))
         self._command(setup, _ENABLE | 1 << NEW_SETPOINT | 1 << CHANGE_IMMEDIATELY)
-        what = "move back into its range"
-        self._await_bits(setup, (SETPOINT_ACKNOWLEDGE,), self._times.enable_s, what)
+        what, late = "move back into its range", f"is homed, but did not reach {target} (607Ah), inside its range"
+        self._await_bits(setup, (SETPOINT_ACKNOWLEDGE,), self._times.enable_s, what, late)
         self._command(setup, _ENABLE)
-        self._await_bits(setup, (TARGET_REACHED,), zero.timeout_s, what)
+        self._await_bits(setup, (TARGET_REACHED,), zero.timeout_s, what, late)
 
     def _enable(self, setup: NodeSetup, mode: OperationMode) -> None:
         self._write(setup, Write(MODE, 0, mode, "mode of operation"))
@@ -310,7 +313,14 @@ class Homing:
         self._lead(setup, DriveState.OPERATION_ENABLED, frozenset({DriveState.OPERATION_ENABLED}), self._times.enable_s)
 
     def _await_bits(
-        self, setup: NodeSetup, bits: tuple[int, ...], timeout_s: float, what: str, *, error: int | None = None
+        self,
+        setup: NodeSetup,
+        bits: tuple[int, ...],
+        timeout_s: float,
+        what: str,
+        late: str,
+        *,
+        error: int | None = None,
     ) -> None:
         """Until the statusword has these bits; the time limit, the error bit and a drive that is off are errors."""
         wanted = sum(1 << bit for bit in bits)
@@ -323,7 +333,7 @@ class Homing:
                 raise self._error(setup, f"could not {what}: it is {describe_state(word)}")
             return word & wanted == wanted
 
-        self._await(reached, timeout_s, lambda: self._error(setup, f"did not {what} in {timeout_s:g} s"))
+        self._await(reached, timeout_s, lambda: self._error(setup, late))
 
     @contextlib.contextmanager
     def _left_disabled(self, setup: NodeSetup) -> Iterator[None]:
@@ -427,7 +437,7 @@ class Homing:
 
     def _pump(self, done: Callable[[], bool], timeout_s: float) -> None:
         port = self._network.port
-        if (now_ns := port.clock.now_ns()) >= self._heartbeat_ns:
+        if self._beats and (now_ns := port.clock.now_ns()) >= self._heartbeat_ns:  # nodes that heard one expect more
             self._heartbeat_ns = now_ns + HEARTBEAT_PRODUCED_MS * 1_000_000
             port.send_batch([pack_heartbeat(MASTER_NODE_ID, NmtState.OPERATIONAL)])
         self._network.pump_until(done, timeout_s)

@@ -52,6 +52,8 @@ EMCY_INHIBIT_100US = 1000
 """At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
 MODE = 0x6060
 HOME_OFFSET = 0x607C
+HOMES_HERE = frozenset({35, 37})
+"""Homing methods that take the present position."""
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
@@ -335,10 +337,11 @@ def _homing_writes(plan: Plan, node: PlannedNode) -> list[Write]:
     home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
     units = abs(float(arm.model.units_per_q[axis, axis]))
     ramp = "homing accelerates as the device has it"
+    still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
     return [
         Write(0x6098, 0, zero.method, "homing method"),
-        Write(0x6099, 1, max(1, round(zero.speed * units)), "speed of the search for the switch"),
-        Write(0x6099, 2, max(1, round(zero.zero_speed * units)), "speed of the search for the zero"),
+        Write(0x6099, 1, max(1, round(zero.speed * units)), "speed of the search for the switch", still),
+        Write(0x6099, 2, max(1, round(zero.zero_speed * units)), "speed of the search for the zero", still),
         Write(0x609A, 0, max(1, round(zero.acceleration * units)), "acceleration in homing", ramp),
         Write(HOME_OFFSET, 0, -round(home), "home offset"),
     ]

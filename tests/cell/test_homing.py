@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +51,7 @@ def scene_of(methods, *, emulated=False, **keys):
 class Bench:
     """Real drives, as far as the cell can see: on a bus that outlives the cells."""
 
-    def __init__(self, scene, folder, *, faults=()):
+    def __init__(self, scene, folder, *, faults=(), around=lambda node: node):
         self.plan = canprobe.plan(scene)
         self.bus = LockstepBus(VirtualClock(), "can0")
         self.world = make_world(self.plan, self.plan.node_ids, truth=False, homed=False)
@@ -57,7 +59,7 @@ class Bench:
         self.frames, self.said = [], []
         self.bus.recorder = lambda can_id, data, t_ns: self.frames.append((can_id, data))
         for node in self.world.nodes:
-            self.bus.attach(FaultyNode(node, faults) if faults else node)
+            self.bus.attach(FaultyNode(node, faults) if faults else around(node))
 
     def cell(self, *, to_home=False):
         return Cell(self.plan, self.bus.port(), zeros=self.record, to_home=to_home, say=self.said.append)
@@ -260,7 +262,7 @@ def failure(bench):
 def test_a_switch_that_is_never_found(tmp_path, monkeypatch):
     monkeypatch.setattr(Plant, "limit_switches", lambda *_: (-np.inf, np.inf))
     bench = Bench(scene_of([17], homing_timeout_s=5.0), tmp_path)
-    assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s")
+    assert failure(bench) == ("node 1: (joint 1) did not find its home position by method 17 in 5 s (homing_timeout_s)")
     assert bench.words(1)[-1] == 0x02
     assert "joint 1 is stopped and disabled; it is not homed" in bench.said
 
@@ -271,6 +273,42 @@ def test_a_homing_error_of_the_drive(tmp_path, monkeypatch):
     assert failure(bench) == (
         "node 1: (joint 1) could not find its home position by method 17: its statusword (6041h) has bit 13"
     )
+
+
+class Turned:
+    """A drive that takes the home offset with the other sign."""
+
+    def __init__(self, node):
+        self._node = node
+
+    def __getattr__(self, name):
+        return getattr(self._node, name)
+
+    def receive(self, can_id, data, t_ns):
+        written = data[:4].hex() == "237c6000"
+        data = data[:4] + struct.pack("<i", -struct.unpack("<i", data[4:])[0]) if written else data
+        answers = self._node.receive(can_id, data, t_ns)
+        read = [(i, d) for i, d in answers if d[1:4].hex() == "7c6000" and d[0] >> 5 == 2]
+        turned = [(i, d[:4] + struct.pack("<i", -struct.unpack("<i", d[4:])[0])) for i, d in read]
+        return turned or answers
+
+
+def test_a_drive_that_takes_the_home_offset_the_other_way_round(tmp_path):
+    bench = Bench(scene_of([35]), tmp_path, around=Turned)
+    assert re.fullmatch(
+        r"node 1: \(joint 1\) homed, but is at -(\d+) \(6064h\) where \1 was expected with 607Ch = -\1: the drive may"
+        " count the home offset the other way round",
+        failure(bench),
+    )
+
+
+def test_without_profile_position_the_joint_is_left_at_its_switch(tmp_path):
+    make = MAKES["late_target"]()
+    changed(make.objects, 0x6502, 0, default=1 << 7 | 1 << 5)
+    eds = {"eds": str(write_eds(make, tmp_path)), "emulated": False}
+    bench = Bench(change(scene_of([18], homing_speed_deg_s=20.0), arm=eds, cycle={"rate_hz": 333.333}), tmp_path)
+    (told,) = bench.home()
+    assert told.endswith("it stands there, outside its range: move it inside by hand before a run")
 
 
 class Once(Participant):
