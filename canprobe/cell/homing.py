@@ -178,11 +178,20 @@ class Homing:
             )
 
     def keep(self) -> None:
-        """Write down where the drives are left, as far as their zeros are known."""
-        self._beats = True
+        """Write down where the drives are left, as far as their zeros are known.
+
+        Raises:
+            CanprobeError: a drive does not answer; the others are written down all the same.
+        """
+        self._beats, failures = True, list[CanprobeError]()
         for axis in self._recorded:
             if axis in self.known:
-                self._record.put(self._drives[axis].node_id, self._evidence(axis))
+                try:
+                    self._record.put(self._drives[axis].node_id, self._evidence(axis))
+                except CanprobeError as error:
+                    failures.append(error)
+        if failures:
+            raise failures[0]
 
     def _evidence(self, axis: int) -> dict[str, Any]:
         """What a drive answers now, and the settings by which its zero would be right, as JSON gives it back."""
