@@ -18,7 +18,7 @@ from canprobe.cell.controller import Command, Controller, Measurement, as_contro
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
 from canprobe.cell.homing import Homing
-from canprobe.cell.log import Notes, RunLog
+from canprobe.cell.log import Notes, RunLog, TactileLog
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
@@ -63,6 +63,7 @@ class Cell:
         drives, tactile: of the arm and the array; None in a scene without one.
         log: one row a cycle, with times since the first SYNC, so that nothing that is computed from them depends on
             how long bring-up took; `start_ns` brings them onto the run's clock.
+        tactile_log: one row a tactile frame, on the same clock.
         notes: what went wrong and was lived with.
         watch: what the nodes report of themselves.
         supervisor: the checks, from bring-up on.
@@ -85,6 +86,7 @@ class Cell:
     ) -> None:
         setup = plan.setup
         self.log = RunLog(rows_kept)
+        self.tactile_log = TactileLog(rows_kept)
         self.drives = make_drives(plan)
         self.tactile = make_tactile(plan)
         self.notes = Notes()
@@ -407,9 +409,11 @@ class Cell:
             self.notes.add(event.what, node_id=event.node_id, t_s=(event.t_ns - self._origin_ns) * 1e-9)
 
     def _record(self, measurement: Measurement, command: Command | None) -> None:
-        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9}
+        assert self.cycle is not None
+        row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9, "sync_late_us": self.cycle.late_ns * 1e-3}
         if self.drives is not None:
             row["q_rad"] = measurement.q
+            row["q_age"] = measurement.q_age
             row["statusword"] = measurement.statuswords
             if measurement.torque_permille:
                 row["torque_permille"] = measurement.torque_permille
@@ -417,6 +421,10 @@ class Cell:
             if command.q_target is not None:
                 row["q_target_rad"] = command.q_target
             row.update(command.columns)
+        if self.tactile is not None:
+            row["tactile_age"] = measurement.tactile_age
+            if measurement.tactile is not None:
+                self.tactile_log.add(measurement.t_ns, measurement.tactile)
         self.log.add(row)
         if self._observers is not None:
             self._observers.cycle(self.start_ns, measurement, command)

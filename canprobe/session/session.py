@@ -138,7 +138,7 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
 Array = NDArray[np.float64]
 LEFT_BY_RUNS = (
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
-    *("surface.png", "tool.toml", "truth.npz"),
+    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
