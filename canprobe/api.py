@@ -23,7 +23,7 @@ from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
 from canprobe.session.session import Say, Session, quiet, resolve_scene
 from canprobe.session.target import LOCKSTEP, Target
-from canprobe.session.up import check_joints, up
+from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.tasks.task import record_of
@@ -42,6 +42,7 @@ __all__ = [
     "commission",
     "emulate",
     "emulate_eds",
+    "home",
     "monitor",
     "open_cell",
     "run",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from canprobe.cell.bringup import BringUp
 from canprobe.cell.controller import Command, Controller, Measurement, as_controller
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
+from canprobe.cell.homing import Homing
 from canprobe.cell.log import Notes, RunLog, TactileLog
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
@@ -54,6 +56,8 @@ class Cell:
         observers: called after each cycle.
         rows_kept: cycles whose row of the log is kept; None for all.
         origin_ns: time on the port's clock from which the run counts, as ``bus.log`` does.
+        zeros: file that records the zeros of real drives that are homed.
+        to_home: the drives are about to be homed; else bring-up refuses one that is not.
 
     Attributes:
         drives, tactile: of the arm and the array; None in a scene without one.
@@ -64,6 +68,7 @@ class Cell:
         watch: what the nodes report of themselves.
         supervisor: the checks, from bring-up on.
         cycle: None before bring-up is done.
+        homing: of the drives without an absolute encoder; None where there are none.
     """
 
     def __init__(
@@ -76,6 +81,8 @@ class Cell:
         observers: Observers | None = None,
         rows_kept: int | None = None,
         origin_ns: int = 0,
+        zeros: Path | None = None,
+        to_home: bool = False,
     ) -> None:
         setup = plan.setup
         self.log = RunLog(rows_kept)
@@ -96,7 +103,12 @@ class Cell:
         self._rows_kept = rows_kept
         self._origin_ns = origin_ns
         self._network = PumpedNetwork(port, other=self._other)
-        self._bring_up = BringUp(self._network, self.watch, make_setups(plan), setup.bring_up, self._say)
+        setups = make_setups(plan)
+        self._bring_up = BringUp(self._network, self.watch, setups, setup.bring_up, self._say)
+        homed = any(one.homing for one in setups)
+        besides: dict[str, Any] = {"supervise": self._supervise_homing, "record": zeros, "say": self._say}
+        self.homing = Homing(plan, setups, self._network, self.watch, **besides) if homed else None
+        self._to_home = to_home
         self._holding = False
         self._running = False
         self._retreats_for: CanprobeError | None = None
@@ -161,6 +173,10 @@ class Cell:
                 kept=self._rows_kept,
             )
             self.watch.start(self._port.clock.now_ns())
+            if self.homing is not None:
+                self.homing.look()
+                if not self._to_home:
+                    self.homing.refuse_unhomed()
         except BaseException:
             self.close()
             raise
@@ -333,6 +349,12 @@ class Cell:
         if finding is not None and finding.condition.reaction is not Reaction.HOLD:
             raise finding.error
 
+    def _supervise_homing(self) -> None:
+        self._note_alarms()
+        seen = self.supervisor.seen
+        seen.sync_ns, seen.controller_state = self._port.clock.now_ns(), self._port.state
+        self._supervise_enabling()
+
     def _supervise(self, measurement: Measurement) -> bool:
         """Check the table's conditions; True: hold in this cycle."""
         self._look(measurement)
@@ -414,6 +436,8 @@ class Cell:
         self._try(self._stop_drives)
         if force := self.supervisor.pressing():
             self.notes.add(f"the probe is left pressing with {force:.1f} N: {FREE_IT}")
+        if self.homing is not None:
+            self._try(self.homing.keep)
         self._try(self._bring_up.release)
         self._try(self._port.close)
         for line in self.supervisor.notes():
