@@ -42,6 +42,7 @@ ERROR_HISTORY = 0x1003
 SOFTWARE_VERSION, STORE_PARAMETERS, VERIFY_CONFIGURATION = 0x100A, 0x1010, 0x1020
 SAVE = int.from_bytes(b"save", "little")
 HEARTBEAT_CONSUMER = 0x1016
+PDO_PARAMETERS = range(0x1400, 0x1C00)
 MODE_DISPLAY = 0x6061
 REVISION = 3
 IDENTITY_NAMES = {1: "vendor id", 2: "product code", 3: "revision number", 4: "serial number"}
@@ -465,11 +466,11 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
         if held == value and write.read_back:
             return
         if value == write.value:
-            raise _refused(setup, write, error) from error
+            raise _refused(setup, write, error, held) from error
         try:
             yield from download(write.index, write.subindex, variable.encode_raw(value))
         except SdoAbortedError as again:
-            raise _refused(setup, write, again) from again
+            raise _refused(setup, write, again, held) from again
     except SdoCommunicationError as error:
         raise NodeError(setup.node_id, _failed(setup, write, error)) from error
     if not write.read_back:
@@ -481,8 +482,13 @@ def write_entry(setup: NodeSetup, write: Write) -> Dialogue:
         )
 
 
-def _refused(setup: NodeSetup, write: Write, error: Exception) -> RefusedError:
-    return RefusedError(setup.node_id, _failed(setup, write, error))
+def _refused(setup: NodeSetup, write: Write, error: Exception, held: int | None = None) -> RefusedError:
+    text = _failed(setup, write, error)
+    if held is not None:
+        text += f"; it holds {held:#x}"
+        if write.index in PDO_PARAMETERS:
+            text += ": if it is fixed, say so in the EDS (AccessType=const), and the plan takes it as it is"
+    return RefusedError(setup.node_id, text)
 
 
 def _failed(setup: NodeSetup, write: Write, error: Exception) -> str:

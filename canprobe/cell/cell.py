@@ -300,12 +300,16 @@ class Cell:
             if all(self.drives.rests):
                 return
             self._cycle_until((), self._one_cycle_s)
-        axis = next(axis for axis, rest in zip(self.drives.axes, self.drives.rests, strict=True) if not rest)
-        raise NodeError(
-            axis.node_id,
-            f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
-            + self.watch.last_words(axis.node_id),
-        )
+        i = self.drives.rests.index(False)
+        node_id, last_ns = self.drives.axes[i].node_id, self._plan.traffic.budget.looks_ns[-1]
+        if (came_ns := self.drives.lateness_ns[i]) > last_ns:
+            why = (
+                f"its TPDO comes {came_ns * 1e-6:.2f} ms behind the SYNC, and the cell waits for it until"
+                f" {last_ns * 1e-6:.2f} ms: lower cycle.rate_hz"
+            )
+        else:
+            why = f"reports no position that stays for {REST_TIMEOUT_S:g} s: moving, or a wrong TPDO"
+        raise NodeError(node_id, why + self.watch.last_words(node_id))
 
     @property
     def _one_cycle_s(self) -> float:
