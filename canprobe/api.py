@@ -15,7 +15,7 @@ from canprobe.cell.cycle import Observation, Observer, Observers
 from canprobe.errors import CanprobeError, ResultsError, UsageError
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Plan
-from canprobe.results.summary import RunResult, log_columns, summarise, write_files
+from canprobe.results.summary import RunResult, log_columns, summarise, tactile_columns, write_files
 from canprobe.scene.model import Scene
 from canprobe.scene.resolve import resolve
 from canprobe.session.children import Bridges
@@ -23,7 +23,7 @@ from canprobe.session.emulation import emulate, emulate_eds
 from canprobe.session.looking import commission, monitor, scan
 from canprobe.session.session import Say, Session, quiet, resolve_scene
 from canprobe.session.target import LOCKSTEP, Target
-from canprobe.session.up import check_joints, up
+from canprobe.session.up import check_joints, home, up
 from canprobe.tasks.from_plan import make_task
 from canprobe.tasks.shape import ShapeRecord, ShapeTracker, on_run_clock
 from canprobe.tasks.task import record_of
@@ -42,6 +42,7 @@ __all__ = [
     "commission",
     "emulate",
     "emulate_eds",
+    "home",
     "monitor",
     "open_cell",
     "run",
@@ -156,8 +157,10 @@ def _mapped(
 
 
 def _draw(result: RunResult, out: Path, say: Say) -> None:
-    if not len(result.log["t_s"]):
+    drawn = [name for name in ("report.html", "report.png", "surface.png") if name in result.plan.outputs]
+    if not len(result.log["t_s"]) or not drawn:
         return
+    say(f"draw {', '.join(drawn)}")
     if "report.html" in result.plan.outputs:
         page, recorded = (importlib.import_module(f"canprobe.bridge.view.{name}") for name in ("browser", "recorded"))
         try:
@@ -261,6 +264,8 @@ class OpenCell(Session):
 
     def _conclude(self, failure: BaseException | None) -> None:
         record, start_s = record_of(self._last), self.cell.start_ns * 1e-9
+        if record.shape is not None and self.scene.shape is not None and self.scene.shape.also:
+            self._say(f"estimate again with {', '.join(self.scene.shape.also)}")
         estimates = _estimates(self.scene, record.shape)
         surface_map, consistency, map_summary = _mapped(self.scene, record.shape, start_s)
         summary = summarise(
@@ -280,6 +285,7 @@ class OpenCell(Session):
             self.truth,
             {name: on_run_clock(records, start_s) for name, records in estimates.items()},
             record.taxels,
+            tactile_columns(self.cell),
             surface_map,
             consistency,
             self.out,

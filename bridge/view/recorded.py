@@ -17,16 +17,13 @@ from numpy.typing import NDArray
 from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
-from canprobe.bus.disk import read_candump
-from canprobe.cell.array import make_tactile
+from canprobe.bus.disk import read_npz
 from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
-from canprobe.planning.make import make_plan
 from canprobe.results.summary import SCHEMA, check_clock
 from canprobe.scene.geometry import true_object
 from canprobe.scene.load import load_scene
 from canprobe.scene.model import Scene
-from canprobe.scene.resolve import resolve
 from canprobe.tasks.probing import Phase
 from canprobe.touch.linear_algebra import tangent_rotation
 
@@ -55,7 +52,7 @@ class RecordedRun:
         log: the columns of `_SHAPES` that the run has; every row one cycle.
         answer_rows: rows at which the estimator gave a new answer.
         answers: at each of them.
-        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time on the clock of the log.
+        taxels: (t_s, (16, 16) uint8 counts) of each tactile frame, by rising time of the cycle that used it.
     """
 
     scene: Scene
@@ -117,7 +114,7 @@ def read_run(folder: Path) -> RecordedRun:
     """Read what is shown of a run.
 
     Args:
-        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``bus.log``.
+        folder: that `canprobe run` wrote: ``scene.toml``, ``log.npz`` and, for the taxels, ``tactile.npz``.
 
     Raises:
         UsageError: no such folder, a file that is missing or of another canprobe, or a column that is not as it should
@@ -139,20 +136,15 @@ def read_run(folder: Path) -> RecordedRun:
         log=log,
         answer_rows=rows,
         answers=tuple(judge(_patch(log, row), shape) for row in rows.tolist()),
-        taxels=tuple(_read_taxels(folder / "bus.log", scene)),
+        taxels=tuple(_read_taxels(folder / "tactile.npz")),
     )
 
 
-def _read_taxels(file: Path, scene: Scene) -> Iterator[tuple[float, NDArray[np.uint8]]]:
-    """The tactile frames of a candump log; none where there is no log, or in features mode."""
-    if scene.sensor is None or scene.sensor.mode == "features" or not file.is_file():
-        return
-    receiver = make_tactile(make_plan(resolve(scene)))
-    assert receiver is not None
-    for t_ns, _, can_id, data in read_candump(file, only=frozenset(receiver.cob_ids)):
-        frame = receiver.assembler.push(can_id, data, t_ns)
-        if frame is not None:
-            yield t_ns * 1e-9, frame.taxels
+def _read_taxels(file: Path) -> Iterator[tuple[float, NDArray[np.uint8]]]:
+    """The images that the cell used; none where there is no file, or of an array that sends features."""
+    columns = read_npz(file) if file.is_file() else {}
+    if columns and np.isnan(columns["features"]).all():
+        yield from zip(columns["t_s"].tolist(), columns["taxels"], strict=True)
 
 
 def _check_schema(file: Path) -> None:

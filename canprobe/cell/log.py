@@ -1,4 +1,4 @@
-"""The run's log: one row a cycle in memory, columns with units as arrays; and the notes of what went wrong."""
+"""The run's log: a row a cycle and a row a tactile frame, in memory; and the notes of what went wrong."""
 
 from __future__ import annotations
 
@@ -6,14 +6,16 @@ import warnings
 from collections import deque
 from collections.abc import Iterable, Mapping, MutableSequence, Sequence
 from copy import copy
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, fields
 from itertools import count, groupby
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from canprobe.cell.controller import TactileSample
 from canprobe.errors import CanprobeError, NodeError
+from canprobe.protocol.tactile import Features
 
 _NO_NUMBERS = (TypeError, ValueError, OverflowError)
 _Part = tuple[list[int], Sequence[Any] | NDArray[np.float64]]
@@ -168,6 +170,38 @@ def joint_positions(log: Mapping[str, NDArray[np.float64]], name: str = "q") -> 
     if turning is None or sliding is None:
         return sliding if turning is None else turning
     return np.where(np.isnan(turning), sliding, turning)
+
+
+class TactileLog:
+    """The tactile frames that the cell used: images and what belongs to them, for `tactile.npz`.
+
+    Args:
+        kept: how many frames are kept, the last ones; None for all.
+    """
+
+    def __init__(self, kept: int | None = None) -> None:
+        self._rows: MutableSequence[tuple[int, TactileSample]] = [] if kept is None else deque(maxlen=kept)
+
+    def add(self, t_ns: int, sample: TactileSample) -> None:
+        """Append the sample that became usable in the cycle at ``t_ns``."""
+        self._rows.append((t_ns, sample))
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """One row a frame (m, ...): when it was usable and sampled, s, taxels, their window, features; empty without.
+
+        Features (m, 7) are NaN in a frame of taxels.
+        """
+        if not self._rows:
+            return {}
+        frames = [sample.frame for _, sample in self._rows]
+        none = (np.nan,) * len(fields(Features))
+        return {
+            "t_s": np.array([t_ns * 1e-9 for t_ns, _ in self._rows]),
+            "t_sample_s": np.array([sample.t_sample_ns * 1e-9 for _, sample in self._rows]),
+            "taxels": np.array([frame.taxels for frame in frames]),
+            "window": np.array([frame.window for frame in frames]),
+            "features": np.array([none if f.features is None else astuple(f.features) for f in frames]),
+        }
 
 
 # What went wrong in a run and was lived with: one line a kind, however often it happened.

@@ -136,6 +136,7 @@ def _scene_server(args: argparse.Namespace) -> Callable[[], None]:
         origin_ns=args.origin,
         store_folder=args.store,
         without_id=args.without_id,
+        homed=args.parent is not None,  # there is nobody who could home the nodes of a run
         say=say,
     )
 

@@ -105,7 +105,14 @@ class World:
         object.__setattr__(self, "participants", [*self.nodes, *recorders])
 
 
-def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, without_id: Collection[int] = ()) -> World:
+def make_world(
+    plan: Plan,
+    node_ids: Collection[int],
+    *,
+    truth: bool = True,
+    without_id: Collection[int] = (),
+    homed: bool = True,
+) -> World:
     """The emulated nodes of a plan, behind one plant.
 
     Where the scene gives a node no serial number, its node id in the scene is one.
@@ -115,17 +122,19 @@ def make_world(plan: Plan, node_ids: Collection[int], *, truth: bool = True, wit
         node_ids: which of its nodes to emulate.
         truth: whether what is true is recorded.
         without_id: which of them start without a node id and wait for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
     """
     plant = Plant(_plant_config(plan.setup))
     nodes = []
     for node in plan.nodes:
         if node.node_id not in node_ids:
             continue
-        nodes.append(_node(plan.setup, node, UNCONFIGURED if node.node_id in without_id else node.node_id, plant))
+        node_id = UNCONFIGURED if node.node_id in without_id else node.node_id
+        nodes.append(_node(plan.setup, node, node_id, plant, homed))
     return World(tuple(nodes), plant, TruthRecorder(plant) if truth else None)
 
 
-def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> SlaveNode:
+def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed: bool) -> SlaveNode:
     dictionary = load_eds(planned.eds, planned.node_id)
     speaks_lss = node_id == UNCONFIGURED or dictionary.device_information.LSS_supported
     od_of = partial(load_eds, planned.eds) if speaks_lss else None
@@ -140,7 +149,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant) -> Sla
             plant,
             od_of,
             quirks=drive.quirks,
-            incremental=drive.incremental,
+            incremental=drive.zero is not None and not homed,
             seed=setup.seed,
         )
     else:

@@ -14,6 +14,7 @@ from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+from canprobe.errors import install_line
 from canprobe.planning.bridges import bridge_outputs
 from canprobe.planning.model import Choice, PlannedPdo, Traffic
 from canprobe.planning.window import TOLERATED, cut_patch, measured_share, patch_across_taxels, window_choices
@@ -297,11 +298,11 @@ def _not_shown(setup: Setup) -> Iterator[tuple[str, str]]:
         yield from ((what, "scene.figures = false") for what in (FIGURE, PAGE))
     else:
         if importlib.util.find_spec("matplotlib") is None:
-            yield FIGURE, "the study extra is not installed: pip install 'canprobe[study]'"
+            yield FIGURE, f"the study extra is not installed: {install_line('study')}"
         if setup.kind == "listen":
             yield PAGE, 'task.kind = "listen": nothing moves'
         elif importlib.util.find_spec("viser") is None:
-            yield PAGE, "the view extra is not installed: pip install 'canprobe[view]'"
+            yield PAGE, f"the view extra is not installed: {install_line('view')}"
     if not setup.bridge.use:
         yield "bridges to other tools", "no [bridge]: no other tool is fed"
 

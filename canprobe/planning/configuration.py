@@ -40,17 +40,20 @@ from canprobe.planning.model import (
     PlannedNode,
     PlannedPdo,
 )
-from canprobe.planning.operation import INTERPOLATION_TIME
+from canprobe.planning.operation import INTERPOLATION_TIME, homing_problems
 from canprobe.planning.traffic import CLASSIC_BYTES
 from canprobe.protocol.cia402 import OperationMode
 from canprobe.protocol.tactile import TactileMode
 from canprobe.robot.chain import Array
-from canprobe.robot.model import ArmModel
+from canprobe.robot.model import ArmModel, coupled_joints, drive_position_at, joints_to_units
 
 SYNC_START_VALUE = 1
 EMCY_INHIBIT_100US = 1000
 """At most ten emergencies a second from a node: one for every late SYNC would make the next SYNC late too."""
 MODE = 0x6060
+HOME_OFFSET = 0x607C
+HOMES_HERE = frozenset({35, 37})
+"""Homing methods that take the present position."""
 TARE = 0x65726174  # "tare", as 1010h has "save"
 FOLLOWING_WINDOW_DEG = 5.0
 FOLLOWING_TIMEOUT_MS = 50
@@ -140,6 +143,8 @@ class NodeSetup:
         left_out: what the EDS excludes of what the cell would have set.
         problems: what the EDS excludes of what must be set; empty in a plan.
         mode: of operation, which 6061h must confirm; None: no drive.
+        homing: what a drive needs for homing, in order; empty: it is not homed. Where the drive is coupled to other
+            joints, the home offset depends on where they are; here they are in the start posture.
     """
 
     node_id: int
@@ -153,6 +158,7 @@ class NodeSetup:
     left_out: tuple[LeftOut, ...] = ()
     problems: tuple[str, ...] = ()
     mode: int | None = None
+    homing: tuple[Write, ...] = ()
 
     @property
     def configuration_date(self) -> dict[int, int]:
@@ -177,6 +183,8 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         device, [*_pdo_writes(plan, node, device), *_common_writes(plan), *of_kind(plan, node, device)]
     )
     times = [_interpolation_writes(device, time) for time in node.interpolation[1:]]
+    homing, not_homing, no_homing = _possible(device, _homing_writes(plan, node))
+    no_homing += [*homing_problems(device), *_coupling_problems(plan, node)] if homing else []
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
@@ -186,9 +194,10 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
         writes=tuple(writes),
         given=_array_given(plan, device.od) if node.kind == "tactile" else (),
         otherwise=tuple(tuple(_possible(device, other)[0]) for other in times),
-        left_out=tuple(left_out),
-        problems=tuple(problems),
+        left_out=(*left_out, *not_homing),
+        problems=(*problems, *no_homing),
         mode=node.mode,
+        homing=tuple(homing),
     )
 
 
@@ -316,6 +325,45 @@ def _drive_writes(plan: Plan, node: PlannedNode, device: Abilities) -> list[Writ
         Write(0x605A, 0, QUICK_STOP_AND_DISABLE, "what a quick stop does", quick),
         Write(0x6007, 0, ABORT_QUICK_STOP, "what a lost connection does", lost),
     ]
+
+
+def _homing_writes(plan: Plan, node: PlannedNode) -> list[Write]:
+    """607Ch is from the home position to the zero: at home the drive is at -607Ch. Source: CiA 402-2, "Homing mode"."""
+    arm = plan.setup.arm
+    axis = arm.node_ids.index(node.node_id) if arm is not None and node.kind == "drive" else None
+    zero = arm.drives[axis].zero if arm is not None and axis is not None else None
+    if arm is None or axis is None or zero is None:
+        return []
+    home = drive_position_at(arm.model, axis, zero.home, joints_to_units(arm.model, arm.q_start))
+    units = abs(float(arm.model.units_per_q[axis, axis]))
+    ramp = "homing accelerates as the device has it"
+    still = f"method {zero.method} does without" if zero.method in HOMES_HERE else None
+    return [
+        Write(0x6098, 0, zero.method, "homing method"),
+        Write(0x6099, 1, max(1, round(zero.speed * units)), "speed of the search for the switch", still),
+        Write(0x6099, 2, max(1, round(zero.zero_speed * units)), "speed of the search for the zero", still),
+        Write(0x609A, 0, max(1, round(zero.acceleration * units)), "acceleration in homing", ramp),
+        Write(HOME_OFFSET, 0, -round(home), "home offset"),
+    ]
+
+
+def _coupling_problems(plan: Plan, node: PlannedNode) -> list[str]:
+    """Where the zero of a drive depends on other joints, they have to be known when it is homed."""
+    arm = plan.setup.arm
+    assert arm is not None
+    axis = arm.node_ids.index(node.node_id)
+    own, joints, problems = arm.drives[axis].zero, arm.model.joints, []
+    for other in sorted(coupled_joints(arm.model, axis)):
+        zero, name = arm.drives[other].zero, joints[other].name
+        if own is None or zero is None or (zero.order, other) < (own.order, axis):
+            continue
+        way = (
+            "each depends on the other: one of them needs an absolute encoder"
+            if axis in coupled_joints(arm.model, other)
+            else f"joints.{name}.homing_order must be lower than {own.order}"
+        )
+        problems.append(f"the zero of {joints[axis].name} depends on {name}, which is homed later: {way}")
+    return problems
 
 
 def _interpolation_writes(device: Abilities, time: Interpolation) -> list[Write]:

@@ -319,7 +319,7 @@ class PlantSettings:
     """`[plant]`: how the emulated arm, contact and array behave.
 
     With fidelity `ideal` each drive tracks as a second-order system, whatever pushes against it. `dynamic` adds rigid
-    links, friction, the cascade of the drives and the push of the object; it needs `pip install 'canprobe[dynamics]'`.
+    links, friction, the cascade of the drives and the push of the object; it needs the extra `dynamics`.
     """
 
     fidelity: Fidelity = "ideal"

@@ -11,7 +11,7 @@ from canprobe.errors import PlanError
 from canprobe.robot.inverse import FIXED_POLE, task_rows
 from canprobe.robot.model import ArmModel
 from canprobe.robot.tool_calibration import ball_approaches
-from canprobe.scene.arms import Bodies, arm_model, per_joint
+from canprobe.scene.arms import Bodies, arm_model, homing_of, per_joint
 from canprobe.scene.geometry import T_flange_probe, expected_ball, scan_axes, true_object
 from canprobe.scene.hardware import EmulateSettings
 from canprobe.scene.load import read_cell
@@ -101,9 +101,12 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
+            zero=homing_of(joint, number),
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
-        for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)
+        for number, ((node_id, emulated), joint) in enumerate(
+            zip(scene.drives.items(), joints.values(), strict=True), start=1
+        )
     ]
     q_start = per_joint(joints, "start")
     arm = Arm(model, tuple(drives), q_start, settings.missed_syncs, settings.grouped_rpdo, settings.torque)

@@ -85,15 +85,38 @@ class Quirks:
 
 
 @dataclass(frozen=True, slots=True)
+class Homing:
+    """How a drive that does not know its zero after power on finds it. Units are rad or m, and s.
+
+    Attributes:
+        method: of CiA 402, 6098h.
+        order: lower numbers are homed first.
+        home: position of the joint at its home position.
+        speed: of the search for the switch.
+        zero_speed: of the search for its edge or the index pulse.
+        acceleration: in homing.
+        timeout_s: longest time that it may take.
+    """
+
+    method: int
+    order: int
+    home: float
+    speed: float
+    zero_speed: float
+    acceleration: float
+    timeout_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Drive(Node):
     """One joint drive.
 
     Attributes:
-        incremental: it does not know its zero after power on, and has to be homed.
+        zero: how it is homed; None: its encoder is absolute.
         quirks: of an emulated one; None: it has none.
     """
 
-    incremental: bool = False
+    zero: Homing | None = None
     quirks: Quirks | None = None
 
 

@@ -35,6 +35,7 @@ def emulate(
     origin_ns: int | None = None,
     store_folder: Path | None = None,
     without_id: tuple[int, ...] = (),
+    homed: bool = False,
     say: Say = quiet,
 ) -> None:
     """Serve emulated nodes on a real interface until interrupted, for any master.
@@ -48,6 +49,7 @@ def emulate(
         origin_ns: time on CLOCK_MONOTONIC that is 0 in that file; by default when the nodes begin to be served.
         store_folder: folder with a file for each node, where its 1010h and LSS store; None forgets at the end.
         without_id: which of the nodes start without a node id, for LSS to give them one.
+        homed: drives that have to be homed start with their zeros, and keep them.
         say: called when the nodes are about to be served.
 
     Raises:
@@ -69,7 +71,7 @@ def emulate(
     _make_places(truth_path, store_folder)
     with _free_port(target, wanted, busy, way_out=way_out, say=say) as port:
         rehearse(plan)
-        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id)
+        world = make_world(plan, node_ids, truth=truth_path is not None, without_id=without_id, homed=homed)
         if world.recorder is not None:
             world.recorder.origin_ns = port.clock.now_ns() if origin_ns is None else origin_ns
         _keep(world.nodes, store_folder)

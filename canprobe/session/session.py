@@ -6,6 +6,7 @@ The composition root: the only place, besides studies and tests, that sees both 
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -137,7 +138,7 @@ def lockstep_bus(scene: Scene, clock: VirtualClock, channel: str) -> LockstepBus
 Array = NDArray[np.float64]
 LEFT_BY_RUNS = (
     *("log.npz", "report.html", "report.png", "run.mcap", "scene.toml", "summary.json", "surface.npz"),
-    *("surface.png", "tool.toml", "truth.npz"),
+    *("surface.png", "tactile.npz", "tool.toml", "truth.npz"),
 )
 """Files of a run's folder besides ``bus.log``."""
 Write = Callable[[int, bytes, int], None]
@@ -190,6 +191,15 @@ def write_scene(scene: Scene, folder: Path) -> None:
             part.write_bytes(content)
 
 
+def zeros_file(plan: Plan) -> Path | None:
+    """Where the zeros of a cell's real drives are recorded, in the user's state folder; None where none is homed."""
+    arm = plan.setup.arm
+    if arm is None or all(drive.zero is None or drive.emulated for drive in arm.drives):
+        return None
+    folder = os.environ.get("XDG_STATE_HOME") or "~/.local/state"
+    return Path(folder).expanduser() / "canprobe" / f"zeros-{arm.model.name}.json"
+
+
 class Session:
     """One cell from bring-up to safe stop. A context manager; :meth:`run` may be called more than once inside.
 
@@ -199,6 +209,7 @@ class Session:
         say: called with each step.
         observers: called after each cycle with its measurement, command and frames.
         rows_kept: cycles whose row of the log is kept, and no truth; None for all.
+        to_home: the drives are about to be homed.
 
     Attributes:
         origin_ns: where the run's clock is 0, on the clock of its bus: every time in its files counts from there.
@@ -212,8 +223,11 @@ class Session:
         say: Say = quiet,
         observers: Sequence[Observer | Callable[[Observation], None]] = (),
         rows_kept: int | None = None,
+        *,
+        to_home: bool = False,
     ) -> None:
         self._rows_kept = rows_kept
+        self._to_home = to_home
         self.plan = scene if isinstance(scene, Plan) else make_plan(resolve(scene))
         self.scene = self.plan.scene
         self.out = out
@@ -287,6 +301,8 @@ class Session:
                 observers=self.observers,
                 rows_kept=self._rows_kept,
                 origin_ns=self.origin_ns,
+                zeros=zeros_file(self.plan),
+                to_home=self._to_home,
             )
             if self.scene.bus.interface != LOCKSTEP:
                 self._get_ready(port)

@@ -172,6 +172,7 @@ BUSY = {
     "run": ("run", "free"),
     "up": ("up", "free"),
     "check_joints": ("up", "free", "--check-joints", "--yes"),
+    "home": ("up", "free", "--home", "--yes"),
     "emulate": ("emulate", "free", "--channel", "vcan0"),
     "emulate_eds": ("emulate", "--eds", "puma260_joint.eds", "--node-id", "5", "--channel", "vcan0"),
     "monitor": ("monitor", "free", "--channel", "vcan0"),

@@ -18,7 +18,7 @@ from canprobe.emulator.serve import Exchange, serve
 from canprobe.emulator.world import TruthRecorder
 from canprobe.errors import BusError
 from canprobe.scene.load import load_scene
-from canprobe.scene.setup import Quirks
+from canprobe.scene.setup import Homing, Quirks
 
 MS = 1_000_000
 CYCLE = 2_500_000
@@ -290,9 +290,10 @@ def test_quirks_and_encoders_of_the_setup_are_those_of_its_drives():
     plan = canprobe.plan(load_scene("free"))
     assert plan.setup.arm is not None
     first, second, *others = plan.setup.arm.drives
-    drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), replace(second, incremental=True), *others)
+    incremental = replace(second, zero=Homing(35, 1, 0.0, 0.1, 0.1, 1.0, 10.0))
+    drives = (replace(first, quirks=Quirks(boot_ns=5, refuse=(0x605A,))), incremental, *others)
     quirky = replace(plan, setup=plan.setup.changed("arm", drives=drives))
-    nodes = build.make_world(quirky, plan.node_ids).nodes
+    nodes = build.make_world(quirky, plan.node_ids, homed=False).nodes
     assert [node.start(0) for node in nodes[:3]] == [[], [(0x702, b"\0")], [(0x703, b"\0")]]
     assert nodes[0].advance(5) == [(0x701, b"\0")]
     assert nodes[0].receive(0x601, bytes.fromhex("2b5a600006000000"), 6)[0][1].hex() == "805a600000000106"

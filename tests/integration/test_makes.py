@@ -15,7 +15,7 @@ from scenes import change, reasons
 
 import canprobe
 from canprobe.cell.controller import Command
-from canprobe.emulator.drive import modes
+from canprobe.errors import NodeError
 from canprobe.planning.configuration import make_setups
 from canprobe.planning.make import make_plan
 from canprobe.planning.model import Interpolation
@@ -26,9 +26,7 @@ from canprobe.session.session import Session
 RATE_HZ = 333.333
 SWING = np.radians((3, -3, 3, 3, -3, 3))
 IP, CSP = OperationMode.INTERPOLATED_POSITION, OperationMode.CYCLIC_SYNC_POSITION
-MOVING = {name: CSP for name in MAKES if name not in ("no_cyclic_mode", "interpolated")}
-if hasattr(modes, "InterpolatedPosition"):
-    MOVING["interpolated"] = IP
+MOVING = {name: IP if name == "interpolated" else CSP for name in MAKES if name != "no_cyclic_mode"}
 
 
 def scene_of(make, folder):
@@ -165,6 +163,27 @@ def test_the_drives_are_disabled_on_the_way_out(tmp_path, make):
         (feedback,) = plan.pdos_of(node_id, "tpdo")
         last = [data for can_id, data in frames if can_id == feedback.cob_id][-1]
         assert feedback.layout.unpack(last)[0] & 0x6F == DriveState.SWITCH_ON_DISABLED.value
+
+
+@pytest.mark.parametrize(
+    ("cell", "quirk", "told"),
+    [
+        (
+            "puma260",
+            {"tpdo_delay_us": 1000.0},
+            r"node \d: its TPDO comes [12]\.\d\d ms behind the SYNC, .* until 1\.\d\d ms",
+        ),
+        (
+            "seven-axis",
+            {"fixed_mapping": True},
+            r"node 1: .*1A00h:00 = 0x2 failed: .*; it holds 0x3: if it is fixed, say so",
+        ),
+    ],
+)
+def test_what_only_the_device_tells_is_said_with_what_there_is(tmp_path, cell, quirk, told):
+    scene = change(canprobe.load_scene("cylinder", cell=cell), emulate=quirk, scene={"figures": False})
+    with pytest.raises(NodeError, match=told), Session(scene, tmp_path) as session:
+        session.run(lambda _: Command(done=True))
 
 
 # What a make may have besides: values that the drives do not take, PDOs with more in them, or with less.

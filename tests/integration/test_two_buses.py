@@ -112,7 +112,7 @@ def test_emulated_nodes_on_two_real_buses_are_refused():
 def test_the_log_of_two_buses_is_read_as_the_one_the_cell_had(pressed):
     result, frames = pressed
     plan = result.plan
-    recording = read_recording(result.out / "bus.log", plan, as_taken=False)
+    recording = read_recording(result.out / "bus.log", plan)
     main = [frame for frame in frames if frame[1] == "can0" and frame[2] == 0x080]
     assert len(recording.syncs) == len(main)
     for pdo in plan.pdos:
