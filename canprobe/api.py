@@ -168,7 +168,7 @@ def _draw(result: RunResult, out: Path, say: Say) -> None:
         except UsageError as error:  # a controller's column that is called like one of ours and is something else
             say(f"report.html is left out: {error}")
         else:
-            page.write_page(shown, out / "report.html")
+            page.write_page(shown, out / "report.html", say)
     if "report.png" in result.plan.outputs:
         from canprobe.results.figures import draw_run
         from canprobe.results.surface_figure import draw_surface

@@ -8,6 +8,7 @@ import zipfile
 from bisect import bisect_right
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from canprobe.bridge.sample import ContactFrame, SurfacePatch
 from canprobe.bridge.view.instants import Answer, Moment, judge
 from canprobe.bridge.view.meshes import Array
 from canprobe.bus.disk import read_npz
+from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
 from canprobe.results.summary import SCHEMA, check_clock
 from canprobe.scene.geometry import true_object
@@ -28,6 +30,7 @@ from canprobe.touch.linear_algebra import tangent_rotation
 _SHAPES: dict[str, tuple[int, ...]] = {
     "t_s": (),
     "q_rad": (-1,),
+    "q_m": (-1,),
     "phase": (),
     "force_n": (),
     "contact_mm": (3,),
@@ -40,7 +43,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 """Columns of ``log.npz`` that are shown, and the shape of a row; -1: one value a joint."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)  # without slots: `cached_property`
 class RecordedRun:
     """What is shown of a run.
 
@@ -68,6 +71,11 @@ class RecordedRun:
         """Time of the last cycle, s."""
         return float(self.log["t_s"][-1])
 
+    @cached_property
+    def _q(self) -> Array | None:
+        """(rows, n) rad or m."""
+        return joint_positions(self.log)
+
     def times(self, step_s: float) -> Array:
         """Instants at an even distance from the first cycle to the last, s."""
         start = float(self.log["t_s"][0])
@@ -75,14 +83,14 @@ class RecordedRun:
 
     def at(self, t_s: float) -> Moment:
         """What the cell knew at an instant."""
-        log = self.log
+        log, q = self.log, self._q
         row = max(int(np.searchsorted(log["t_s"], t_s + 1e-9, side="right")) - 1, 0)
         answer = int(np.searchsorted(self.answer_rows, row, side="right")) - 1
         frame = bisect_right(self.taxels, t_s + 1e-9, key=lambda item: item[0]) - 1
         return Moment(
             t_s=float(log["t_s"][row]),
             phase=self._phase(row),
-            q=log["q_rad"][row] if "q_rad" in log and np.isfinite(log["q_rad"][row]).all() else None,
+            q=q[row] if q is not None and np.isfinite(q[row]).all() else None,
             contact=self._contact(row),
             answer=self.answers[answer] if answer >= 0 else None,
             taxels=self.taxels[frame][1] if frame >= 0 else None,

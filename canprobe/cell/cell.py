@@ -18,7 +18,7 @@ from canprobe.cell.controller import Command, Controller, Measurement, as_contro
 from canprobe.cell.cycle import Cycle, Observers
 from canprobe.cell.drives import make_drives
 from canprobe.cell.homing import Homing
-from canprobe.cell.log import Notes, RunLog, TactileLog
+from canprobe.cell.log import Notes, RunLog, TactileLog, joint_columns
 from canprobe.cell.supervision import Finding, Reaction, Seen, limits_of
 from canprobe.cell.supervisor import JointGuard, Supervisor
 from canprobe.cell.watch import NodeWatch
@@ -34,7 +34,7 @@ WARM_UP_S = 0.1
 """Cycling before the drives are enabled, until both sides are up to speed."""
 REST_TIMEOUT_S = 2.0
 FREE_IT = "free it; a run does not begin while the array measures a force"
-OWN_COLUMNS = frozenset({"t_s", "q_rad", "statusword", "torque_permille", "q_target_rad"})
+OWN_COLUMNS = frozenset({"t_s", "q_rad", "q_m", "statusword", "torque_permille", "q_target_rad", "q_target_m"})
 """Of the log; a controller's `Command.columns` have other names."""
 STUCK_NS = 1_000_000_000
 """Time in a cycle after which an interrupt does not wait for its end."""
@@ -95,6 +95,7 @@ class Cell:
         guard = JointGuard(plan) if setup.arm is not None else None
         seen = Seen(limits_of(plan), self.watch, self.drives, self.tactile, port.counters)
         self.supervisor = Supervisor(seen, guard, patch_from(setup) if setup.arm is not None else None)
+        self._slides = np.array([] if setup.arm is None else setup.arm.model.chain.prismatic, dtype=bool)
         self._plan = plan
         self._port = port
         self._to_say = say
@@ -416,14 +417,15 @@ class Cell:
         assert self.cycle is not None
         row: dict[str, object] = {"t_s": measurement.t_ns * 1e-9, "sync_late_us": self.cycle.late_ns * 1e-3}
         if self.drives is not None:
-            row["q_rad"] = measurement.q
+            if measurement.q is not None:
+                row.update(joint_columns("q", measurement.q, self._slides))
             row["q_age"] = measurement.q_age
             row["statusword"] = measurement.statuswords
             if measurement.torque_permille:
                 row["torque_permille"] = measurement.torque_permille
         if command is not None:
             if command.q_target is not None:
-                row["q_target_rad"] = command.q_target
+                row.update(joint_columns("q_target", command.q_target, self._slides))
             row.update(command.columns)
         if self.tactile is not None:
             row["tactile_age"] = measurement.tactile_age

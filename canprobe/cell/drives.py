@@ -1,4 +1,4 @@
-"""The drives as one: TPDOs in and joint angles out, targets in and RPDOs out.
+"""The drives as one: TPDOs in and joint positions out, targets in and RPDOs out.
 
 The drives hold *motor* positions; gears and couplings are undone here and nowhere else.
 """
@@ -370,7 +370,7 @@ class DriveGroup:
         return tuple([track.rested_ns >= REST_NS for track in self._tracks])
 
     def joints(self) -> Vector:
-        """Joint angles (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
+        """Joint positions (n,), rad or m, at this SYNC; where a report is missing, carried on for a few cycles."""
         now_ns = self._deadline_ns
         q = units_to_joints(self._model, np.array([t.position(self._cycle, now_ns) for t in self._tracks]))
         q.flags.writeable = False  # it goes into the log as it was measured, whatever a controller does with it

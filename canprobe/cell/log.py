@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import deque
-from collections.abc import Iterable, MutableSequence, Sequence
+from collections.abc import Iterable, Mapping, MutableSequence, Sequence
 from copy import copy
 from dataclasses import astuple, dataclass, field, fields
 from itertools import count, groupby
@@ -69,7 +69,7 @@ class _RowKind:
 class RunLog:
     """Collects named columns row by row; a column that a row lacks is filled with NaN there.
 
-    Column names carry their unit as a suffix (``t_s``, ``q_deg``, ``force_n``). Values are numbers or small vectors.
+    Column names carry their unit as a suffix (``t_s``, ``q_rad``, ``force_n``). Values are numbers or small vectors.
     A row is kept as one block of numbers: sorting its values into columns would cost ten times as much in the cycle,
     keeping them as they come four times the memory. Nothing in it changes with the arrays that were given.
 
@@ -137,6 +137,39 @@ class RunLog:
             )
             warnings.warn(text, stacklevel=3)
         return out
+
+
+# Positions of joints: columns `q_rad` for those that turn, `q_m` for those that slide, one place a joint in each.
+
+
+def joint_columns(name: str, q: NDArray[np.float64], prismatic: NDArray[np.bool_]) -> dict[str, NDArray[np.float64]]:
+    """Joint positions as columns of the log: of an arm whose joints all turn `name_rad` alone, else with `name_m`.
+
+    Args:
+        name: `q` or `q_target`.
+        q: (n,) rad or m.
+        prismatic: (n,) which joints slide.
+
+    Returns:
+        (n,) each, NaN where a joint is of the other kind.
+    """
+    if not prismatic.any():
+        return {f"{name}_rad": q}
+    sliding = {f"{name}_m": np.where(prismatic, q, np.nan)}
+    return sliding if prismatic.all() else {f"{name}_rad": np.where(prismatic, np.nan, q), **sliding}
+
+
+def joint_positions(log: Mapping[str, NDArray[np.float64]], name: str = "q") -> NDArray[np.float64] | None:
+    """The inverse of `joint_columns` for a whole log: (rows, n) rad or m; None where it has no such columns.
+
+    Args:
+        log: columns by name.
+        name: `q` or `q_target`.
+    """
+    turning, sliding = log.get(f"{name}_rad"), log.get(f"{name}_m")
+    if turning is None or sliding is None:
+        return sliding if turning is None else turning
+    return np.where(np.isnan(turning), sliding, turning)
 
 
 class TactileLog:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from canprobe.cli.output import print_json, print_table
-from canprobe.cli.parser import Parser, add_options
+from canprobe.cli import scenes
 
 HELP = "list the packaged cells"
 EXAMPLE = """\
@@ -14,20 +13,9 @@ examples:
   canprobe run cylinder --cell puma560
 """
 
-
-def add_arguments(parser: Parser) -> None:
-    """Add the command's arguments."""
-    add_options(parser, "--json")
+add_arguments = scenes.add_arguments
 
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged cell, and the folder of their files."""
-    from canprobe.scene.load import packaged_cells, packaged_files
-
-    cells, paths = packaged_cells(), packaged_files("cells")
-    if args.json:
-        print_json([{"name": name, "title": title, "path": str(paths[name])} for name, title in cells])
-    else:
-        print_table(cells)
-        print(f"in {next(iter(paths.values())).parent}; copy one to change it, or let `canprobe init` write one")
-    return 0
+    return scenes.print_packaged("cells", args, "copy one to change it, or let `canprobe init` write one")

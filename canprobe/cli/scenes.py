@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from typing import Literal
 
 from canprobe.cli.output import print_json, print_table
 from canprobe.cli.parser import Parser, add_options
@@ -22,15 +23,17 @@ def add_arguments(parser: Parser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Print name and title of every packaged scene, and the folder of their files."""
-    from canprobe.scene.load import packaged_scenes, scenes_folder
+    return print_packaged("scenes", args, "copy one to change it")
 
-    scenes, folder = packaged_scenes(), scenes_folder()
+
+def print_packaged(what: Literal["scenes", "cells"], args: argparse.Namespace, advice: str) -> int:
+    """Print name and title of every packaged scene or cell, their folder, and what can be done with them."""
+    from canprobe.scene.load import packaged_cells, packaged_files, packaged_scenes
+
+    found, paths = packaged_scenes() if what == "scenes" else packaged_cells(), packaged_files(what)
     if args.json:
-        paths = (str(folder / f"{name}.toml") for name, _ in scenes)
-        print_json(
-            [{"name": name, "title": title, "path": path} for (name, title), path in zip(scenes, paths, strict=True)]
-        )
+        print_json([{"name": name, "title": title, "path": str(paths[name])} for name, title in found])
     else:
-        print_table(scenes)
-        print(f"in {folder}; copy one to change it")
+        print_table(found)
+        print(f"in {next(iter(paths.values())).parent}; {advice}")
     return 0

@@ -267,15 +267,16 @@ class Choice:
 
 @dataclass(frozen=True, slots=True)
 class JointSpeeds:
-    """Fastest joint motion of the task, and what is allowed, one value a joint, deg/s; of a prismatic joint mm/s."""
+    """Fastest joint motion of the task, and what is allowed, one value a joint, each in its unit: deg/s or mm/s."""
 
-    needed_deg_s: tuple[float, ...]
-    limit_deg_s: tuple[float, ...]
+    needed: tuple[float, ...]
+    limit: tuple[float, ...]
+    units: tuple[str, ...]
 
     @property
     def worst_share(self) -> float:
         """Largest share of its limit that a joint is asked for; above 1 it cannot."""
-        return max(need / limit for need, limit in zip(self.needed_deg_s, self.limit_deg_s, strict=True))
+        return max(need / limit for need, limit in zip(self.needed, self.limit, strict=True))
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from canprobe.bus.disk import read_npz
 from canprobe.cell.controller import Measurement, TactileSample
+from canprobe.cell.log import joint_positions
 from canprobe.errors import UsageError
 from canprobe.planning.model import Plan
 from canprobe.protocol.cia402 import DriveState, known_state
@@ -51,7 +52,9 @@ class RunFolder:
         """The measurement of each cycle, as the cell had it; times count from the first cycle."""
         log, samples = self.log, self._samples()
         rows = len(log["t_s"])
-        joints = log.get("q_rad", np.full((rows, 1), np.nan))
+        joints = joint_positions(log)
+        if joints is None:
+            joints = np.full((rows, 1), np.nan)
         ages = log.get("q_age", np.zeros((rows, 0))).astype(int)
         words = log.get("statusword", np.zeros((rows, 0))).astype(int)
         torques = log.get("torque_permille", np.zeros((rows, 0)))
@@ -109,7 +112,8 @@ def read_run(folder: Path) -> RunFolder | None:
     if not log.is_file() or not tactile.is_file():
         return None
     columns, images = read_npz(log), read_npz(tactile)
-    missing = [name for name in ("t_s", "q_rad", "q_age") if name not in columns]
+    missing = [name for name in ("t_s", "q_age") if name not in columns]
+    missing += ["q_rad"] if joint_positions(columns) is None else []
     missing += [name for name in ("t_s", "t_sample_s", "taxels", "window", "features") if name not in images]
     if missing:
         raise UsageError(f"{folder}: expected the columns of a run, got none called {', '.join(missing)}; run it again")

@@ -30,7 +30,7 @@ _UNITS = {
     "hz": "Hz", "ns": "ns", "us": "us", "n": "N", "m": "m", "s": "s",
 }  # fmt: skip
 _TRUTH_UNITS = {  # the plant's own columns are SI without a suffix
-    "q": "rad", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
+    "q": "rad or m", "probe_centre": "m", "force": "N", "depth": "m", "depth_rate": "m/s", "contact_point": "m",
     "kappa": "1/m", "pad_uv": "m",
 }  # fmt: skip
 _ATTRS = b"PANDAS_ATTRS"  # where pandas itself keeps a frame's attrs in Parquet

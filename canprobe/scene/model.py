@@ -264,7 +264,9 @@ class LimitSettings:
     preload_max_n: Annotated[float, Range(0, 50)] = 0.15
     """Highest force before the run. The tare of the array would take it for zero."""
     joint_margin_deg: Annotated[float, Range(0, 45)] = 1.0
-    """Angle that is kept from every joint stop."""
+    """Angle that is kept from the stops of revolute joints."""
+    joint_margin_mm: Annotated[float, Range(0, 1000)] = 3.5
+    """Travel that is kept from the stops of prismatic joints."""
     joint_speed_share: Annotated[float, Range(0.001, 1)] = 1.0
     """Share of the speed limits of the arm."""
     late_cycles_max_percent: Annotated[float, Range(0, 100)] = 10.0
@@ -323,8 +325,8 @@ class PlantSettings:
     fidelity: Fidelity = "ideal"
     """Model of the arm."""
     true_cell: Annotated[str | None, ScenePath()] = None
-    """Cell whose chain the emulated arm has where it differs from the one that the controller uses. Its base is placed
-    so that the start point stays where it is."""
+    """Cell whose chain the emulated arm has where it differs from the one that the controller uses: a packaged name, or
+    a path relative to the file. Its base is placed so that the start point stays where it is."""
     integrator: Annotated[Integrator, DYNAMIC] = "rosenbrock"
     """Integrator of the equations of motion."""
     step_us: Annotated[float, Range(10, 2500), DYNAMIC] = 625.0

@@ -77,7 +77,7 @@ def resolve(scene: Scene) -> Setup:
         rate_hz=scene.cycle.rate_hz,
         realtime=scene.cycle.realtime,
         compute_ns=round(scene.cycle.compute_us * 1000),
-        limits=_limits(scene.limits),
+        limits=_limits(scene.limits, arm),
         bring_up=scene.bring_up,
         bridge=scene.bridge or BridgeSettings(),
         arm=arm,
@@ -144,13 +144,14 @@ def _array(settings: SensorSettings) -> Array:
     )
 
 
-def _limits(settings: LimitSettings) -> SafetyLimits:
+def _limits(settings: LimitSettings, arm: Arm | None) -> SafetyLimits:
     low, high = settings.workspace_min_mm, settings.workspace_max_mm
+    slides = [] if arm is None else [joint.prismatic for joint in arm.model.joints]
     bounded = low is not None or high is not None
     return SafetyLimits(
         force_max=settings.force_max_n,
         preload_max=settings.preload_max_n,
-        joint_margin=math.radians(settings.joint_margin_deg),
+        joint_margin=np.where(slides, settings.joint_margin_mm * MM, math.radians(settings.joint_margin_deg)),
         speed_share=settings.joint_speed_share,
         late_share=settings.late_cycles_max_percent / 100,
         workspace=np.array([low or (-math.inf,) * 3, high or (math.inf,) * 3]) * MM if bounded else None,

@@ -189,7 +189,7 @@ class SafetyLimits:
     Attributes:
         force_max: N.
         preload_max: N before the run, which the array's tare takes for zero.
-        joint_margin: kept from every joint stop, rad.
+        joint_margin: (n,) kept from the stops of each joint, rad or m; empty without an arm.
         speed_share: of the joints' speed limits.
         late_share: of the last second's cycles, late by half a period.
         workspace: box (2, 3) of the probe's tip in base, m; an open side is infinite; None without any.
@@ -197,7 +197,7 @@ class SafetyLimits:
 
     force_max: float
     preload_max: float
-    joint_margin: float
+    joint_margin: Floats
     speed_share: float
     late_share: float
     workspace: Floats | None

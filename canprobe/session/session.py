@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz, write_text
+from canprobe.bus.disk import CandumpWriter, RecordingPort, whole_file, write_npz
 from canprobe.bus.lockstep import LockstepBus
 from canprobe.bus.port import Clock, JoinedPort, MonotonicClock, Port, Reports, VirtualClock, elapsed_ns, is_bus_error
 from canprobe.bus.scheduling import MASTER_PRIORITY, garbage_collection_paused, realtime, reserve_memory
@@ -33,7 +33,7 @@ from canprobe.planning.model import Plan
 from canprobe.planning.traffic import exact_frame_bits
 from canprobe.protocol.frame_bits import best_case_bits, best_case_fd_bits, exact_bits
 from canprobe.protocol.frames import EMCY_BASE, HEARTBEAT_BASE, SDO_RX_BASE, SDO_TX_BASE
-from canprobe.scene.load import dump_scene, with_files_beside
+from canprobe.scene.load import with_files_beside
 from canprobe.scene.model import BridgeSettings, Scene
 from canprobe.scene.resolve import resolve
 from canprobe.scene.rules import need_scene, with_values
@@ -181,17 +181,14 @@ def _with_bridges(settings: BridgeSettings | None, names: Sequence[str]) -> Brid
 
 
 def write_scene(scene: Scene, folder: Path) -> None:
-    """Write `scene.toml` into a folder, with the EDS and URDF files that it names beside it.
+    """Write `scene.toml` into a folder, with the EDS, URDF and cell files that it names beside it.
 
     Raises:
         ResultsError: a file cannot be written; no part of it is left.
     """
-    moved, files = with_files_beside(scene)
-    for name, path in files.items():
-        content = path.read_bytes()
+    for name, content in reversed(with_files_beside(scene).items()):
         with whole_file(folder / name) as part:
             part.write_bytes(content)
-    write_text(folder / "scene.toml", dump_scene(moved))
 
 
 def zeros_file(plan: Plan) -> Path | None:

@@ -250,8 +250,9 @@ def test_the_page_holds_the_whole_run(page, run):
 
 
 def test_the_last_pose_in_the_page_is_the_last_pose_of_the_run(page, run):
+    from puma_arm import UPENN
+
     from canprobe.robot.chain import forward
-    from canprobe.robot.puma import UPENN
 
     places = [
         m["position"]

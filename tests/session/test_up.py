@@ -101,7 +101,7 @@ def test_a_sound_arm_is_found_so_and_its_pose_is_told(cell):
     cell.operator, said = Watcher(), []
     findings = canprobe.api.check_joints(scene(), operator=cell.operator, say=said.append)
     assert [(f.joint, f.fault, f.skipped) for f in findings] == [(joint, None, None) for joint in range(6)]
-    assert [f.moved_deg for f in findings] == pytest.approx([1.0] * 6, abs=0.03)
+    assert [f.moved for f in findings] == pytest.approx([1.0] * 6, abs=0.03)
     assert said[-1].startswith(f"{REPORTED} 90.00, 65.00, 15.00, 0.00, 100.00, 0.")
     assert_disabled(cell.session)
 
