@@ -62,11 +62,13 @@ class PdoPlanning:
         setup: of the scene.
         sync: the cycle.
         devices: what each node can.
+        channels: of the bus that each node is on.
     """
 
     setup: Setup
     sync: SyncPlan
     devices: Mapping[int, Abilities]
+    channels: Mapping[int, str]
     pdos: list[PlannedPdo] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
     not_available: list[tuple[str, str]] = field(default_factory=list)
@@ -105,6 +107,7 @@ class PdoPlanning:
                 node_id=node_id,
                 direction=direction,
                 number=number,
+                channel=self.channels[node_id],
                 layout=layout,
                 rate_hz=1000 / RESENT_MS if on_event else self.sync.rate_hz / layout.transmission_type,
                 bits_worst=frame_bits(layout.length, self.setup.bus),
@@ -191,11 +194,14 @@ def plan_drive_pdos(planning: PdoPlanning) -> None:
     for node_id, why in without.items() if arm.grouped else ():
         text = f"{planning.devices[node_id].eds}: {why}, so each drive keeps its own target RPDO"
         planning.not_available.append(("two targets in one RPDO", text))
-    for axis, node_id in enumerate(arm.node_ids):
+    beside: dict[str, list[int]] = {}  # two drives share an RPDO on one bus only
+    for node_id in arm.node_ids:
+        mine = beside.setdefault(planning.channels[node_id], [])
+        mine.append(node_id)
         if not arm.grouped or without:
             _plan_commands(planning, node_id)
         else:
-            _plan_grouped(planning, node_id, arm.node_ids[axis - axis % 2])
+            _plan_grouped(planning, node_id, mine[(len(mine) - 1) // 2 * 2])
     for node_id in arm.node_ids:
         _plan_tolerated(planning, node_id)
 
@@ -304,6 +310,7 @@ def _plan_tolerated(planning: PdoPlanning, node_id: int) -> None:
                 node_id=node_id,
                 direction="tpdo",
                 number=number,
+                channel=planning.channels[node_id],
                 layout=layout,
                 rate_hz=rate,
                 bits_worst=frame_bits(layout.length, planning.setup.bus),

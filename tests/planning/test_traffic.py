@@ -4,7 +4,6 @@ import dataclasses
 import importlib.resources
 import math
 import re
-from types import SimpleNamespace
 
 import pytest
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
@@ -248,7 +247,7 @@ def test_order_of_node_ids_is_the_order_of_joints():
 
 def _pdo(cob_id, node_id, direction):
     layout = PdoLayout(cob_id, (PdoEntry(0x6041, 0, 16),))
-    return PlannedPdo(node_id, direction, 1, layout, 400.0, 75, 2_500_000)
+    return PlannedPdo(node_id, direction, 1, "can0", layout, 400.0, 75, 2_500_000)
 
 
 @pytest.mark.parametrize(
@@ -391,8 +390,7 @@ def test_cycle_budget(name, sections, sync_blocked, sneaks_in, compute):
 
 @pytest.mark.parametrize(("best_us", "starts_us"), [(300, (625, 1145)), (900, (900, 1145))])
 def test_a_controller_starts_when_the_last_feedback_comes_or_at_the_next_look(best_us, starts_us):
-    messages = SimpleNamespace(feedback=("some",), best_feedback_ns=best_us * 1000)
-    starts = controller_starts(messages, (625_000, 1_145_000, 1_500_000), 1_145_000)
+    starts = controller_starts(best_us * 1000, (625_000, 1_145_000, 1_500_000), 1_145_000)
     assert starts == tuple(us * 1000 for us in starts_us)
 
 
