@@ -95,7 +95,7 @@ def _dcf_of(plan: Plan, setup: NodeSetup, name: str) -> str:
         "NodeName": setup.name,
         "Baudrate": str(plan.scene.bus.bitrate // 1000),
         "NetNumber": "1",
-        "NetworkName": plan.scene.bus.channel,
+        "NetworkName": setup.channel,
         "CANopenManager": "0",
     }
     keys = {"fileinfo": {"FileName": name, "LastEDS": source.name}, "devicecomissioning": commissioning}

@@ -167,7 +167,7 @@ class BringUp:
         if missing:
             raise self._error(
                 f"({missing[0].name}) sent no boot-up within {self._settings.boot_up_s:g} s of its reset on"
-                f" {self._network.port.channel}{_others('nor did', missing)}"
+                f" {missing[0].channel}{_others('nor did', missing)}"
                 "; check power, node id, bit rate and termination, or mark it emulated in the scene",
                 *missing,
             )

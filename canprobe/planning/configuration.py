@@ -131,6 +131,7 @@ class NodeSetup:
     Attributes:
         node_id: the node.
         name: for messages, such as ``joint 3``.
+        channel: of the bus that it is on.
         eds: name of its EDS file, for messages.
         dictionary: its object dictionary, from the EDS.
         identity: expected values of 1018h by sub-index; an absent sub-index is not checked.
@@ -144,6 +145,7 @@ class NodeSetup:
 
     node_id: int
     name: str
+    channel: str
     eds: str
     dictionary: ObjectDictionary
     identity: dict[int, int]
@@ -180,6 +182,7 @@ def _setup(plan: Plan, node: PlannedNode) -> NodeSetup:
     return NodeSetup(
         node_id=node.node_id,
         name=node.role,
+        channel=node.channel,
         eds=node.eds,
         dictionary=device.od,
         identity={sub: value for sub, value in enumerate(node.identity.numbers, start=1) if value is not None},

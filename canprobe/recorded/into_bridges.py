@@ -98,7 +98,7 @@ def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayRes
     as_taken = folder is not None and plan.scene.bus.interface != LOCKSTEP
     ours = folder is not None if result is None else result.summary["driven_by"] == "task"
     recording = read_recording(path, plan, as_taken=as_taken)
-    groups = _frames_by_sync(path, recording)
+    groups = _frames_by_sync(path, recording, plan)
     before = next(groups)
     if before:
         yield Observation(before[-1][2], None, None, before)
@@ -136,13 +136,14 @@ def _columns(folder: Path | None, start_ns: int, period_ns: int) -> dict[int, di
     }
 
 
-def _frames_by_sync(path: Path, recording: Recording) -> Iterator[list[TimedFrame]]:
-    """All frames of the cell's channel: those before the first SYNC, then from each SYNC to the next."""
+def _frames_by_sync(path: Path, recording: Recording, plan: Plan) -> Iterator[list[TimedFrame]]:
+    """All frames of the cell's buses: those before the first SYNC, then from each SYNC to the next."""
+    others = {bus.channel for bus in plan.buses[1:]}
     frames: list[TimedFrame] = []
     for t_ns, channel, can_id, data in read_candump(path):
-        if channel != recording.channel:
+        if channel != recording.channel and channel not in others:
             continue
-        if can_id == SYNC_ID and len(data) <= 1:
+        if can_id == SYNC_ID and len(data) <= 1 and channel not in others:
             yield frames
             frames = []
         frames.append((can_id, data, t_ns))

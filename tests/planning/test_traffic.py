@@ -97,17 +97,40 @@ def test_image_beside_the_drives_is_refused_with_numbers_and_ways_out(cylinder):
 )
 def test_ways_out_written_into_the_scene_file_make_it_fit(cylinder, sections):
     """As a user would: what a way out names goes into the file, nothing else."""
-    scene = change(cylinder, **sections)
+    follow_ways_out(change(cylinder, **sections))
+
+
+def follow_ways_out(scene):
+    """Write each way out into the file, plan that, and return what the ways out name."""
+    texts = []
     for way in ways_out(scene):
         text, numbers = way.rsplit(": ", 1)
+        texts.append(text)
         file = dump_scene(scene)
-        for section, key, value in re.findall(r'(\w+)\.(\w+) = ("[^"]*"|[\w.]+)', text):
+        for section, key, value in re.findall(r'(\w+(?:\.\w+)?)\.(\w+) = ("[^"]*"|[\w.]+)', text):
             head, name, tail = file.partition(f"[{section}]\n")
-            file = f"{head}{name}{key} = {value}\n" + re.sub(rf"^{key} = .*\n", "", tail, count=1, flags=re.M)
+            mine, mark, rest = tail.partition("\n[")
+            mine = re.sub(rf"^{key} = .*\n?", "", mine, count=1, flags=re.M)
+            file = f"{head}{name}{key} = {value}\n{mine}{mark}{rest}"
         for key in re.findall(r"without sensor\.(\w+)", text):
             file = re.sub(rf"^{key} = .*\n", "", file, count=1, flags=re.M)
         plan = canprobe.plan(parse_scene(file))
         assert f"load {100 * max(bus.traffic.load for bus in plan.buses):.0f} %" in numbers, way
+        assert ("without 6077h" in numbers) == (scene.arm.torque and not plan.setup.arm.torque), way
+    return texts
+
+
+def eight_drives():
+    scene = load_scene("cylinder", "seven-axis")
+    joints = {**scene.joints, "joint_8": dataclasses.replace(scene.joints["joint_7"], node_id=8)}
+    return dataclasses.replace(scene, joints=joints)
+
+
+def test_eight_drives_with_an_array_need_a_second_bus_or_a_third_of_a_kilohertz():
+    texts = follow_ways_out(eight_drives())
+    assert "cycle.rate_hz = 333.333 with sensor.rate_hz = 166.667" in texts
+    half = " and ".join(f'joints.joint_{n}.channel = "can1"' for n in (5, 6, 7, 8))
+    assert f"a second bus for half of the drives ({half})" in texts
 
 
 def test_average_below_one_but_peak_too_high_is_refused(cylinder):
