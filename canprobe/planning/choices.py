@@ -184,7 +184,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
     if array.mode == "image":
         yield 'sensor.mode = "window"', setup.changed("array", mode="window")
     if array.mode != "features":  # only a window may have another size
-        text = 'sensor.mode = "features"' + " without sensor.window" * (array.window != WINDOW)
+        text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
         yield text, setup.changed("array", mode="features", window=WINDOW)
     if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
         own = _free_channel(setup)

@@ -11,7 +11,7 @@ from canprobe.bus.disk import read_candump
 from canprobe.bus.lockstep import LockstepBus, Participant
 from canprobe.bus.port import JoinedPort, VirtualClock
 from canprobe.cell.controller import Command
-from canprobe.errors import InterfaceError, UsageError
+from canprobe.errors import InterfaceError
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import NmtState
 from canprobe.recorded.recording import read_recording
@@ -100,13 +100,6 @@ def test_a_joined_port_sends_where_a_frame_belongs_and_hears_all_in_order(joined
     joined.close()
     with pytest.raises(InterfaceError):
         joined.drain()
-
-
-def test_emulated_nodes_on_two_real_buses_are_refused():
-    scene = split_scene()
-    scene = dataclasses.replace(scene, bus=dataclasses.replace(scene.bus, interface="socketcan"))
-    with pytest.raises(UsageError, match="share one plant"):
-        canprobe.run(scene, files=False)
 
 
 def test_the_log_of_two_buses_is_read_as_the_one_the_cell_had(pressed):
