@@ -177,6 +177,25 @@ def test_serve_on_a_port_answers_a_master(plant):
     ]
 
 
+def test_nodes_of_two_buses_hear_their_own_bus_only(plant):
+    clock = VirtualClock()
+    buses = [LockstepBus(clock, name) for name in ("a", "b")]
+    masters = [bus.port() for bus in buses]
+    nodes = [make_drive_node(load_eds("puma260_joint", i), i, i - 1, plant) for i in (1, 2)]
+    turn = itertools.count()
+
+    def stop():
+        number = next(turn)
+        if number == 0:
+            for master in masters:  # both ask node 1, which is on the first bus
+                master.send_batch([(0x601, bytes.fromhex("4000100000000000"))])
+        return number == 2
+
+    serve([([node], bus.port()) for node, bus in zip(nodes, buses, strict=True)], stop)
+    heard = [[can_id for can_id, _, _ in master.drain()] for master in masters]
+    assert heard == [[0x701, 0x581], [0x702]]
+
+
 def test_serve_keeps_the_deadlines_of_its_nodes(plant):
     bus = LockstepBus(VirtualClock(), "test")
     master, port = bus.port(), bus.port()
