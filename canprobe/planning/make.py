@@ -32,6 +32,7 @@ from canprobe.planning.motion import check_motion
 from canprobe.planning.operation import choose_mode, interpolations, operation_problems, period_problem
 from canprobe.planning.pdos import PdoPlanning, plan_drive_pdos, plan_tactile_pdos
 from canprobe.planning.traffic import plan_ratio, plan_sync, plan_traffic
+from canprobe.planning.units import range_problems
 from canprobe.planning.window import cut_patch
 from canprobe.robot.dynamics import dynamics_problem
 from canprobe.scene.setup import Node, Setup
@@ -63,6 +64,7 @@ def make_plan(setup: Setup) -> Plan:
         if cut is not None and not cut.safe:
             problems.append(cut.text)
             ways = ways or [*cut.ways]
+    problems += range_problems(setup)
     joint_speeds, unreachable = check_motion(setup)
     problems += unreachable
     truth, arm = setup.truth, setup.arm

@@ -102,6 +102,8 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
+            turn_units=joint.counts_per_turn if joint.kind == "revolute" else None,
+            gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
         for (node_id, emulated), joint in zip(scene.drives.items(), joints.values(), strict=True)

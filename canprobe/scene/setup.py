@@ -91,10 +91,14 @@ class Drive(Node):
     """One joint drive.
 
     Attributes:
+        turn_units: position units of a motor turn; None: of a prismatic joint.
+        gear: turns of the motor per turn of the joint.
         incremental: it does not know its zero after power on, and has to be homed.
         quirks: of an emulated one; None: it has none.
     """
 
+    turn_units: float | None = None
+    gear: float = 1.0
     incremental: bool = False
     quirks: Quirks | None = None
 
