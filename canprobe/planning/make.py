@@ -164,7 +164,8 @@ def _plan_bus(setup: Setup, devices: Mapping[int, Abilities], choices: tuple[Cho
     planning = PdoPlanning(setup, sync, devices, channel_of, problems=problems, not_available=not_available)
     plan_drive_pdos(planning)
     plan_tactile_pdos(planning, ratio)
-    planned = order_by_deadline(planning.pdos) if setup.bus.cob_ids == "by_deadline" else planning.pdos
+    by_deadline = setup.bus.cob_ids == "by_deadline"
+    planned = order_by_deadline(planning.pdos, devices.values()) if by_deadline else planning.pdos
     planning.problems += identifier_problems(planned)
     buses, pdos, overload = plan_traffic(planned, sync, channels, setup.bus, setup.compute_ns)
     return _BusPlan(

@@ -7,14 +7,16 @@ that cannot be switched off is planned as what it is: traffic.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from canprobe.eds.packaged import has_long_pdos, has_window_size
-from canprobe.planning.devices import COMMUNICATION, Abilities
+from canprobe.planning.devices import COMMUNICATION, INVALID, Abilities
 from canprobe.planning.model import EVERY_SYNC, Direction, NodeKind, PlannedPdo, SyncPlan
 from canprobe.planning.operation import TARGETS, Place, choose_mode
 from canprobe.planning.traffic import SYNCHRONOUS, frame_bits
+from canprobe.protocol.frames import is_restricted
 from canprobe.protocol.pdo import MAX_BITS, PdoEntry, PdoLayout
 from canprobe.protocol.tactile import WINDOW, window_words
 from canprobe.scene.setup import Array, Setup
@@ -29,7 +31,10 @@ DUMMY_INTEGER32 = 0x0004
 
 DRIVE_TPDOS, DRIVE_RPDOS = (0x180, 0x280, 0x380, 0x480), (0x200, 0x300, 0x400, 0x500)
 """By use: the first PDO of a drive that is used has the first, whatever its number."""
-TACTILE_TPDO1 = 0x511  # 180h + 16 would beat every RPDO; below them all it waits for none of the drives' frames
+TACTILE_TPDO1 = 0x511
+"""Of the array, and those that follow it: 180h + 16 would beat every RPDO; behind them all it delays no drive's frame.
+RPDO4 of nodes 17 to 49 have them by default: where there are such nodes, the array has others."""
+_LAST_COB_ID, _FIRST_COB_ID = 0x57F, 0x481
 TACTILE_DEADLINE_CYCLES = 2
 RESENT_MS, LOST_MS = 100, 250
 """How often a PDO that is sent on a change comes at the slowest, and when its receiver takes it for lost."""
@@ -343,12 +348,24 @@ def plan_tactile_pdos(planning: PdoPlanning, ratio: int) -> None:
         size = next(words for words in FD_WORDS if words <= len(rest)) if long else 1
         parcels.append(rest[:size])
         rest = rest[size:]
+    cob_ids = _tactile_cob_ids(planning, len(parcels))
     for number, objects in enumerate(parcels, start=1):
         entries = planning.entries(array.node_id, "tpdo", *objects)
         if entries and _maps(planning, array.node_id, number, entries):
-            layout = PdoLayout(TACTILE_TPDO1 + number - 1, tuple(entries), ratio, fd=long)
+            layout = PdoLayout(cob_ids[number - 1], tuple(entries), ratio, fd=long)
             cycles = min(TACTILE_DEADLINE_CYCLES, ratio)
             planning.add(array.node_id, "tpdo", number, layout, kind="tactile", cycles=cycles)
+
+
+def _tactile_cob_ids(planning: PdoPlanning, count: int) -> list[int]:
+    """The lowest free identifiers from `TACTILE_TPDO1` on, ascending; lower ones where those are not enough."""
+    taken = {pdo.cob_id for pdo in planning.pdos}
+    for device in planning.devices.values():
+        words = [device.number(COMMUNICATION["rpdo"] + number - 1, 1) for number in device.pdo_numbers("rpdo")]
+        taken |= {word & 0x7FF for word in words if word is not None and not word & INVALID}
+    places = (*range(TACTILE_TPDO1, _LAST_COB_ID + 1), *range(TACTILE_TPDO1 - 1, _FIRST_COB_ID - 1, -1))
+    free = (cob_id for cob_id in places if cob_id not in taken and not is_restricted(cob_id))
+    return sorted(itertools.islice(free, count))
 
 
 def _maps(planning: PdoPlanning, node_id: int, number: int, entries: Sequence[PdoEntry]) -> bool:

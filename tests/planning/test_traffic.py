@@ -6,6 +6,7 @@ import math
 import re
 
 import pytest
+from makes import write_eds
 from scenes import change, reasons, refused, ways_out, with_joints, without_torque
 
 import canprobe
@@ -449,3 +450,22 @@ def test_a_sensor_alone_has_a_budget_too():
     assert budget.tactile_ns == (HEARTBEAT + SYNC + HEARTBEAT + 9 * FULL) * 1000
     assert budget.looks_ns == (625_000, 1_500_000)
     assert budget.slack_ns == 2_500_000 - 625_000 - 200_000
+
+
+@pytest.mark.parametrize("mode", ["window", "image"])
+@pytest.mark.parametrize("ids", [(17, 18, 19, 20, 21, 49, 126), (120, 121, 122, 123, 124, 125, 126)])
+def test_identifiers_of_the_array_leave_those_of_any_drive_alone(mode, ids, tmp_path):
+    """RPDO4 of nodes 17 to 49 are 511h to 531h, where the array's are otherwise; whatever bus they are on."""
+    scene = load_scene("cylinder", "seven-axis")
+    scene = change(
+        scene,
+        arm={"eds": str(write_eds("milliseconds_only", tmp_path))},
+        cycle={"rate_hz": 333.333},
+        sensor={"mode": mode, "channel": "can1", "rate_hz": 333.333 / 2},
+    )
+    plan = canprobe.plan(with_joints(scene, node_id=ids, channel=["can0"] * 4 + ["can2"] * 3))
+    tactile = [pdo.cob_id for pdo in plan.pdos if pdo.kind == "tactile"]
+    drives = {pdo.cob_id for pdo in plan.pdos if pdo.kind == "drive"} | {0x500 + node_id for node_id in ids}
+    assert drives.isdisjoint(tactile) and len(set(tactile)) == len(tactile)
+    assert tactile == sorted(tactile) and (tactile[0] == 0x511) == (17 not in ids)
+    assert [bus.channel for bus in plan.buses] == ["can0", "can2", "can1"]
