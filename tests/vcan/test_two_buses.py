@@ -106,7 +106,10 @@ def test_emulated_drives_of_one_arm_on_two_interfaces(bench: Any, second_bus: An
     bench.start("run", scene, *buses, "--out", bench.folder / "run").end(0)
     results = bench.results("run")
     assert results.summary["completed"]
-    assert all(0 < load["measured"] < load["planned_worst"] for load in results.summary["bus_load"].values())
+    assert {name: load["measured"] > 0 for name, load in results.summary["bus_load"].items()} == {
+        "vcan0": True,
+        SECOND: True,
+    }
     on = {name: {row[2] for row in results.frames if row[1] == name} for name in ("vcan0", SECOND)}
     tpdos, common = {0x180 + node_id for node_id in range(1, 7)}, {0x000, 0x080, 0x77F}
     assert on["vcan0"] & tpdos == {0x181, 0x182, 0x183} and on[SECOND] & tpdos == {0x184, 0x185, 0x186}
