@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
 from types import TracebackType
@@ -58,8 +58,7 @@ def run(
     scene: Scene,
     *,
     interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
+    channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -75,8 +74,8 @@ def run(
 
     Args:
         scene: from `canprobe.load_scene`.
-        interface, channel, bitrate: in the place of the scene's bus.
-        sensor_channel: the sensor's bus, where it is another one.
+        interface, bitrate: in the place of the scene's.
+        channel: in the place of the scene's; ``{"can0": "vcan0", "can1": "vcan1"}`` where it names several.
         out: folder for the files; ``runs/<scene>-<time>`` by default.
         seed, duration_s: in the place of the scene's.
         progress: called with (seconds done, seconds in all).
@@ -92,7 +91,7 @@ def run(
         SafetyStop: the cell was stopped for safety. The drives are disabled and the files written.
         ResultsError: a file could not be written, for example on a full disk. The drives are disabled.
     """
-    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    target = Target.over(scene, interface, channel, bitrate)
     resolved = resolve_scene(scene, target, seed=seed, duration_s=duration_s, bridge=bridge)
     folder = results_folder(resolved, out) if files else None
     check_free(folder, force=force)
@@ -321,8 +320,7 @@ def open_cell(
     scene: Scene,
     *,
     interface: str | None = None,
-    channel: str | None = None,
-    sensor_channel: str | None = None,
+    channel: str | Mapping[str, str] | None = None,
     bitrate: int | None = None,
     out: Path | str | None = None,
     seed: int | None = None,
@@ -344,7 +342,7 @@ def open_cell(
 
     Args:
         scene: from `canprobe.load_scene`.
-        interface, channel, sensor_channel, bitrate, seed: in the place of the scene's.
+        interface, channel, bitrate, seed: in the place of the scene's, as for `run`.
         out: folder for the same files as those of :func:`run`; None writes nothing.
         say: called with each step.
         force, observers, bridge: as for `run`.
@@ -361,7 +359,7 @@ def open_cell(
     Leaving it raises:
         ResultsError: a file could not be written.
     """
-    target = Target.over(scene, interface, channel, bitrate, sensor_channel)
+    target = Target.over(scene, interface, channel, bitrate)
     resolved = resolve_scene(scene, target, seed=seed, bridge=bridge)
     folder = Path(out) if out is not None else None
     check_free(folder, force=force)

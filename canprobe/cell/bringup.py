@@ -168,7 +168,7 @@ class BringUp:
         if missing:
             raise self._error(
                 f"({missing[0].name}) sent no boot-up within {self._settings.boot_up_s:g} s of its reset on"
-                f" {self._network.port.channel}{_others('nor did', missing)}"
+                f" {missing[0].channel}{_others('nor did', missing)}"
                 "; check power, node id, bit rate and termination, or mark it emulated in the scene",
                 *missing,
             )
@@ -230,6 +230,7 @@ class BringUp:
         try:
             yield from self._identify(report)
             yield from self._check_given(setup)
+            yield from self._check_units(report)
             report.kept = self._settings.store and (yield from self._is_kept(setup))
             yield from self._write_all(report)
             if self._settings.store and not report.kept:
@@ -268,9 +269,30 @@ class BringUp:
             if got != given.value:
                 raise NodeError(
                     setup.node_id,
-                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value}, as the scene's"
-                    f" {given.key} says, got {got}: {given.otherwise}; put right {given.key}",
+                    f"({setup.name}) {given.index:04X}h:{given.subindex:02X} expected {given.value},"
+                    f" {given.says}, got {got}: {given.otherwise}",
                 )
+
+    def _check_units(self, report: NodeReport) -> Dialogue:
+        """How many units of a motor turn the device states; what it does not answer is not compared."""
+        turn = report.setup.turn
+        if turn is None:
+            return
+        quotients = []
+        for index in (turn.feed, turn.ratio):
+            if index is not None:
+                try:
+                    over = yield from read_entry(report.setup, index, 1)
+                    under = yield from read_entry(report.setup, index, 2)
+                except NodeError as error:
+                    if isinstance(error.__cause__, SdoAbortedError):
+                        return
+                    raise
+                if not over or not under:
+                    return
+                quotients.append(over / under)
+        if (mismatch := turn.mismatch(quotients[0], quotients[1] if len(quotients) > 1 else 1.0)) is not None:
+            report.remarks.append(mismatch)
 
     def _is_kept(self, setup: NodeSetup) -> Generator[bytes | None, bytes, bool]:
         """Whether the node reports that it was configured with these very values."""

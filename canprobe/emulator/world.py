@@ -24,6 +24,7 @@ from canprobe.emulator.plant.config import PlantConfig, PressMotion
 from canprobe.emulator.plant.plant import Plant
 from canprobe.emulator.plant.taxels import TaxelConfig
 from canprobe.planning.model import Plan, PlannedNode
+from canprobe.planning.units import FEED, GEAR_RATIO, RESOLUTION
 from canprobe.protocol.frames import SYNC_ID, UNCONFIGURED, Frame
 from canprobe.robot.chain import Array, Chain, forward
 from canprobe.robot.inverse import start_posture
@@ -69,6 +70,15 @@ class TruthRecorder(Participant):
         for name in truths[0] if truths else ():
             columns[name] = np.array([truth[name] for truth in truths])
         return columns
+
+
+def _set_turn_units(node: SlaveNode, units: float | None) -> None:
+    """The factor group of a device that was delivered for this cell, where its EDS has one: units of a motor turn."""
+    delivered = node.dictionary.delivered
+    ratio = (delivered(GEAR_RATIO, 1) or 1) / (delivered(GEAR_RATIO, 2) or 1)
+    for index, value in ((RESOLUTION, units), (FEED, None if units is None else units * ratio)):
+        if value is not None and value.is_integer() and delivered(index, 1) and delivered(index, 2) in (0, 1):
+            node.dictionary.set_default(index, 1, int(value))
 
 
 def set_serial_number(node: SlaveNode, serial: int) -> None:
@@ -152,6 +162,7 @@ def _node(setup: Setup, planned: PlannedNode, node_id: int, plant: Plant, homed:
             incremental=drive.zero is not None and not homed,
             seed=setup.seed,
         )
+        _set_turn_units(node, drive.turn_units)
     else:
         assert setup.array is not None
         node = make_tactile_node(dictionary, node_id, plant, od_of=od_of)

@@ -54,9 +54,8 @@ class _OpenKey:
         return getattr(getattr(setup, self.part), self.field, None)
 
     def written(self, setup: Setup) -> str:
-        """The value as a scene file writes it; an array without a channel is on the bus of the scene."""
-        value = self.value(setup)
-        return _written(setup.bus.channel if self.field == "channel" and value is None else value)
+        """The value as a scene file writes it."""
+        return _written(self.value(setup))
 
 
 def _written(value: Any) -> str:
@@ -69,8 +68,23 @@ def _modes(setup: Setup) -> list[tuple[ArrayMode, str]]:
 
 
 def _channels(setup: Setup) -> list[tuple[str, str]]:
-    own = (second_channel(setup.bus.channel), "a separate bus for the sensor")
-    return [(setup.bus.channel, "one bus carries everything"), *([own] if setup.arm is not None else [])]
+    if setup.arm is None:
+        return [(setup.bus.channel, "one bus carries everything")]
+    first, *others = dict.fromkeys(drive.channel for drive in setup.arm.drives)
+    return [
+        (first, "beside its drives" if others else "one bus carries everything"),
+        *((channel, "beside its drives") for channel in others),
+        (_free_channel(setup), "a separate bus for the sensor"),
+    ]
+
+
+def _free_channel(setup: Setup) -> str:
+    """The next channel that no node is on."""
+    nodes = (*(setup.arm.drives if setup.arm is not None else ()), *((setup.array,) if setup.array is not None else ()))
+    channel, taken = setup.bus.channel, {setup.bus.channel, *(node.channel for node in nodes)}
+    while channel in taken:
+        channel = second_channel(channel)
+    return channel
 
 
 def second_channel(channel: str) -> str:
@@ -105,7 +119,7 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
     sensing = [key for key in keys if key.part == "array" and key.field != "channel"]
     wiring = [key for key in keys if key not in sensing]
     for chosen in itertools.product(*(key.options(setup) for key in sensing)):
-        for torque in (True, False) if setup.arm is not None else (True,):
+        for torque in (True, False) if _wants_torque(setup) else (True,):
             for others in itertools.product(*(key.options(setup) for key in wiring)):
                 candidate, choices = setup, []
                 for key, (value, why) in zip((*sensing, *wiring), (*chosen, *others), strict=True):
@@ -123,7 +137,7 @@ def candidates(setup: Setup) -> Iterator[tuple[Setup, tuple[Choice, ...]]]:
 def opened(setup: Setup) -> Setup:
     """The setup with every key left to the plan that stands at its default; what the array sends stays."""
     for key in _KEYS:
-        if getattr(setup, key.part) is not None and key.value(setup) in (None, False, "default"):
+        if getattr(setup, key.part) is not None and key.value(setup) in (setup.bus.channel, False, "default"):
             setup = setup.changed(key.part, **{key.field: AUTO})
     return setup
 
@@ -131,20 +145,25 @@ def opened(setup: Setup) -> Setup:
 # What to change when a scene does not fit its bus: each way is planned too, and only those that fit are named.
 
 FD_ARRAY = "tactile_array_fd.eds"
-Fit = Callable[[Setup], Traffic | None]
-"""Traffic of a changed scene, or None where that does not fit either."""
+Fit = Callable[[Setup], tuple[Setup, Traffic] | None]
+"""A changed setup as the plan closes it and the traffic of its fullest bus; None where that does not fit either."""
 
 
 def ways_out(setup: Setup, fit: Fit) -> list[str]:
     """Changes each of which makes the scene fit, with the load and the longest demand that it leaves."""
     found = []
     for text, changed in (*_changes(setup), *_together(setup, fit), *_quicker(setup, fit), *_slower(setup, fit)):
-        traffic = fit(changed)
-        if traffic is not None:
+        if (fitting := fit(changed)) is not None:
+            closed, traffic = fitting
             peak = max(traffic.demands, key=lambda demand: demand.used_ns / demand.available_ns)
             share = f"{peak.used_ns / 1000:.0f} of {peak.available_ns / 1000:.0f} µs"
-            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}")
+            less = ", without 6077h" if _wants_torque(setup) and not _wants_torque(closed) else ""
+            found.append(f"{text}: load {100 * traffic.load:.0f} %, peak {share}{less}")
     return found or ["fewer nodes or a faster bus"]
+
+
+def _wants_torque(setup: Setup) -> bool:
+    return setup.arm is not None and setup.arm.torque
 
 
 def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
@@ -157,6 +176,7 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
         yield text, setup.changed("bus", transmit_queue="priority")
     if setup.arm is not None and not setup.arm.grouped:
         yield "arm.grouped_rpdo = true", setup.changed("arm", grouped=True)
+    yield from _split(setup)
     if array is None:
         return
     if array.mode == "window":
@@ -165,15 +185,26 @@ def _changes(setup: Setup) -> Iterator[tuple[str, Setup]]:
     if array.mode == "image":
         yield 'sensor.mode = "window"', setup.changed("array", mode="window")
     if array.mode != "features":  # only a window may have another size
-        text = 'sensor.mode = "features"' + " without sensor.window" * (array.window != WINDOW)
+        text = 'sensor.mode = "features"' + " without sensor.window" * (array.mode == "window")
         yield text, setup.changed("array", mode="features", window=WINDOW)
-    if setup.arm is not None and array.channel in (None, bus.channel):
-        own = second_channel(bus.channel)
+    if setup.arm is not None and any(array.channel == drive.channel for drive in setup.arm.drives):
+        own = _free_channel(setup)
         yield f'a separate bus for the sensor (sensor.channel = "{own}")', setup.changed("array", channel=own)
     if not bus.fd and array.emulated:
         fd = setup.changed("bus", fd=True)
         yield "bus.fd = true", fd
         yield f'CAN FD: bus.fd = true and sensor.eds = "{FD_ARRAY}"', fd.changed("array", eds=FD_ARRAY)
+
+
+def _split(setup: Setup) -> Iterator[tuple[str, Setup]]:
+    """The second half of the drives on a bus of their own."""
+    arm = setup.arm
+    if arm is None or len(arm.drives) < 2 or len({drive.channel for drive in arm.drives}) > 1:
+        return
+    own, kept = _free_channel(setup), len(arm.drives) // 2
+    drives = (*arm.drives[:kept], *(replace(drive, channel=own) for drive in arm.drives[kept:]))
+    keys = " and ".join(f'joints.{joint.name}.channel = "{own}"' for joint in arm.model.joints[kept:])
+    yield f"a second bus for half of the drives ({keys})", setup.changed("arm", drives=drives)
 
 
 def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
@@ -190,9 +221,9 @@ def _together(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
 def _quicker(setup: Setup, fit: Fit) -> Iterator[tuple[str, Setup]]:
     """A controller that takes no longer than the bus leaves it, in whole microseconds."""
     idle = fit(replace(setup, compute_ns=0))
-    if idle is None or idle.budget.slack_ns is None:
+    if idle is None or (slack_ns := idle[1].budget.slack_ns) is None:
         return
-    left_us = idle.budget.slack_ns // 1000
+    left_us = slack_ns // 1000
     if 0 < left_us * 1000 < setup.compute_ns:
         yield f"cycle.compute_us = {left_us}", replace(setup, compute_ns=left_us * 1000)
 

@@ -100,7 +100,7 @@ def _observations(plan: Plan, path: Path, folder: Path | None, result: ReplayRes
         yield from _observations_of(run, path, plan, estimates)
         return
     recording = read_recording(path, plan)
-    groups = frames_by_sync(path, recording.channel)
+    groups = frames_by_sync(path, recording.channel, plan)
     before = next(groups)
     if before:
         yield Observation(before[-1][2], None, None, before)
@@ -115,7 +115,7 @@ def _observations_of(
     run: RunFolder, path: Path, plan: Plan, estimates: dict[int, SurfaceEstimate]
 ) -> Iterator[Observation]:
     """The observations of a run: what its master measured, with the frames from each SYNC to the next."""
-    groups = frames_by_sync(path, plan.buses[0].channel) if path.is_file() else iter(())
+    groups = frames_by_sync(path, plan.buses[0].channel, plan) if path.is_file() else iter(())
     if before := next(groups, []):
         yield Observation(before[-1][2], None, None, before)
     start_ns = round(run.start_s * 1e9)
@@ -138,13 +138,14 @@ def _estimates(result: ReplayResult | None) -> dict[int, SurfaceEstimate]:
     return {} if result is None else {round(r.told_s * 1e9): r.estimate for r in result.tracker.records}
 
 
-def frames_by_sync(path: Path, on: str) -> Iterator[list[TimedFrame]]:
-    """All frames of a channel: those before the first SYNC, then from each SYNC to the next."""
+def frames_by_sync(path: Path, first: str, plan: Plan) -> Iterator[list[TimedFrame]]:
+    """All frames of the cell's buses: those before the first SYNC, then from each SYNC on the first bus to the next."""
+    others = {bus.channel for bus in plan.buses[1:]}
     frames: list[TimedFrame] = []
     for t_ns, channel, can_id, data in read_candump(path):
-        if channel != on:
+        if channel != first and channel not in others:
             continue
-        if can_id == SYNC_ID and len(data) <= 1:
+        if can_id == SYNC_ID and len(data) <= 1 and channel not in others:
             yield frames
             frames = []
         frames.append((can_id, data, t_ns))

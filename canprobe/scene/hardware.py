@@ -114,6 +114,8 @@ class JointSettings:
     """Amplitude of the swing in `free`."""
     node_id: NodeId | None = None
     """Node id of the drive. Left out: the number of the joint, from 1."""
+    channel: Channel | None = None
+    """Channel of the bus that the drive is on. Left out: `bus.channel`. Node ids differ on all buses together."""
     eds: Annotated[str | None, ScenePath()] = None
     """EDS of the drive. Left out: `arm.eds`."""
     emulated: bool | None = None

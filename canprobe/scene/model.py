@@ -111,7 +111,7 @@ class SensorSettings:
     emulated: bool = True
     """canprobe serves the array. false: the array is real."""
     channel: Channel | None = None
-    """Channel of a separate bus for the array. Left out: the bus of the drives. "auto": the plan chooses."""
+    """Channel of a separate bus for the array. Left out: `bus.channel`. "auto": the plan chooses."""
     mode: TactileModeName = "window"
     """What the array sends: the taxels round the contact, all taxels, or force, centroid and moments that it
     computes from them."""
@@ -443,6 +443,13 @@ class Scene:
     def seed(self) -> int:
         """The seed of everything random."""
         return self.scene.seed
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels that the scene names, that of `[bus]` first; not one that is left to the plan."""
+        named = [joint.channel for joint in self.joints.values()]
+        named += [self.sensor.channel] if self.sensor is not None and self.sensor.channel != "auto" else []
+        return tuple(dict.fromkeys((self.bus.channel, *(name for name in named if name is not None))))
 
     @property
     def emulated_node_ids(self) -> tuple[int, ...]:

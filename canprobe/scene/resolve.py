@@ -64,7 +64,7 @@ def resolve(scene: Scene) -> Setup:
     """
     need_scene(scene)
     arm, bodies = _arm(scene)
-    array = _array(scene.sensor) if scene.sensor is not None else None
+    array = _array(scene.sensor, scene.bus.channel) if scene.sensor is not None else None
     settings = scene.probe or ProbeSettings()
     probe = Probe(T_flange_probe(settings), settings.radius_mm * MM, settings.stiffness_n_m3, settings.mass_kg)
     return Setup(
@@ -98,10 +98,13 @@ def _arm(scene: Scene) -> tuple[Arm | None, Bodies]:
     drives = [
         Drive(
             node_id=node_id,
+            channel=joint.channel or scene.bus.channel,
             eds=joint.eds or settings.eds,
             emulated=emulated,
             serial=joint.serial_number,
             zero=homing_of(joint, number),
+            turn_units=joint.counts_per_turn if joint.kind == "revolute" else None,
+            gear=joint.gear,
             quirks=_quirks(scene.emulate, node_id, joint.noise_counts),
         )
         for number, ((node_id, emulated), joint) in enumerate(
@@ -130,10 +133,10 @@ def _quirks(settings: EmulateSettings | None, node_id: int, noise: float) -> Qui
     return None if quirks == Quirks() else quirks
 
 
-def _array(settings: SensorSettings) -> Array:
+def _array(settings: SensorSettings, channel: str) -> Array:
     return Array(
         node_id=settings.node_id,
-        channel=settings.channel,
+        channel=settings.channel or channel,
         eds=settings.eds,
         emulated=settings.emulated,
         serial=settings.serial_number,

@@ -47,13 +47,15 @@ class Node:
     """What every node has.
 
     Attributes:
-        node_id: 1–126.
+        node_id: 1–126, on all buses together.
+        channel: of its bus.
         eds: name or path of its EDS.
         emulated: served by the emulator.
         serial: what 1018h:04 must answer; None: anything.
     """
 
     node_id: int
+    channel: str
     eds: str
     emulated: bool
     serial: int | None
@@ -113,10 +115,14 @@ class Drive(Node):
 
     Attributes:
         zero: how it is homed; None: its encoder is absolute.
+        turn_units: position units of a motor turn; None: of a prismatic joint.
+        gear: turns of the motor per turn of the joint.
         quirks: of an emulated one; None: it has none.
     """
 
     zero: Homing | None = None
+    turn_units: float | None = None
+    gear: float = 1.0
     quirks: Quirks | None = None
 
 
@@ -151,14 +157,12 @@ class Array(Node):
     """The tactile array.
 
     Attributes:
-        channel: of its bus; None: the arm's.
         mode: what it sends.
         window: taxels along the window that follows the contact.
         rate_hz: of its frames.
         full_scale: pressure of a full count, Pa.
     """
 
-    channel: str | None
     mode: ArrayMode
     window: int | Auto
     rate_hz: float

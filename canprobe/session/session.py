@@ -443,8 +443,6 @@ class Session:
                 "python-can's virtual bus ends at the process, and emulated nodes have one of their own; use --bus"
                 " lockstep, or --bus socketcan --channel vcan0 by: canprobe vcan -- COMMAND"
             )
-        if len({node.channel for node in self.plan.nodes if node.emulated}) > 1:
-            raise UsageError("emulated nodes on two buses share one plant: run them in lockstep, or on one bus")
         check_links(bus.interface, expected_of(self.plan), self._say)
         clock = MonotonicClock()
         self.origin_ns = clock.now_ns()
@@ -461,8 +459,8 @@ class Session:
         if self.scene.emulated_node_ids:
             self.cell.listen()  # they would boot beside those of another master
             self._say("start the emulated nodes")
-            emulated = next(node.channel for node in self.plan.nodes if node.emulated)
-            child = EmulatorChild(self.scene, self.out, emulated, truth=self.keeps_all, origin_ns=self.origin_ns)
+            channels = list(dict.fromkeys(node.channel for node in self.plan.nodes if node.emulated))
+            child = EmulatorChild(self.scene, self.out, channels, truth=self.keeps_all, origin_ns=self.origin_ns)
             self._stack.callback(self._end_child, child)
             child.start()
         self._say("rehearse in lockstep")

@@ -43,7 +43,7 @@ from canprobe.cell.supervision import Limits, limits_of
 from canprobe.emulator.node.slave_node import SlaveNode
 from canprobe.emulator.plant.plant import Plant
 from canprobe.errors import CanprobeError, SafetyStop
-from canprobe.planning.configuration import motor_speed_limit
+from canprobe.planning.units import motor_speed_limit
 from canprobe.protocol.cia402 import POWERED_STATES, state_of
 from canprobe.protocol.frames import Frame
 from canprobe.results.summary import summarise

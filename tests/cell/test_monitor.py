@@ -145,7 +145,7 @@ def test_the_command_listens_to_both_buses(capsys):
     """On python-can's own bus, which ends at the process: the heartbeats are waiting when the monitor opens."""
     buses = {name: can.Bus(interface="virtual", channel=name) for name in ("left", "right")}
     scene = on_two_buses()
-    heard = iter(api.monitor(api.Target.over(scene, "virtual", "left", None, "right").applied_to(scene)))
+    heard = iter(api.monitor(api.Target.over(scene, "virtual", {"can0": "left", "can1": "right"}).applied_to(scene)))
     next(heard)
     for name, node_id in (("left", 4), ("right", 16)):
         buses[name].send(can.Message(arbitration_id=0x700 + node_id, data=b"\x05", is_extended_id=False))
